@@ -1,0 +1,208 @@
+"""The six callbacks of a mechanism: the decorator for compiled ones, and the door for plain Python functions."""
+
+import inspect
+import itertools
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakValueDictionary
+
+import numpy as np
+from numba import njit, objmode
+from numba.core.dispatcher import Dispatcher
+from numba.core.errors import NumbaError
+from numpy.typing import NDArray
+
+from twoloop.kernels.common import CONSTRAINT_CALLBACK, FORCE_CALLBACK, MATRIX_CALLBACK, kernel
+
+Array = NDArray[np.float64]
+
+# kind: (arguments, signature)
+KINDS: dict[str, tuple[tuple[str, ...], Any]] = {
+    "mass": (("t", "q", "p", "M"), MATRIX_CALLBACK),
+    "force": (("t", "q", "v", "p", "Q"), FORCE_CALLBACK),
+    "constraint": (("t", "q", "p", "C"), CONSTRAINT_CALLBACK),
+    "jacobian": (("t", "q", "p", "Cq"), MATRIX_CALLBACK),
+    "constraint_rate": (("t", "q", "p", "Ct"), CONSTRAINT_CALLBACK),
+    "gamma": (("t", "q", "v", "p", "Qd"), FORCE_CALLBACK),
+}
+
+
+def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
+    """Compile one callback of a mechanism with the signature that its kind has.
+
+    The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,), the
+    parameters `p`, and the array to fill, which arrives full of zeros::
+
+        @callback("jacobian")
+        def jacobian(t, q, p, Cq):
+            Cq[0, 0] = q[0]
+            Cq[0, 1] = q[1]
+
+    Parameters
+    ----------
+    kind : str
+        "mass" (t, q, p, M), "force" (t, q, v, p, Q), "constraint" (t, q, p, C), "jacobian" (t, q, p, Cq),
+        "constraint_rate" (t, q, p, Ct) or "gamma" (t, q, v, p, Qd).
+
+    Raises
+    ------
+    ValueError
+        If `kind` is unknown.
+    TypeError
+        If the function has other arguments, or numba cannot compile it.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {kind!r}")
+    arguments, signature = KINDS[kind]
+
+    def decorate(function: Callable[..., None]) -> Dispatcher:
+        given = tuple(inspect.signature(function).parameters)
+        if given != arguments:
+            raise TypeError(
+                f"{function.__name__} is declared as the callback {kind!r}, whose arguments are "
+                f"({', '.join(arguments)}); it has ({', '.join(given)})"
+            )
+        try:
+            return kernel(signature, stamp=None)(function)
+        except NumbaError as error:
+            raise TypeError(_why_not(kind, function, error)) from error
+
+    return decorate
+
+
+def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
+    name = getattr(function, "__name__", "?")
+    return (
+        f"{kind}: numba cannot compile the function {name!r}. It must use numbers, numpy arrays and functions that "
+        f"numba knows, and give the array that {kind} asks for. Numba says:\n{error}"
+    )
+
+
+class PythonFunctions:
+    """Plain Python functions of one system, called through the compiled wrappers below."""
+
+    _count = itertools.count(1)
+    registry: "WeakValueDictionary[int, PythonFunctions]" = WeakValueDictionary()
+
+    def __init__(self, name: str, functions: dict[str, Callable[..., Any]]):
+        self.name = name
+        self.functions = functions
+        self.handle = next(self._count)
+        self.registry[self.handle] = self
+
+    def call(self, kind: str, arguments: tuple[Any, ...], out: Array) -> None:
+        """Call one function with copies of the arrays, check what comes back and write it to `out`."""
+        t = arguments[0]
+        try:
+            value = self.functions[kind](*arguments)
+        except Exception as error:
+            error.add_note(f"raised by {kind} of system {self.name!r} at t = {t!r}")
+            raise
+        store(kind, self.name, t, value, out)
+
+
+def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
+    """Write what a Python function returned to `out`, or say what is wrong with it."""
+    try:
+        array = np.asarray(value)
+        real = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+    except ValueError:
+        real = False
+    if not real:
+        raise TypeError(
+            f"{kind} of system {name!r} must return a real array of shape {out.shape}; "
+            f"at t = {t!r} it returned {value!r}"
+        )
+    if array.shape != out.shape:
+        raise ValueError(
+            f"{kind} of system {name!r} must return an array of shape {out.shape}; at t = {t!r} it returned shape "
+            f"{array.shape}"
+        )
+    out[...] = array
+
+
+def _call_with_q(kind: str, t: float, q: Array, p: Array, out: Array) -> None:
+    PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy()), out)
+
+
+def _call_with_q_v(kind: str, t: float, q: Array, v: Array, p: Array, out: Array) -> None:
+    PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy(), v.copy()), out)
+
+
+@callback("mass")
+def python_mass(t, q, p, M):
+    with objmode():
+        _call_with_q("mass", t, q, p, M)
+
+
+@callback("force")
+def python_force(t, q, v, p, Q):
+    with objmode():
+        _call_with_q_v("force", t, q, v, p, Q)
+
+
+@callback("constraint")
+def python_constraint(t, q, p, C):
+    with objmode():
+        _call_with_q("constraint", t, q, p, C)
+
+
+@callback("jacobian")
+def python_jacobian(t, q, p, Cq):
+    with objmode():
+        _call_with_q("jacobian", t, q, p, Cq)
+
+
+@callback("constraint_rate")
+def python_constraint_rate(t, q, p, Ct):
+    with objmode():
+        _call_with_q("constraint_rate", t, q, p, Ct)
+
+
+@callback("gamma")
+def python_gamma(t, q, v, p, Qd):
+    with objmode():
+        _call_with_q_v("gamma", t, q, v, p, Qd)
+
+
+@callback("constraint_rate")
+def no_rate(t, q, p, Ct):
+    """Constraints that do not depend on time."""
+
+
+@callback("gamma")
+def no_gamma(t, q, v, p, Qd):
+    """Stands where gamma is differenced; never called."""
+
+
+def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
+    """Compile a function that returns its array, and wrap it to the in-place signature of its kind."""
+    arguments, signature = KINDS[kind]
+    user = function if isinstance(function, Dispatcher) else njit(function)
+    message = f"{kind} returned an array of the wrong shape"
+    if "v" in arguments:
+
+        def in_place(t, q, v, p, out):
+            value = user(t, q, v)
+            if value.shape != out.shape:
+                raise ValueError(message)
+            out[:] = value
+    elif signature is MATRIX_CALLBACK:
+
+        def in_place(t, q, p, out):
+            value = user(t, q)
+            if value.shape != out.shape:
+                raise ValueError(message)
+            out[:, :] = value
+    else:
+
+        def in_place(t, q, p, out):
+            value = user(t, q)
+            if value.shape != out.shape:
+                raise ValueError(message)
+            out[:] = value
+
+    try:
+        return njit(signature, error_model="numpy")(in_place)
+    except NumbaError as error:
+        raise TypeError(_why_not(kind, function, error)) from error

@@ -1,0 +1,180 @@
+"""Many steps with step-size control, until the last output time, a full buffer or a failure.
+
+`advance` knows nothing of the method: a step is a first-class function with its options and its memory.
+"""
+
+import numpy as np
+from numba import types
+
+from twoloop.kernels.common import (
+    DONE,
+    FUNCTIONS,
+    INTEGERS,
+    MATRIX,
+    N_ACCEPTED,
+    N_REJECTED_CONVERGENCE,
+    N_REJECTED_ERROR,
+    NOT_FINITE,
+    VECTOR,
+    WORK,
+    Functions,
+    StepFunction,
+    f8,
+    i8,
+    kernel,
+)
+from twoloop.kernels.inner import accelerations, factor_dependent, factor_mass
+from twoloop.kernels.partition import partition, partition_is_worn
+
+# what advance() returns
+ALL_OUTPUT_DONE, BUFFER_FULL, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
+
+# places in `control`, constant during a run
+(
+    SAFETY,
+    FACTOR_MIN,
+    FACTOR_MAX,
+    EXPONENT,  # the step factor is err**-EXPONENT
+    MAX_STEP,
+    FIXED_STEP,  # 0: step-size control
+    LIMIT_START,  # h_max at the beginning of a step
+    LIMIT_FACTOR,  # h_max becomes this times the step that did not converge ...
+    LIMIT_MEMORY,  # ... for this many accepted steps
+    MAX_STEPS,  # accepted steps
+    STORE_ALL,  # 1: every accepted step is stored; 0: output times only
+    N_CONTROL,
+) = range(12)
+
+# places in `clock`, carried from call to call
+T, H_NEXT, H_LIMIT, LIMIT_AGE, NEXT_OUTPUT, T_START, N_FIXED, FAILURE_CODE, H_FAILED, N_CLOCK = range(10)
+
+
+@kernel(i8(*FUNCTIONS, WORK, f8, VECTOR))
+def start(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags, w, t, state):
+    """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
+    f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
+    n = w.Q.size
+    q, v = state[:n], state[n : 2 * n]
+    code = factor_mass(f, w, t, q)
+    if code == DONE:
+        code = partition(f, w, t, q)
+    if code == DONE:
+        code = factor_dependent(f, w, t, q)
+    if code == DONE:
+        code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
+    return code
+
+
+_ADVANCE = i8(
+    *FUNCTIONS,  # the functions come one by one: only so does numba take them as first-class functions
+    WORK,
+    StepFunction,
+    *(VECTOR,) * 8,
+    MATRIX,
+    VECTOR,
+    INTEGERS,
+)
+
+
+@kernel(_ADVANCE)
+def advance(
+    mass,
+    force,
+    constraint,
+    jacobian,
+    constraint_rate,
+    gamma,
+    p,
+    flags,
+    w,
+    step,
+    options,
+    memory,
+    tolerances,
+    control,
+    clock,
+    state,
+    outputs,
+    out_t,
+    out_state,
+    out_h,
+    filled,
+):
+    """Step on from (clock, state) until every time in `outputs` is reached; steps are shortened to land on them.
+
+    Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
+    out_t / out_state and the entries of out_h that this call wrote.
+    """
+    f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
+    new_state = np.empty_like(state)
+    fixed = control[FIXED_STEP] > 0.0
+    n = w.Q.size
+    filled[:] = 0
+    while True:
+        if filled[0] == out_t.size or filled[1] == out_h.size:
+            return BUFFER_FULL
+        if w.counters[N_ACCEPTED] >= control[MAX_STEPS]:
+            return MAX_STEPS_REACHED
+        t = clock[T]
+        target = outputs[int(clock[NEXT_OUTPUT])]
+        if partition_is_worn(w) and partition(f, w, t, state[:n]) != DONE:
+            return RANK_LOST
+        h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
+        left = target - t
+        lands = h >= left * (1.0 - 1e-10)
+        size = h
+        if lands:
+            size = left
+        elif not fixed and h > 0.5 * left:
+            size = 0.5 * left  # two equal steps rather than a long and a tiny one
+        if size <= 4.0 * np.spacing(max(abs(t), abs(target))):
+            return STEP_TOO_SMALL
+        code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
+        if code == DONE and not np.isfinite(error):
+            code = NOT_FINITE
+        accepted = code == DONE and error <= 1.0
+        memory[0] = 1.0 if accepted else 0.0
+        if code != DONE:
+            w.counters[N_REJECTED_CONVERGENCE] += 1
+            clock[FAILURE_CODE] = code
+            clock[H_FAILED] = size
+            if fixed:
+                return FIXED_STEP_FAILED
+            clock[H_LIMIT] = control[LIMIT_FACTOR] * size
+            clock[LIMIT_AGE] = 0.0
+            clock[H_NEXT] = 0.5 * size
+            if partition(f, w, t, state[:n]) != DONE:
+                return RANK_LOST
+            continue
+        factor = control[FACTOR_MAX]
+        if error > 0.0:
+            factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
+        proposal = min(size * factor, clock[H_LIMIT])
+        if not accepted:
+            w.counters[N_REJECTED_ERROR] += 1
+            clock[FAILURE_CODE] = DONE
+            clock[H_NEXT] = proposal
+            continue
+        w.counters[N_ACCEPTED] += 1
+        clock[N_FIXED] += 1.0
+        if lands:
+            clock[T] = target
+        else:
+            # no accumulated rounding in the times of a fixed-step run
+            clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
+        state[:] = new_state
+        out_h[filled[1]] = size
+        filled[1] += 1
+        if lands or control[STORE_ALL] == 1.0:
+            out_t[filled[0]] = clock[T]
+            out_state[filled[0], :] = state
+            filled[0] += 1
+        # a step cut short by an output time says little about the next
+        clock[H_NEXT] = proposal if size == h else max(proposal, h)
+        clock[LIMIT_AGE] += 1.0
+        if clock[LIMIT_AGE] > control[LIMIT_MEMORY]:
+            clock[H_LIMIT] = control[LIMIT_START]
+        if lands:
+            clock[NEXT_OUTPUT] += 1.0
+            if int(clock[NEXT_OUTPUT]) == outputs.size:
+                return ALL_OUTPUT_DONE

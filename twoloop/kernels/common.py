@@ -1,0 +1,167 @@
+"""What every kernel shares: signatures, the workspace, return codes, counters and the compiling decorator.
+
+Every callback of a mechanism has one fixed signature and works in place, so that the integrator is compiled once
+and takes any mechanism (and any method) as a first-class function.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+from numba.core.dispatcher import Dispatcher
+
+f8 = types.float64
+i8 = types.int64
+VECTOR = types.float64[::1]
+MATRIX = types.float64[:, ::1]
+INTEGERS = types.int64[::1]
+
+# (t, q, p, M), (t, q, v, p, Q), (t, q, p, C): the three shapes that the six callbacks have
+MATRIX_CALLBACK = types.void(f8, VECTOR, VECTOR, MATRIX)
+FORCE_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR, VECTOR)
+CONSTRAINT_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR)
+
+MatrixFunction = types.FunctionType(MATRIX_CALLBACK)
+ForceFunction = types.FunctionType(FORCE_CALLBACK)
+ConstraintFunction = types.FunctionType(CONSTRAINT_CALLBACK)
+
+
+class Functions(NamedTuple):
+    """The six callbacks of a mechanism, its parameters and its flags, as the kernels see them."""
+
+    mass: Any
+    force: Any
+    constraint: Any
+    jacobian: Any
+    constraint_rate: Any
+    gamma: Any
+    p: Any
+    flags: Any
+
+
+# places in Functions.flags
+CONSTANT_MASS, DIAGONAL_MASS, GAMMA_GIVEN = range(3)
+
+FUNCTIONS = types.NamedTuple(
+    [
+        MatrixFunction,
+        ForceFunction,
+        ConstraintFunction,
+        MatrixFunction,
+        ConstraintFunction,
+        ForceFunction,
+        VECTOR,
+        INTEGERS,
+    ],
+    Functions,
+)
+
+
+class Work(NamedTuple):
+    """Arrays that an evaluation writes; made once a run. Sizes: n_q coordinates, n_c constraints."""
+
+    M: Any  # (n_q, n_q) mass matrix
+    L: Any  # (n_q, n_q) its Cholesky factor; for a constant diagonal M, 1/sqrt(M_jj) on the diagonal
+    Cq: Any  # (n_c, n_q) constraint Jacobian at the last position
+    Cqd: Any  # (n_c, n_c) LU factors of its dependent columns
+    S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its Cholesky factor
+    W: Any  # (n_c, n_q) rows L^-1 Cq^T; scratch for full pivoting
+    Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences)
+    Q: Any  # (n_q) force
+    x: Any  # (n_q) scratch
+    C: Any  # (n_c) constraint, and corrections
+    Ct: Any  # (n_c) constraint rate
+    Qd: Any  # (n_c) right side of Cq a = Qd
+    g: Any  # (n_c) scratch
+    lam: Any  # (n_c) multipliers of an evaluation that nobody keeps
+    dependent: Any  # (n_c) columns of the dependent coordinates
+    independent: Any  # (n_q - n_c) columns of the independent coordinates
+    pivots: Any  # (n_c) row exchanges of the LU factors
+    order: Any  # (n_q) scratch: column order of the full pivoting
+    counters: Any  # (N_COUNTERS) see below
+    quality: Any  # (2) pivot ratio of Cqd: [best since the partition was chosen, now]
+
+
+_INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters")
+_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx")
+WORK = types.NamedTuple(
+    [MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields],
+    Work,
+)
+
+# places in Work.counters
+(
+    N_ACCEPTED,
+    N_REJECTED_ERROR,
+    N_REJECTED_CONVERGENCE,
+    N_OUTER,
+    N_INNER,
+    N_EVALUATIONS,
+    N_PARTITIONS,
+    N_FACTORIZATIONS,
+    N_COUNTERS,
+) = range(9)
+
+# what a kernel returns: DONE, or why it could not
+DONE, OUTER_DIVERGED, INNER_DIVERGED, SINGULAR, NOT_FINITE, MASS_NOT_DEFINITE = range(6)
+
+# (functions, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
+STEP = types.Tuple((i8, f8))(FUNCTIONS, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
+StepFunction = types.FunctionType(STEP)
+
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step
+ATOL, RTOL, ESTIMATE, N_TOLERANCES = range(4)
+
+
+def _package_stamp() -> tuple[float, int]:
+    """Time and size of all kernel sources: numba itself watches only the file a function stands in."""
+    files = [path.stat() for path in Path(__file__).parent.glob("*.py")]
+    return max(f.st_mtime for f in files), sum(f.st_size for f in files)
+
+
+_STAMP = _package_stamp()
+
+
+def kernel(signature: Any, stamp: tuple[float, int] | None = _STAMP) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """Compile a function once for `signature` and keep the machine code on disk."""
+
+    def compile_now(function: Callable[..., Any]) -> Dispatcher:
+        dispatcher = njit(cache=True, error_model="numpy")(function)
+        if stamp is not None:
+            # without this, an edit of linalg.py would leave a stale advance.py in the cache
+            dispatcher._cache._cache_file._source_stamp = stamp
+        dispatcher.compile(signature)
+        dispatcher.disable_compile()
+        return dispatcher
+
+    return compile_now
+
+
+inlined = njit(error_model="numpy")  # a helper that is compiled into the kernels which call it
+
+
+def make_work(n_q: int, n_c: int) -> Work:
+    """Allocate the workspace of one run."""
+    matrices = {name: np.zeros((n_c, n_q)) for name in ("Cq", "W", "Cqx")}
+    return Work(
+        M=np.zeros((n_q, n_q)),
+        L=np.zeros((n_q, n_q)),
+        Cqd=np.zeros((n_c, n_c)),
+        S=np.zeros((n_c, n_c)),
+        Q=np.zeros(n_q),
+        x=np.zeros(n_q),
+        C=np.zeros(n_c),
+        Ct=np.zeros(n_c),
+        Qd=np.zeros(n_c),
+        g=np.zeros(n_c),
+        lam=np.zeros(n_c),
+        dependent=np.zeros(n_c, dtype=np.int64),
+        independent=np.zeros(n_q - n_c, dtype=np.int64),
+        pivots=np.zeros(n_c, dtype=np.int64),
+        order=np.zeros(n_q, dtype=np.int64),
+        counters=np.zeros(N_COUNTERS, dtype=np.int64),
+        quality=np.zeros(2),
+        **matrices,
+    )

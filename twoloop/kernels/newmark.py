@@ -1,0 +1,64 @@
+"""A Newmark step, its outer loop by fixed point on the independent accelerations. Equation numbers are the paper's."""
+
+import numpy as np
+
+from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, inlined, kernel
+from twoloop.kernels.inner import evaluate
+
+MAX_SWEEPS = 60
+ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinking has converged
+
+# places in `options`
+BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
+
+
+@inlined
+def _error(options, tolerances, h, q, a, a1):
+    """|beta - 1/6| h^2 |a1 - a|: the leading local error of q, for any beta and gamma = 1/2.
+
+    With ERROR_TOL > 0 the 2-norm over ERROR_TOL (the paper's err_out); else the weighted root mean square.
+    """
+    factor = abs(options[BETA] - 1.0 / 6.0) * h * h
+    total = 0.0
+    for m in range(q.size):
+        scale = 1.0 if options[ERROR_TOL] > 0.0 else tolerances[ATOL] + tolerances[RTOL] * abs(q[m])
+        total += ((a1[m] - a[m]) / scale) ** 2
+    if options[ERROR_TOL] > 0.0:
+        return factor * np.sqrt(total) / options[ERROR_TOL]
+    return factor * np.sqrt(total / q.size)
+
+
+@kernel(STEP)
+def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt: (12) for the independent coordinates, inner loop, accelerations, until these stop changing."""
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    beta, gamma = options[BETA], options[GAMMA]
+    a_new = memory
+    for m in range(n):
+        a1[m] = a[m]
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: where Newton starts
+    before = np.inf
+    for _ in range(MAX_SWEEPS):
+        w.counters[N_OUTER] += 1
+        for m in w.independent:
+            q1[m] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
+            v1[m] = v[m] + h * ((1.0 - gamma) * a[m] + gamma * a1[m])
+        code = evaluate(f, w, t + h, q1, v1, options[INNER_TOL], a_new, lam1)
+        if code != DONE:
+            return code, np.inf
+        change = 0.0
+        for m in w.independent:
+            difference = h * abs(a_new[m] - a1[m])
+            change = max(change, gamma * difference / max(abs(v1[m]), 1.0))
+            change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
+        for m in range(n):
+            a1[m] = a_new[m]
+        if change <= options[OUTER_TOL] or (change >= before and change <= ROUNDING_FLOOR):
+            error = _error(options, tolerances, h, q, a, a1) if tolerances[ESTIMATE] == 1.0 else 0.0
+            return DONE, error
+        if not change <= before:
+            return OUTER_DIVERGED, np.inf
+        before = change
+    return OUTER_DIVERGED, np.inf

@@ -1,0 +1,341 @@
+"""Implicit Runge-Kutta steps: the outer loop by fixed point, and Richardson's error estimate around it.
+
+Two outer loops are available: `sweep_accelerations` iterates on the stage accelerations alone (the tableau applied
+twice to q'' = a), `sweep_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.kernels.common import (
+    ATOL,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    OUTER_DIVERGED,
+    RTOL,
+    STEP,
+    inlined,
+    kernel,
+)
+from twoloop.kernels.inner import accelerations, evaluate, positions, velocities
+
+MAX_SWEEPS = 60
+MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
+GROWTH = 1e3  # the differences may first grow (the sweep is not normal), but not by more than this
+PATIENCE = 8  # sweeps after which a difference that grows again means divergence
+ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinking has converged
+FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
+
+# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
+STAGES, INNER_TOL, OUTER_TOL, DIVISOR, N_SCALARS = range(5)
+# places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
+LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
+PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, N_VECTORS = range(8)
+
+
+def options_array(
+    A: ArrayLike, b: ArrayLike, c: ArrayLike, inner_tol: float, outer_tol: float, divisor: float
+) -> NDArray[np.float64]:
+    """The parameter block that the steps of this file read."""
+    A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
+    scalars = np.array([float(len(b)), inner_tol, outer_tol, divisor])
+    return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
+
+
+def memory_size(s: int, n_q: int) -> int:
+    """Length of `memory` for s stages and n_q coordinates."""
+    return N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + s
+
+
+@inlined
+def _tableau(options):
+    s = int(options[STAGES])
+    o = N_SCALARS
+    A = options[o : o + s * s].reshape((s, s))
+    A2 = options[o + s * s : o + 2 * s * s].reshape((s, s))
+    o += 2 * s * s
+    return s, A, A2, options[o : o + s], options[o + s : o + 2 * s], options[o + 2 * s : o + 3 * s]
+
+
+@inlined
+def _block(memory, s, n, which):
+    start = N_MEMORY_SCALARS + which * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def _vector(memory, s, n, which):
+    start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
+    return memory[start : start + n]
+
+
+@inlined
+def _interpolate(c, theta, A_stage, weights, a):
+    """The polynomial through (c_j, A_stage_j) at theta."""
+    s = c.size
+    for j in range(s):
+        product = 1.0
+        for k in range(s):
+            if k != j:
+                product *= (theta - c[k]) / (c[j] - c[k])
+        weights[j] = product
+    for m in range(a.size):
+        total = 0.0
+        for j in range(s):
+            total += weights[j] * A_stage[j, m]
+        a[m] = total
+
+
+@inlined
+def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
+    """One step of size h from (q, v) by sweeps on the stage accelerations; A_stage holds their prediction on entry.
+
+    Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
+    undamped systems the sweep's rate is the square of the first-order one. On return A_stage has converged and
+    (q1, v1) is the end of the step, on the constraints.
+    """
+    s, A, A2, b, bA, c = _tableau(options)
+    n = q.size
+    tolerance = options[INNER_TOL]
+    for j in range(s):
+        for m in range(n):
+            total = 0.0
+            for k in range(s):
+                total += A2[j, k] * A_stage[k, m]
+            Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
+    first = 0.0
+    before = 0.0
+    converged = False
+    for sweep in range(MAX_SWEEPS):
+        w.counters[N_OUTER] += 1
+        # all stages are set before any is evaluated: Gauss-Seidel would converge for smaller h only
+        for j in range(s):
+            for m in w.independent:
+                in_q = 0.0
+                in_v = 0.0
+                for k in range(s):
+                    in_q += A2[j, k] * A_stage[k, m]
+                    in_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * in_q
+                V_stage[j, m] = v[m] + h * in_v
+        change = 0.0
+        for j in range(s):
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1, w.lam)
+            if code != DONE:
+                return code
+            for m in w.independent:
+                difference = h * abs(q1[m] - A_stage[j, m])
+                change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
+                change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
+            for m in range(n):
+                A_stage[j, m] = q1[m]
+        if change <= options[OUTER_TOL]:
+            converged = True
+            break
+        if sweep == 0:
+            first = change
+        elif not change <= GROWTH * first:
+            return OUTER_DIVERGED
+        elif change >= before:
+            if change <= ROUNDING_FLOOR:
+                converged = True
+                break
+            if sweep >= PATIENCE:
+                return OUTER_DIVERGED
+        before = change
+    if not converged:
+        return OUTER_DIVERGED
+    for m in range(n):
+        in_q = 0.0
+        in_v = 0.0
+        for k in range(s):
+            in_q += bA[k] * A_stage[k, m]
+            in_v += b[k] * A_stage[k, m]
+        q1[m] = q[m] + h * v[m] + h * h * in_q
+        v1[m] = v[m] + h * in_v
+    code = positions(f, w, t + h, q1, tolerance)
+    if code == DONE:
+        code = velocities(f, w, t + h, q1, v1)
+    return code
+
+
+@inlined
+def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
+    """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
+
+    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. The stages are swept
+    in the manner of Jacobi. On return (q1, v1) is the end of the step, on the constraints.
+    """
+    s, A, _, b, _, c = _tableau(options)
+    n = q.size
+    tolerance = options[INNER_TOL]
+    for m in range(n):
+        q1[m] = q[m] + h * v[m]
+        v1[m] = v[m] + h * a[m]
+    code = evaluate(f, w, t + h, q1, v1, tolerance, A_stage[0], w.lam)
+    if code != DONE:
+        return code
+    for j in range(s):
+        for m in range(n):
+            A_stage[j, m] = A_stage[0, m]
+            V_stage[j, m] = v1[m]
+            Q_stage[j, m] = q1[m]
+    norm_before = np.inf
+    for _ in range(MAX_SWEEPS_PAPER):
+        w.counters[N_OUTER] += 1
+        for m in w.independent:
+            for j in range(s):
+                total = 0.0
+                for k in range(s):
+                    total += A[j, k] * V_stage[k, m]
+                Q_stage[j, m] = q[m] + h * total
+            for j in range(s):
+                total = 0.0
+                for k in range(s):
+                    total += A[j, k] * A_stage[k, m]
+                V_stage[j, m] = v[m] + h * total
+        for j in range(s):
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j], w.lam)
+            if code != DONE:
+                return code
+        for m in range(n):
+            q_old[m] = q1[m]
+            v_old[m] = v1[m]
+        change = 0.0
+        for m in w.independent:
+            in_q = 0.0
+            in_v = 0.0
+            for k in range(s):
+                in_q += b[k] * V_stage[k, m]
+                in_v += b[k] * A_stage[k, m]
+            q1[m] = q[m] + h * in_q
+            v1[m] = v[m] + h * in_v
+            change = max(change, abs(q1[m] - q_old[m]) / max(abs(q1[m]), 1.0))
+            change = max(change, abs(v1[m] - v_old[m]) / max(abs(v1[m]), 1.0))
+        code = positions(f, w, t + h, q1, tolerance)
+        if code == DONE:
+            code = velocities(f, w, t + h, q1, v1)
+        if code != DONE:
+            return code
+        if change <= options[OUTER_TOL]:  # (32)
+            return DONE
+        norm = 0.0
+        for m in range(n):
+            norm += (q1[m] - q_old[m]) ** 2 + (v1[m] - v_old[m]) ** 2
+        norm = np.sqrt(norm)
+        if not norm <= norm_before:  # (33)
+            return OUTER_DIVERGED
+        norm_before = norm
+    return OUTER_DIVERGED
+
+
+@inlined
+def _richardson_norm(tolerances, divisor, q, v, q_full, v_full, q1, v1):
+    """Eqs. (26), (27) over positions and velocities, dependent and independent."""
+    atol = tolerances[ATOL]
+    rtol = tolerances[RTOL]
+    n = q.size
+    total = 0.0
+    for m in range(n):
+        scale = atol + rtol * max(abs(q[m]), abs(q_full[m]))
+        total += ((q_full[m] - q1[m]) / scale) ** 2
+        scale = atol + rtol * max(abs(v[m]), abs(v_full[m]))
+        total += ((v_full[m] - v1[m]) / scale) ** 2
+    return np.sqrt(total / (2 * n)) / divisor
+
+
+@kernel(STEP)
+def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt by sweeps on the accelerations; the result is that of the two half steps where error is estimated.
+
+    Stages are predicted from the polynomial through the stage accelerations of the last accepted step, those of the
+    half steps from the whole step's.
+    """
+    s, _, _, _, _, c = _tableau(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    previous = _block(memory, s, n, PREVIOUS)
+    trial = _block(memory, s, n, TRIAL)
+    half = _block(memory, s, n, HALF)
+    Q_stage = _block(memory, s, n, Q_STAGE)
+    V_stage = _block(memory, s, n, V_STAGE)
+    q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
+    q_mid, v_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID)
+    weights = memory[memory.size - s :]
+    if memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0:
+        previous[:, :] = trial
+        memory[H_PREVIOUS] = memory[H_TRIAL]
+        memory[HAS_PREVIOUS] = 1.0
+    memory[HAS_TRIAL] = 0.0
+    ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
+    for j in range(s):
+        if ratio <= FARTHEST:
+            _interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
+        else:
+            trial[j, :] = a
+    code = sweep_accelerations(f, w, options, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
+    if code != DONE:
+        return code, np.inf
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        q_full[:] = q1
+        v_full[:] = v1
+        for j in range(s):
+            _interpolate(c, 0.5 * c[j], trial, weights, half[j])
+        code = sweep_accelerations(f, w, options, t, 0.5 * h, q, v, half, Q_stage, V_stage, q_mid, v_mid)
+        if code != DONE:
+            return code, np.inf
+        for j in range(s):
+            _interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
+        code = sweep_accelerations(f, w, options, t + 0.5 * h, 0.5 * h, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
+        if code != DONE:
+            return code, np.inf
+        error = _richardson_norm(tolerances, options[DIVISOR], q, v, q_full, v_full, q1, v1)
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    memory[HAS_TRIAL] = 1.0
+    memory[H_TRIAL] = h
+    return code, error
+
+
+@kernel(STEP)
+def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt in the manner of the paper (Sects. 3.1-3.3): a step of h, two of h/2, their difference the error."""
+    s, _, _, _, _, _ = _tableau(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    A_stage = _block(memory, s, n, TRIAL)
+    Q_stage = _block(memory, s, n, Q_STAGE)
+    V_stage = _block(memory, s, n, V_STAGE)
+    q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
+    q_mid, v_mid, a_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID), _vector(memory, s, n, A_MID)
+    q_old, v_old = _vector(memory, s, n, Q_OLD), _vector(memory, s, n, V_OLD)
+    code = sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
+    if code != DONE:
+        return code, np.inf
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        q_full[:] = q1
+        v_full[:] = v1
+        g = 0.5 * h
+        code = sweep_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
+        if code == DONE:
+            code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
+        if code != DONE:
+            return code, np.inf
+        code = sweep_first_order(
+            f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
+        )
+        if code != DONE:
+            return code, np.inf
+        error = _richardson_norm(tolerances, options[DIVISOR], q, v, q_full, v_full, q1, v1)
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    return code, error
+
+
+STEPS: dict[str, Any] = {"fixed-point": runge_kutta_step, "paper": paper_step}

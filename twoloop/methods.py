@@ -1,0 +1,270 @@
+"""What a user chooses: RungeKutta(...), Newmark(...) and the presets. Frozen options, no state."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
+
+Array = NDArray[np.float64]
+
+# Newton in the inner loop converges quadratically and is tested on its last correction: this leaves rounding only
+INNER_TOL = 1e-8
+OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
+OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+NEWMARK_OUTER_SHARE = 1e-3  # of err_out; Newmark sweeps converge so fast that this costs next to nothing
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
+
+    step: Any
+    options: Array
+    memory: Array
+    exponent: float
+    safety: float = 0.9
+    factor_min: float = 0.2
+    factor_max: float = 5.0
+    limit_start: float = np.inf
+    limit_factor: float = 0.7
+    limit_memory: int = 10
+
+
+class Method(Protocol):
+    """What solve_dae needs of a method."""
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        ...
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        ...
+
+
+def _check_tolerance(name: str, value: float | None) -> None:
+    if value is None:
+        return
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)):
+        raise TypeError(f"{name} must be a number or None; given {value!r} of type {type(value).__name__}")
+    if not 0.0 < value < np.inf:
+        raise ValueError(f"{name} must be positive and finite; given {value!r}")
+
+
+@dataclass(frozen=True)
+class RungeKutta:
+    """Two-loop procedure with an implicit Runge-Kutta method.
+
+    Parameters
+    ----------
+    tableau : Tableau
+        Any tableau of `twoloop.tableaux`.
+    outer : {"fixed-point", "paper"}
+        "fixed-point": sweeps on the stage accelerations, predicted from the step before, with a growth test.
+        "paper": sweeps on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
+    error : {"richardson", "richardson-undivided"}
+        Difference between one step of h and two of h/2, divided by 2^order - 1 or, as printed in (26), not.
+        Either way the step continues from the two half steps.
+    inner_tol : float, optional
+        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
+    outer_tol : float, optional
+        The outer loop stops when no independent velocity or position changes by more than this, relative to
+        max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is not one of those named, or a tolerance is not positive.
+    """
+
+    tableau: Tableau
+    outer: Literal["fixed-point", "paper"] = "fixed-point"
+    error: Literal["richardson", "richardson-undivided"] = "richardson"
+    inner_tol: float | None = None
+    outer_tol: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.tableau, Tableau):
+            raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {self.tableau!r}")
+        if self.outer not in ("fixed-point", "paper"):
+            raise ValueError(f"outer must be 'fixed-point' or 'paper'; given {self.outer!r}")
+        if self.error not in ("richardson", "richardson-undivided"):
+            raise ValueError(f"error must be 'richardson' or 'richardson-undivided'; given {self.error!r}")
+        _check_tolerance("inner_tol", self.inner_tol)
+        _check_tolerance("outer_tol", self.outer_tol)
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return f"{self.tableau.name}, {self.outer}"
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels import runge_kutta as kernels
+
+        tableau = self.tableau
+        outer_tol = self.outer_tol
+        if outer_tol is None:
+            outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * min(rtol, atol)
+        options = kernels.options_array(
+            tableau.A,
+            tableau.b,
+            tableau.c,
+            INNER_TOL if self.inner_tol is None else self.inner_tol,
+            outer_tol,
+            2.0**tableau.order - 1.0 if self.error == "richardson" else 1.0,
+        )
+        memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
+        step = kernels.STEPS[self.outer]
+        exponent = 1.0 / (tableau.order + 1)
+        if self.outer == "paper":
+            return Plan(
+                step,
+                options,
+                memory,
+                exponent,
+                factor_min=0.5,
+                limit_start=1.0,
+                limit_factor=1.0,
+                limit_memory=0,
+            )
+        return Plan(step, options, memory, exponent)
+
+
+@dataclass(frozen=True)
+class Newmark:
+    """Two-loop procedure with Newmark's method, the outer loop by fixed point on the independent accelerations.
+
+    Parameters
+    ----------
+    beta, gamma : float
+        Parameters of (12), in which beta = 1/4 is the average-acceleration method.
+    error_tol : float, optional
+        err_out of the paper: a step is accepted when |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this. None:
+        the same estimate as a root mean square weighted by atol + rtol |q|.
+    inner_tol : float, optional
+        Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
+    outer_tol : float, optional
+        The outer loop stops when no independent velocity or position would change by more than this, relative to
+        max(|value|, 1). None: 1e-3 error_tol or 0.01 min(rtol, atol); with fixed steps 1e-14.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is out of range.
+    """
+
+    beta: float = 0.25
+    gamma: float = 0.5
+    error_tol: float | None = None
+    inner_tol: float | None = None
+    outer_tol: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.beta <= 1.0:
+            raise ValueError(f"beta must be between 0 and 1; given {self.beta!r}")
+        if not 0.0 <= self.gamma <= 1.0:
+            raise ValueError(f"gamma must be between 0 and 1; given {self.gamma!r}")
+        for name in ("error_tol", "inner_tol", "outer_tol"):
+            _check_tolerance(name, getattr(self, name))
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return f"Newmark(beta={self.beta:g}, gamma={self.gamma:g})"
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels import newmark as kernels
+
+        if self.outer_tol is not None:
+            outer_tol = self.outer_tol
+        elif fixed:
+            outer_tol = OUTER_TOL_FIXED
+        elif self.error_tol is not None:
+            outer_tol = NEWMARK_OUTER_SHARE * self.error_tol
+        else:
+            outer_tol = OUTER_SHARE * min(rtol, atol)
+        options = np.zeros(kernels.N_OPTIONS)
+        options[kernels.BETA] = self.beta
+        options[kernels.GAMMA] = self.gamma
+        options[kernels.INNER_TOL] = INNER_TOL if self.inner_tol is None else self.inner_tol
+        options[kernels.OUTER_TOL] = outer_tol
+        options[kernels.ERROR_TOL] = 0.0 if self.error_tol is None else self.error_tol
+        return Plan(
+            kernels.newmark_step,
+            options,
+            np.zeros(1 + n_q),
+            exponent=1.0 / 3.0,
+            factor_min=0.5,
+            limit_start=1.0 if self.error_tol is not None else np.inf,
+        )
+
+
+def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
+    """The paper's procedure with Sun's 3-stage Radau IIB; run it with rtol = atol = 1e-5 to follow Sect. 4.1.
+
+    As printed: coordinate partitioning by LU; eqs. (14), (15) for the dependents at every stage; explicit Euler
+    prediction for all stages; the outer loop ends by (32), is given up by (33); the error is (26), (27), the
+    difference of one step and two half steps undivided; the next step by (31), (34) with fac = 0.9, facmax = 5,
+    facmin = 0.5 and h_max = 1 s at the beginning of each step; after (33) h_max = h and the step is halved.
+
+    Where this differs from the printed text, and why:
+
+    - (32): the printed denominator max(Delta(y_i), 1) compares a difference with itself; max(|y_i|, 1) is used.
+    - (26): "Rotol" is read as Rtol. (27): n is 2 n_q, because z holds positions and velocities.
+    - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
+    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta sweep iterates the K_i, and so does this.
+    - Left open by the text and chosen: stages swept in the manner of Jacobi; the accepted state is that of the two
+      half steps; Newton starts from the last iterate of the same stage; err_in bounds the largest correction;
+      200 sweeps at the most; the first step size, by solve_dae; c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
+    - "Once in a time step or several time steps": the partition is checked at every step, and chosen anew when the
+      pivot ratio of C_qd has fallen to a tenth of its best, and after every step that did not converge.
+
+    Parameters
+    ----------
+    inner_tol, outer_tol : float
+        err_in (largest Newton correction of a position) and err_out (epsilon_tol of (32)).
+    """
+    return RungeKutta(sun_radau_iib(3), "paper", "richardson-undivided", inner_tol, outer_tol)
+
+
+def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float = 0.5) -> Newmark:
+    """The two-loop procedure with Newmark's method that the paper compares with; beta = 1/2 as printed.
+
+    As printed: (12) with beta = gamma = 1/2; the outer loop by (11) and (12) with the inner loop between them.
+
+    Where this differs from the printed text, and why:
+
+    - beta = 1/2 is not the average-acceleration method in the form (12), 1/4 is: the leading error is four times
+      larger. Both can be chosen; the printed one is the default.
+    - The paper refers to Hussein and Shabana for error control and convergence. err_out is taken as the tolerance
+      of the local error |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 (Zienkiewicz and Xie 1991), with the step factor
+      0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: only so does the cost grow as in Table 3.
+    - The outer loop stops when y_i would change by less than err_out / 1000, relative to max(|y_i|, 1); it is given
+      up when the differences grow.
+    - Newton starts from the Taylor polynomial of the dependents, not from the last position.
+    - The partition is renewed as in `paper_irk`.
+
+    Parameters
+    ----------
+    inner_tol, outer_tol : float
+        err_in (largest Newton correction of a position) and err_out (tolerance of the step error, unit of q).
+    beta : float
+        Parameter of (12).
+    """
+    return Newmark(beta=beta, gamma=0.5, error_tol=outer_tol, inner_tol=inner_tol)
+
+
+PRESETS: dict[str, Method] = {
+    "SunRadau5": RungeKutta(sun_radau_iib(3)),
+    **{f"Gauss{2 * s}": RungeKutta(gauss(s)) for s in range(2, 9)},
+    "RadauIIA5": RungeKutta(radau_iia(3)),
+    "Newmark": Newmark(),
+    "PaperIRK": paper_irk(),
+    "PaperNewmark": paper_newmark(),
+}

@@ -1,0 +1,105 @@
+"""What a run returns: Result, Status, Statistics."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Status(IntEnum):
+    """How a run ended: 0 reached the end, 1 an event, negative a failure."""
+
+    REACHED_END = 0
+    EVENT = 1
+    STEP_TOO_SMALL = -1
+    MAX_STEPS = -2
+    NOT_CONVERGED = -3
+    NOT_FINITE = -4
+    RANK_LOST = -5
+    SOLVER_FAILED = -6
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Counts and CPU time of a run; None where a foreign solver does not tell.
+
+    Attributes
+    ----------
+    n_accepted, n_rejected_error, n_rejected_convergence : int or None
+        Steps accepted, steps that failed the error test, steps whose loops did not converge.
+    n_outer : int or None
+        Sweeps of the outer loop (a sweep evaluates every stage once).
+    n_inner : int or None
+        Newton iterations of the inner loop.
+    n_evaluations : int or None
+        Solutions of eq. (6) for accelerations and multipliers.
+    n_partitions : int or None
+        Coordinate partitionings, the first included.
+    n_factorizations : int or None
+        Matrix factorisations of C_qd, of C_q M^-1 C_q^T, and those of the partitionings.
+    cpu_time : float
+        Process time of the integration, s; compilation and checks of the input not included.
+    """
+
+    n_accepted: int | None = None
+    n_rejected_error: int | None = None
+    n_rejected_convergence: int | None = None
+    n_outer: int | None = None
+    n_inner: int | None = None
+    n_evaluations: int | None = None
+    n_partitions: int | None = None
+    n_factorizations: int | None = None
+    cpu_time: float = 0.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """A trajectory, how the run ended, and what it cost.
+
+    Attributes
+    ----------
+    t : ndarray (n_t,)
+        Times, s.
+    q, v, a : ndarray (n_q, n_t)
+        Coordinates, velocities, accelerations: one column an instant.
+    lam : ndarray (n_c, n_t)
+        Multipliers of M a + C_q^T lam = Q.
+    h : ndarray
+        Sizes of the accepted steps, s.
+    status : Status
+        0: reached the end; 1: an event; negative: failed.
+    message : str
+        What happened and, after a failure, what to try.
+    stats : Statistics
+        Counts and CPU time.
+    sol, t_events
+        None: dense output and events are not available yet.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    lam: Array
+    h: Array
+    status: Status
+    message: str
+    stats: Statistics
+    sol: Callable[[float], Array] | None = None
+    t_events: list[Array] | None = None
+
+    @property
+    def success(self) -> bool:
+        """Whether the run reached its end or an event."""
+        return self.status >= 0
+
+    def __repr__(self) -> str:
+        counts = ", ".join(
+            f"{f.name}={getattr(self.stats, f.name)}" for f in fields(self.stats) if getattr(self.stats, f.name) is not None
+        )
+        end = f"t[-1]={self.t[-1]:g}" if self.t.size else "no output"
+        return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"

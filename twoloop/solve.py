@@ -1,0 +1,465 @@
+"""solve_dae: checks the input, drives the compiled integrator in chunks, assembles the Result."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.kernels import common
+from twoloop.methods import PRESETS, Method, Plan
+from twoloop.result import Result, Statistics, Status
+from twoloop.system import ConstrainedSystem, check_size, check_vector
+
+Array = NDArray[np.float64]
+
+CONSISTENT = 1e-8  # largest violation that an initial state may have, relative to max(1, |q|) or max(1, |v|)
+BUFFER_ROWS = 1024
+BUFFER_STEPS = 4096
+
+
+def solve_dae(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    method: str | Method = "SunRadau5",
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    *,
+    t_eval: ArrayLike | None = None,
+    first_step: float | None = None,
+    max_step: float = np.inf,
+    max_steps: int | None = None,
+    step_size: float | None = None,
+    dense_output: bool = False,
+    events: Any = None,
+    progress: bool | None = None,
+) -> Result:
+    """Integrate a constrained mechanical system by a two-loop procedure.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem.
+    t_span : (float, float)
+        Start and end, s; the end after the start.
+    q0, v0 : array_like (n_q,)
+        Consistent initial coordinates and velocities (see `consistent_state`).
+    method : str or method object
+        "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "PaperIRK", "PaperNewmark", or an
+        object: `RungeKutta(...)`, `Newmark(...)`.
+    rtol, atol : float
+        A step is accepted when the root mean square of error / (atol + rtol |value|) over all positions and
+        velocities is at most 1. A `Newmark` with `error_tol` has its own test.
+    t_eval : array_like, optional
+        Increasing times in t_span at which to store the solution; steps are shortened to land on them. None: every
+        accepted step is stored.
+    first_step : float, optional
+        First step to try, s. None: chosen from the accelerations at the start.
+    max_step : float
+        Largest step, s.
+    max_steps : int, optional
+        Largest number of accepted steps. None: no limit.
+    step_size : float, optional
+        Constant step, s: no error control; only the last step is shortened, to end at t_span[1]. Times in `t_eval`
+        must then be multiples of it. A step that does not converge ends the run.
+    dense_output, events
+        Not available yet.
+    progress : bool, optional
+        True: show a bar (needs the package rich).
+
+    Returns
+    -------
+    Result
+        After a failure, with what was computed so far, `success=False` and a message that says what to try.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong: before any work, naming it. An exception of a Python callback comes through
+        unchanged, with a note that says which callback and at what time.
+    NotImplementedError
+        If `dense_output` or `events` is asked for.
+    """
+    if dense_output:
+        raise NotImplementedError("dense_output is not available yet; use t_eval to get the solution at given times")
+    if events is not None:
+        raise NotImplementedError("events are not available yet; search the stored solution (t_eval) instead")
+    if not isinstance(system, ConstrainedSystem):
+        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
+    method = _check_method(method)
+    t0, t1 = _check_span(t_span)
+    q0 = check_vector("q0", q0, system.n_q)
+    v0 = check_vector("v0", v0, system.n_q)
+    _check_positive("rtol", rtol)
+    _check_positive("atol", atol)
+    if first_step is not None:
+        _check_positive("first_step", first_step)
+    _check_positive("max_step", max_step, infinite=True)
+    if step_size is not None:
+        _check_positive("step_size", step_size)
+        if step_size > t1 - t0:
+            raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
+        if first_step is not None or max_step != np.inf:
+            raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
+    if max_steps is not None:
+        check_size("max_steps", max_steps, 1)
+    times = None if t_eval is None else _check_times(t_eval, t0, t1, step_size)
+    check_start(system, t0, q0, v0)
+
+    plan = method.plan(system.n_q, float(rtol), float(atol), step_size is not None)
+    run = _Run(system, plan, t0, q0, v0, float(rtol), float(atol), step_size)
+    if step_size is None:
+        run.set_sizes(first_step, float(max_step), t1)
+    if max_steps is not None:
+        run.control[run.a.MAX_STEPS] = max_steps
+    with _progress_bar(progress, method.name, t0, t1) as report:
+        return run.go(t1, times, report)
+
+
+class _Run:
+    """The arrays of one run, and the loop over the chunks that the compiled `advance` returns."""
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        plan: Plan,
+        t0: float,
+        q0: Array,
+        v0: Array,
+        rtol: float,
+        atol: float,
+        step_size: float | None,
+    ):
+        from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
+
+        self.a = advance
+        self.system, self.plan, self.t0 = system, plan, t0
+        self.work = common.make_work(system.n_q, system.n_c)
+        flags = system.functions.flags.copy()
+        if system.constant_mass:
+            mass = system.mass(t0, q0)
+            flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+        self.functions = system.functions._replace(flags=flags)
+        self.state = np.concatenate([q0, v0, np.zeros(system.n_q + system.n_c)])
+        self.tolerances = np.zeros(common.N_TOLERANCES)
+        self.tolerances[common.ATOL] = atol
+        self.tolerances[common.RTOL] = rtol
+        self.tolerances[common.ESTIMATE] = step_size is None
+        self.control = np.zeros(advance.N_CONTROL)
+        self.control[advance.SAFETY] = plan.safety
+        self.control[advance.FACTOR_MIN] = plan.factor_min
+        self.control[advance.FACTOR_MAX] = plan.factor_max
+        self.control[advance.EXPONENT] = plan.exponent
+        self.control[advance.MAX_STEP] = np.inf
+        self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
+        self.control[advance.LIMIT_START] = plan.limit_start
+        self.control[advance.LIMIT_FACTOR] = plan.limit_factor
+        self.control[advance.LIMIT_MEMORY] = plan.limit_memory
+        self.control[advance.MAX_STEPS] = np.inf
+        self.clock = np.zeros(advance.N_CLOCK)
+        self.clock[advance.T] = self.clock[advance.T_START] = t0
+        self.clock[advance.H_LIMIT] = plan.limit_start
+        self._begin()
+
+    def _begin(self) -> None:
+        code = self.a.start(*self.functions, self.work, self.t0, self.state)
+        if code == common.DONE:
+            return
+        n = self.system.n_q
+        q, v = self.state[:n], self.state[n : 2 * n]
+        if code == common.MASS_NOT_DEFINITE:
+            raise ValueError(
+                f"mass of {self.system.name!r} must be positive definite; its smallest eigenvalue at t = {self.t0!r} "
+                f"is {np.linalg.eigvalsh(self.system.mass(self.t0, q)).min():.3g}"
+            )
+        raise ValueError(
+            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: "
+            f"{_blame(self.system, self.t0, q, v)}"
+        )
+
+    def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
+        """Set the first and the largest step."""
+        if first_step is None:
+            # Hairer, Norsett & Wanner I, II.4: one per cent of the state's scale over its rate
+            n = self.system.n_q
+            z, rate = self.state[: 2 * n], self.state[n : 3 * n]
+            scale = self.tolerances[common.ATOL] + self.tolerances[common.RTOL] * np.abs(z)
+            size, speed = np.linalg.norm(z / scale), np.linalg.norm(rate / scale)
+            first_step = 0.01 * size / speed if size > 1e-5 and speed > 1e-5 else 1e-6
+        self.clock[self.a.H_NEXT] = min(first_step, t1 - self.t0)
+        self.control[self.a.MAX_STEP] = max_step
+
+    def go(self, t1: float, times: Array | None, report: Any) -> Result:
+        """Advance to t1, chunk by chunk, and assemble the result."""
+        a, system = self.a, self.system
+        every_step = times is None
+        outputs = np.array([t1]) if times is None else np.append(times[times > self.t0], t1)
+        if len(outputs) > 1 and outputs[-2] == t1:
+            outputs = outputs[:-1]
+        self.control[a.STORE_ALL] = every_step
+        first_row = every_step or (times is not None and times[0] == self.t0)
+        t_parts = [np.array([self.t0])] if first_row else []
+        rows = [self.state.copy()[None, :]] if first_row else []
+        h_parts: list[Array] = []
+        out_t, out_h = np.empty(BUFFER_ROWS), np.empty(BUFFER_STEPS)
+        out_state = np.empty((BUFFER_ROWS, len(self.state)))
+        filled = np.zeros(2, dtype=np.int64)
+        cpu = 0.0
+        code = a.BUFFER_FULL
+        while code == a.BUFFER_FULL:
+            began = time.process_time()
+            code = a.advance(
+                *self.functions,
+                self.work,
+                self.plan.step,
+                self.plan.options,
+                self.plan.memory,
+                self.tolerances,
+                self.control,
+                self.clock,
+                self.state,
+                outputs,
+                out_t,
+                out_state,
+                out_h,
+                filled,
+            )
+            cpu += time.process_time() - began
+            t_parts.append(out_t[: filled[0]].copy())
+            rows.append(out_state[: filled[0]].copy())
+            h_parts.append(out_h[: filled[1]].copy())
+            report(self.clock[a.T])
+        t = np.concatenate(t_parts)
+        table = np.concatenate(rows)
+        if times is not None and times[-1] != t1 and len(t) > 0 and t[-1] == t1:
+            t, table = t[:-1], table[:-1]
+        n = system.n_q
+        status, message = self._outcome(code)
+        return Result(
+            t=t,
+            q=table[:, :n].T,
+            v=table[:, n : 2 * n].T,
+            a=table[:, 2 * n : 3 * n].T,
+            lam=table[:, 3 * n :].T,
+            h=np.concatenate(h_parts),
+            status=status,
+            message=message,
+            stats=self._statistics(cpu),
+        )
+
+    def _statistics(self, cpu: float) -> Statistics:
+        c = self.work.counters
+        return Statistics(
+            n_accepted=int(c[common.N_ACCEPTED]),
+            n_rejected_error=int(c[common.N_REJECTED_ERROR]),
+            n_rejected_convergence=int(c[common.N_REJECTED_CONVERGENCE]),
+            n_outer=int(c[common.N_OUTER]),
+            n_inner=int(c[common.N_INNER]),
+            n_evaluations=int(c[common.N_EVALUATIONS]),
+            n_partitions=int(c[common.N_PARTITIONS]),
+            n_factorizations=int(c[common.N_FACTORIZATIONS]),
+            cpu_time=cpu,
+        )
+
+    def _outcome(self, code: int) -> tuple[Status, str]:
+        """Status and message for what `advance` returned."""
+        a, t = self.a, float(self.clock[self.a.T])
+        n = self.system.n_q
+        if code == a.ALL_OUTPUT_DONE:
+            return Status.REACHED_END, f"Reached the end, t = {t:g}."
+        if code == a.MAX_STEPS_REACHED:
+            taken = int(self.control[a.MAX_STEPS])
+            return (
+                Status.MAX_STEPS,
+                f"Stopped at t = {t:.10g} after max_steps = {taken} accepted steps. Raise max_steps, loosen rtol and "
+                "atol, or shorten t_span.",
+            )
+        if code == a.RANK_LOST:
+            return (
+                Status.RANK_LOST,
+                f"Stopped at t = {t:.10g}: the constraint Jacobian has lost rank there "
+                f"({_dependent_rows(self.system, t, self.state[:n])}), so no choice of independent coordinates exists. "
+                "Redundant constraints and singular positions are not handled yet: end t_span before, or change the "
+                "geometry.",
+            )
+        failure = int(self.clock[a.FAILURE_CODE])
+        if failure == common.NOT_FINITE:
+            # the last attempt began at t: look where it went, to name the callback
+            end = t + float(self.clock[a.H_FAILED])
+            blame = _blame(self.system, end, self.state[:n], self.state[n : 2 * n])
+            return (
+                Status.NOT_FINITE,
+                f"Stopped at t = {t:.10g}: a value that is not finite came up just after it ({blame}). The result "
+                "holds what was computed before.",
+            )
+        reason = _REASONS[failure]
+        if code == a.FIXED_STEP_FAILED:
+            return (
+                Status.NOT_CONVERGED,
+                f"Stopped at t = {t:.10g}: with the fixed step_size = {self.control[a.FIXED_STEP]:g} {reason}. "
+                "Take a smaller step_size, or leave it out for step-size control.",
+            )
+        return (
+            Status.STEP_TOO_SMALL,
+            f"Stopped at t = {t:.10g}: the step size fell below the spacing of floating-point numbers; at the last "
+            f"attempt {reason}. Look for a discontinuity or a singular position near this time, loosen rtol and "
+            "atol, or use coordinates of similar scale.",
+        )
+
+
+_REASONS = {
+    common.DONE: "the error estimate stayed above the tolerances",
+    common.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    common.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
+    common.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
+    common.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
+}
+
+
+def _check_method(method: str | Method) -> Method:
+    known = ", ".join(PRESETS)
+    if isinstance(method, str):
+        if method not in PRESETS:
+            raise ValueError(f"method must be one of {known}, or a method object; given {method!r}")
+        return PRESETS[method]
+    if isinstance(method, type) or not callable(getattr(method, "plan", None)):
+        raise TypeError(f"method must be a name ({known}) or an object such as RungeKutta(gauss(3)); given {method!r}")
+    return method
+
+
+def _check_span(t_span: tuple[float, float]) -> tuple[float, float]:
+    span = check_vector("t_span", t_span, 2)
+    t0, t1 = float(span[0]), float(span[1])
+    if not t1 > t0:
+        raise ValueError(f"t_span must be (start, end) with end > start; given ({t0!r}, {t1!r})")
+    return t0, t1
+
+
+def _check_positive(name: str, value: Any, infinite: bool = False) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{name} must be a number; given {value!r} of type {type(value).__name__}")
+    if not value > 0.0 or (not infinite and value == np.inf):
+        raise ValueError(f"{name} must be positive{'' if infinite else ' and finite'}; given {value!r}")
+
+
+def _check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None) -> Array:
+    times = np.array(t_eval, dtype=np.float64)
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
+    if not np.isfinite(times).all() or times.min() < t0 or times.max() > t1:
+        raise ValueError(
+            f"t_eval must lie within t_span = ({t0:g}, {t1:g}); given times from {times.min():g} to {times.max():g}"
+        )
+    if (np.diff(times) <= 0.0).any():
+        where = int(np.flatnonzero(np.diff(times) <= 0.0)[0])
+        raise ValueError(
+            f"t_eval must be strictly increasing; entry {where + 1} ({times[where + 1]:g}) follows {times[where]:g}"
+        )
+    if step_size is not None:
+        ratio = (times - t0) / step_size
+        off = np.abs(ratio - np.round(ratio)) > 1e-6
+        off &= times != t1
+        if off.any():
+            raise ValueError(
+                f"t_eval must hold multiples of step_size = {step_size!r} from t = {t0:g} when the step is fixed; "
+                f"{times[off][0]!r} is not one"
+            )
+    return times
+
+
+def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> None:
+    """Call every callback once at the start and check shapes, finiteness, rank and consistency.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Naming the callback or the argument, what was found and what to do.
+    """
+    matrix = system.mass(t0, q0)
+    jacobian = system.jacobian(t0, q0)
+    blame = _blame(system, t0, q0, v0)
+    if blame != _NOTHING_FOUND:
+        raise ValueError(f"at the start, t = {t0:g}, {blame}")
+    if np.abs(matrix - matrix.T).max() > 1e-10 * np.abs(matrix).max():
+        raise ValueError(
+            f"mass of {system.name!r} must be symmetric; at t = {t0:g} max|M - M^T| is "
+            f"{np.abs(matrix - matrix.T).max():.3g}"
+        )
+    redundant = redundant_rows(jacobian)
+    if redundant:
+        raise ValueError(
+            f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} at "
+            f"t = {t0:g}: row(s) {redundant} depend on the others. Leave these constraints out (redundant constraints "
+            "are not handled yet), or start from another position"
+        )
+    for name, violation, scale in (
+        ("q0", system.constraint(t0, q0), np.abs(q0).max()),
+        ("v0", system.velocity_constraint(t0, q0, v0), np.abs(v0).max()),
+    ):
+        row = int(np.abs(violation).argmax())
+        if abs(violation[row]) > CONSISTENT * max(1.0, scale):
+            equation = "C(t, q)" if name == "q0" else "C_q v + C_t"
+            raise ValueError(
+                f"{name} is not consistent with the constraints of {system.name!r}: max|{equation}| is "
+                f"{abs(violation[row]):.3g} (row {row}) at t = {t0:g}, at most {CONSISTENT:g} is accepted. Project it "
+                "with twoloop.consistent_state(system, t, q, v)"
+            )
+
+
+def redundant_rows(jacobian: Array) -> list[int]:
+    """Rows of a Jacobian that depend on the others: those that full pivoting leaves without a pivot."""
+    A = jacobian.copy()
+    rows = np.arange(A.shape[0])
+    largest = np.abs(A).max()
+    for k in range(A.shape[0]):
+        i, j = np.unravel_index(np.abs(A[k:]).argmax(), A[k:].shape)
+        i += k
+        if not abs(A[i, j]) > 1e-11 * largest:
+            return sorted(int(r) for r in rows[k:])
+        A[[k, i]], rows[[k, i]] = A[[i, k]], rows[[i, k]]
+        A[k + 1 :] -= np.outer(A[k + 1 :, j] / A[k, j], A[k])
+        A[k + 1 :, j] = 0.0
+    return []
+
+
+def _dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
+    rows = redundant_rows(system.jacobian(t, q))
+    return f"row(s) {rows} depend on the others" if rows else "its pivots are below the rank tolerance"
+
+
+_NOTHING_FOUND = "no callback was found at fault"
+
+
+def _blame(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str:
+    """Which callback gives values that are not finite at (t, q, v)."""
+    values = {
+        "mass": lambda: system.mass(t, q),
+        "force": lambda: system.force(t, q, v),
+        "constraint": lambda: system.constraint(t, q),
+        "jacobian": lambda: system.jacobian(t, q),
+        "constraint_rate": lambda: system.constraint_rate(t, q),
+        "gamma": lambda: system.gamma(t, q, v),
+    }
+    guilty = [kind for kind, value in values.items() if not np.isfinite(value()).all()]
+    if not guilty:
+        return _NOTHING_FOUND
+    return f"{' and '.join(guilty)} of {system.name!r} returned values that are not finite"
+
+
+@contextmanager
+def _progress_bar(progress: bool | None, name: str, t0: float, t1: float) -> Iterator[Any]:
+    """A function that takes the time reached; draws a bar when asked to."""
+    if not progress:
+        yield lambda t: None
+        return
+    try:
+        from rich.progress import Progress
+    except ImportError as error:
+        raise ImportError("progress=True needs the package rich: pip install rich") from error
+    with Progress() as bar:
+        task = bar.add_task(f"{name}, t = {t0:g} to {t1:g} s", total=t1 - t0)
+        yield lambda t: bar.update(task, completed=t - t0)

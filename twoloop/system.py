@@ -1,0 +1,281 @@
+"""The problem: M(t, q) q'' + C_q^T lam = Q(t, q, v) with C(t, q) = 0, as compiled callbacks, sizes and parameters."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.callbacks import KINDS, PythonFunctions, compile_returning, no_gamma, no_rate
+from twoloop.callbacks import (
+    python_constraint,
+    python_constraint_rate,
+    python_force,
+    python_gamma,
+    python_jacobian,
+    python_mass,
+)
+from twoloop.kernels.common import CONSTANT_MASS, DIAGONAL_MASS, GAMMA_GIVEN, Functions
+
+Array = NDArray[np.float64]
+
+_THROUGH_PYTHON = {
+    "mass": python_mass,
+    "force": python_force,
+    "constraint": python_constraint,
+    "jacobian": python_jacobian,
+    "constraint_rate": python_constraint_rate,
+    "gamma": python_gamma,
+}
+
+
+def check_size(name: str, value: Any, least: int) -> int:
+    """Return `value` as an int of at least `least`, or say what is wrong with it."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name} must be an int; given {value!r} of type {type(value).__name__}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}; given {value}")
+    return int(value)
+
+
+class ConstrainedSystem:
+    """A constrained mechanical system, M(t, q) a + C_q^T lam = Q(t, q, v), C(t, q) = 0 (eq. (1) of the paper).
+
+    Parameters
+    ----------
+    n_q, n_c : int
+        Number of coordinates and of constraints, 1 <= n_c <= n_q.
+    mass, force, constraint, jacobian : compiled callbacks
+        M (n_q, n_q), symmetric and positive definite; Q (n_q,); C (n_c,); C_q (n_c, n_q). Each made by
+        `twoloop.callback`. For plain Python functions use `from_python`.
+    constraint_rate : compiled callback, optional
+        C_t (n_c,). None: the constraints do not depend on time.
+    gamma : compiled callback, optional
+        Q_d (n_c,) of C_q a = Q_d, that is -((C_q v)_q v + 2 C_qt v + C_tt). None: by differences of C_q and C_t.
+    parameters : array_like, optional
+        The vector `p` that every callback gets.
+    constant_mass : bool
+        True: M depends neither on t nor on q, and is factored once.
+    name : str
+        Shown in messages.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a size is not a sensible integer or a callback was not made by `twoloop.callback`.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_q: int,
+        n_c: int,
+        mass: Dispatcher,
+        force: Dispatcher,
+        constraint: Dispatcher,
+        jacobian: Dispatcher,
+        constraint_rate: Dispatcher | None = None,
+        gamma: Dispatcher | None = None,
+        parameters: ArrayLike = (),
+        constant_mass: bool = False,
+        name: str = "system",
+    ):
+        self.n_q = check_size("n_q", n_q, 1)
+        self.n_c = check_size("n_c", n_c, 1)
+        if self.n_c > self.n_q:
+            raise ValueError(f"n_c must not exceed n_q = {self.n_q}; given {self.n_c}")
+        self.name = name
+        self.parameters = np.array(parameters, dtype=np.float64).reshape(-1)
+        self.constant_mass = bool(constant_mass)
+        callbacks = {
+            "mass": mass,
+            "force": force,
+            "constraint": constraint,
+            "jacobian": jacobian,
+            "constraint_rate": no_rate if constraint_rate is None else constraint_rate,
+            "gamma": no_gamma if gamma is None else gamma,
+        }
+        for kind, function in callbacks.items():
+            arguments, signature = KINDS[kind]
+            if not isinstance(function, Dispatcher) or signature.args not in function.overloads:
+                raise TypeError(
+                    f"{kind} must be compiled by @twoloop.callback({kind!r}) with the arguments "
+                    f"({', '.join(arguments)}); given {function!r}. Plain Python functions enter by "
+                    "ConstrainedSystem.from_python"
+                )
+        flags = np.zeros(3, dtype=np.int64)
+        flags[CONSTANT_MASS] = self.constant_mass
+        flags[GAMMA_GIVEN] = gamma is not None
+        self.functions = Functions(**callbacks, p=self.parameters, flags=flags)
+        self._python: PythonFunctions | None = None
+
+    def __repr__(self) -> str:
+        return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
+
+    @classmethod
+    def from_python(
+        cls,
+        *,
+        n_q: int,
+        n_c: int,
+        mass: Callable[[float, Array], ArrayLike] | ArrayLike,
+        force: Callable[[float, Array, Array], ArrayLike],
+        constraint: Callable[[float, Array], ArrayLike],
+        jacobian: Callable[[float, Array], ArrayLike],
+        constraint_rate: Callable[[float, Array], ArrayLike] | None = None,
+        gamma: Callable[[float, Array, Array], ArrayLike] | None = None,
+        compile: bool = False,
+        name: str = "system",
+    ) -> "ConstrainedSystem":
+        """Make a system of plain functions that take arrays and return arrays.
+
+        Parameters
+        ----------
+        n_q, n_c : int
+            Number of coordinates and of constraints.
+        mass : callable or array_like (n_q, n_q)
+            mass(t, q). An array is a constant mass matrix, factored once.
+        force : callable
+            force(t, q, v) -> (n_q,).
+        constraint, jacobian : callable
+            constraint(t, q) -> (n_c,), jacobian(t, q) -> (n_c, n_q).
+        constraint_rate : callable, optional
+            constraint_rate(t, q) -> (n_c,), the partial derivative C_t. None: no dependence on time.
+        gamma : callable, optional
+            gamma(t, q, v) -> (n_c,), the right side of C_q a = Q_d. None: by differences of C_q and C_t.
+        compile : bool
+            False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
+            the values of closures and globals as they are now.
+        name : str
+            Shown in messages.
+
+        Raises
+        ------
+        TypeError
+            If an argument is not callable, or `compile=True` and numba cannot compile it (says why).
+        ValueError
+            If a size is out of range or a mass array has the wrong shape.
+        """
+        n_q, n_c = check_size("n_q", n_q, 1), check_size("n_c", n_c, 1)
+        constant_mass = not callable(mass)
+        if not callable(mass):
+            matrix = np.array(mass, dtype=np.float64)
+            if matrix.shape != (n_q, n_q):
+                raise ValueError(f"mass must have shape {(n_q, n_q)}; given an array of shape {matrix.shape}")
+            mass = _constant(matrix)
+        given: dict[str, Any] = {
+            "mass": mass,
+            "force": force,
+            "constraint": constraint,
+            "jacobian": jacobian,
+            "constraint_rate": constraint_rate,
+            "gamma": gamma,
+        }
+        for kind, function in given.items():
+            if not callable(function) and not (function is None and kind in ("constraint_rate", "gamma")):
+                raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
+        functions = {kind: function for kind, function in given.items() if function is not None}
+        sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "constant_mass": constant_mass, "name": name}
+        if compile:
+            return cls(**sizes, **{kind: compile_returning(kind, function) for kind, function in functions.items()})
+        python = PythonFunctions(name, functions)
+        system = cls(**sizes, **{kind: _THROUGH_PYTHON[kind] for kind in functions}, parameters=[python.handle])
+        system._python = python  # the registry holds it weakly
+        return system
+
+    def mass(self, t: float, q: Array) -> Array:
+        """M(t, q), (n_q, n_q)."""
+        return self._call(self.functions.mass, (self.n_q, self.n_q), t, q)
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q(t, q, v), (n_q,)."""
+        return self._call(self.functions.force, (self.n_q,), t, q, v)
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C(t, q), (n_c,)."""
+        return self._call(self.functions.constraint, (self.n_c,), t, q)
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q(t, q), (n_c, n_q)."""
+        return self._call(self.functions.jacobian, (self.n_c, self.n_q), t, q)
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t(t, q), (n_c,)."""
+        return self._call(self.functions.constraint_rate, (self.n_c,), t, q)
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """Q_d(t, q, v), (n_c,); zeros for a system that was given none."""
+        return self._call(self.functions.gamma, (self.n_c,), t, q, v)
+
+    def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
+        """C_q v + C_t, (n_c,): zero for consistent velocities (eq. (4))."""
+        return self.jacobian(t, q) @ np.asarray(v, dtype=np.float64) + self.constraint_rate(t, q)
+
+    def _call(self, function: Dispatcher, shape: tuple[int, ...], t: float, *arrays: Array) -> Array:
+        out = np.zeros(shape)
+        inputs = [np.ascontiguousarray(array, dtype=np.float64) for array in arrays]
+        function(float(t), *inputs, self.functions.p, out)
+        return out
+
+
+def _constant(matrix: Array) -> Callable[[float, Array], Array]:
+    def mass(t, q):  # type: ignore[no-untyped-def]
+        return matrix
+
+    return mass
+
+
+def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    t : float
+        Time, s.
+    q, v : array_like (n_q,)
+        Guess. Its distance to the constraints should be small against the mechanism.
+
+    Returns
+    -------
+    q, v : ndarray (n_q,)
+        With C(t, q) = 0 and C_q v + C_t = 0 to rounding.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a value is not finite, or no consistent position is found near the guess.
+    """
+    q = check_vector("q", q, system.n_q)
+    v = check_vector("v", v, system.n_q)
+    correction = np.inf
+    for _ in range(50):
+        step = np.linalg.lstsq(system.jacobian(t, q), -system.constraint(t, q), rcond=1e-10)[0]
+        q = q + step
+        before, correction = correction, float(np.abs(step).max())
+        if not np.isfinite(correction) or correction < 1e-15 * max(1.0, np.abs(q).max()):
+            break
+        if correction >= before and correction < 1e-12:
+            break  # rounding level
+    violation = float(np.abs(system.constraint(t, q)).max())
+    if not violation < 1e-10 * max(1.0, float(np.abs(q).max())):
+        raise ValueError(
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after 50 iterations "
+            f"max|C| is {violation:.3g}. Give a guess that is nearer to an assembled position"
+        )
+    v = v - np.linalg.lstsq(system.jacobian(t, q), system.velocity_constraint(t, q, v), rcond=1e-10)[0]
+    return q, v
+
+
+def check_vector(name: str, value: ArrayLike, n: int) -> Array:
+    """Return `value` as a new float vector of length n, or say what is wrong with it."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be {n} real numbers; given {value!r}") from error
+    if array.shape != (n,):
+        raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite; entries {np.flatnonzero(~np.isfinite(array)).tolist()} are not")
+    return array
