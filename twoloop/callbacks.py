@@ -12,7 +12,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
-from twoloop.kernels.common import CONSTRAINT_CALLBACK, FORCE_CALLBACK, MATRIX_CALLBACK, kernel
+from twoloop.kernels.common import CONSTRAINT_CALLBACK, FORCE_CALLBACK, MATRIX_CALLBACK
 
 Array = NDArray[np.float64]
 
@@ -63,9 +63,15 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
                 f"({', '.join(arguments)}); it has ({', '.join(given)})"
             )
         try:
-            return kernel(signature, stamp=None)(function)
+            try:
+                dispatcher = njit(cache=True, error_model="numpy")(function)
+            except RuntimeError:  # numba has nowhere to keep what is typed at a prompt
+                dispatcher = njit(error_model="numpy")(function)
+            dispatcher.compile(signature)
         except NumbaError as error:
             raise TypeError(_why_not(kind, function, error)) from error
+        dispatcher.disable_compile()
+        return dispatcher
 
     return decorate
 

@@ -66,9 +66,11 @@ class RungeKutta:
     outer : {"fixed-point", "paper"}
         "fixed-point": sweeps on the stage accelerations, predicted from the step before, with a growth test.
         "paper": sweeps on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
-    error : {"richardson", "richardson-undivided"}
-        Difference between one step of h and two of h/2, divided by 2^order - 1 or, as printed in (26), not.
-        Either way the step continues from the two half steps.
+    error : {"richardson", "richardson-paper"}
+        Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
+        "richardson": its largest component counts, and the step continues from the extrapolated state, put back on
+        the constraints, whose order is one higher. "richardson-paper": its root mean square (27) counts, and the step
+        continues from the two half steps. Fixed steps estimate nothing and are the tableau's own.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
@@ -83,7 +85,7 @@ class RungeKutta:
 
     tableau: Tableau
     outer: Literal["fixed-point", "paper"] = "fixed-point"
-    error: Literal["richardson", "richardson-undivided"] = "richardson"
+    error: Literal["richardson", "richardson-paper"] = "richardson"
     inner_tol: float | None = None
     outer_tol: float | None = None
 
@@ -92,8 +94,8 @@ class RungeKutta:
             raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {self.tableau!r}")
         if self.outer not in ("fixed-point", "paper"):
             raise ValueError(f"outer must be 'fixed-point' or 'paper'; given {self.outer!r}")
-        if self.error not in ("richardson", "richardson-undivided"):
-            raise ValueError(f"error must be 'richardson' or 'richardson-undivided'; given {self.error!r}")
+        if self.error not in ("richardson", "richardson-paper"):
+            raise ValueError(f"error must be 'richardson' or 'richardson-paper'; given {self.error!r}")
         _check_tolerance("inner_tol", self.inner_tol)
         _check_tolerance("outer_tol", self.outer_tol)
 
@@ -116,7 +118,7 @@ class RungeKutta:
             tableau.c,
             INNER_TOL if self.inner_tol is None else self.inner_tol,
             outer_tol,
-            2.0**tableau.order - 1.0 if self.error == "richardson" else 1.0,
+            1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
         )
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         step = kernels.STEPS[self.outer]
@@ -230,7 +232,7 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     inner_tol, outer_tol : float
         err_in (largest Newton correction of a position) and err_out (epsilon_tol of (32)).
     """
-    return RungeKutta(sun_radau_iib(3), "paper", "richardson-undivided", inner_tol, outer_tol)
+    return RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", inner_tol, outer_tol)
 
 
 def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float = 0.5) -> Newmark:

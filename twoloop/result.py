@@ -99,7 +99,9 @@ class Result:
 
     def __repr__(self) -> str:
         counts = ", ".join(
-            f"{f.name}={getattr(self.stats, f.name)}" for f in fields(self.stats) if getattr(self.stats, f.name) is not None
+            f"{f.name}={getattr(self.stats, f.name)}"
+            for f in fields(self.stats)
+            if getattr(self.stats, f.name) is not None
         )
         end = f"t[-1]={self.t[-1]:g}" if self.t.size else "no output"
         return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"

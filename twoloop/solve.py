@@ -8,14 +8,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twoloop.checks import (
+    check_positive,
+    check_size,
+    check_span,
+    check_start,
+    check_times,
+    check_vector,
+    dependent_rows,
+    not_finite,
+)
 from twoloop.kernels import common
 from twoloop.methods import PRESETS, Method, Plan
 from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem, check_size, check_vector
+from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-CONSISTENT = 1e-8  # largest violation that an initial state may have, relative to max(1, |q|) or max(1, |v|)
 BUFFER_ROWS = 1024
 BUFFER_STEPS = 4096
 
@@ -91,23 +100,23 @@ def solve_dae(
     if not isinstance(system, ConstrainedSystem):
         raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
     method = _check_method(method)
-    t0, t1 = _check_span(t_span)
+    t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)
-    _check_positive("rtol", rtol)
-    _check_positive("atol", atol)
+    check_positive("rtol", rtol)
+    check_positive("atol", atol)
     if first_step is not None:
-        _check_positive("first_step", first_step)
-    _check_positive("max_step", max_step, infinite=True)
+        check_positive("first_step", first_step)
+    check_positive("max_step", max_step, infinite=True)
     if step_size is not None:
-        _check_positive("step_size", step_size)
+        check_positive("step_size", step_size)
         if step_size > t1 - t0:
             raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
         if first_step is not None or max_step != np.inf:
             raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
     if max_steps is not None:
         check_size("max_steps", max_steps, 1)
-    times = None if t_eval is None else _check_times(t_eval, t0, t1, step_size)
+    times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     check_start(system, t0, q0, v0)
 
     plan = method.plan(system.n_q, float(rtol), float(atol), step_size is not None)
@@ -145,6 +154,7 @@ class _Run:
             flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
         self.functions = system.functions._replace(flags=flags)
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + system.n_c)])
+        self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.N_TOLERANCES)
         self.tolerances[common.ATOL] = atol
         self.tolerances[common.RTOL] = rtol
@@ -178,7 +188,7 @@ class _Run:
             )
         raise ValueError(
             f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: "
-            f"{_blame(self.system, self.t0, q, v)}"
+            f"{not_finite(self.system, self.t0, q, v)}"
         )
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
@@ -222,6 +232,7 @@ class _Run:
                 self.control,
                 self.clock,
                 self.state,
+                self.new_state,
                 outputs,
                 out_t,
                 out_state,
@@ -282,7 +293,7 @@ class _Run:
             return (
                 Status.RANK_LOST,
                 f"Stopped at t = {t:.10g}: the constraint Jacobian has lost rank there "
-                f"({_dependent_rows(self.system, t, self.state[:n])}), so no choice of independent coordinates exists. "
+                f"({dependent_rows(self.system, t, self.state[:n])}), so no choice of independent coordinates exists. "
                 "Redundant constraints and singular positions are not handled yet: end t_span before, or change the "
                 "geometry.",
             )
@@ -290,7 +301,7 @@ class _Run:
         if failure == common.NOT_FINITE:
             # the last attempt began at t: look where it went, to name the callback
             end = t + float(self.clock[a.H_FAILED])
-            blame = _blame(self.system, end, self.state[:n], self.state[n : 2 * n])
+            blame = not_finite(self.system, end, self.state[:n], self.state[n : 2 * n])
             return (
                 Status.NOT_FINITE,
                 f"Stopped at t = {t:.10g}: a value that is not finite came up just after it ({blame}). The result "
@@ -329,125 +340,6 @@ def _check_method(method: str | Method) -> Method:
     if isinstance(method, type) or not callable(getattr(method, "plan", None)):
         raise TypeError(f"method must be a name ({known}) or an object such as RungeKutta(gauss(3)); given {method!r}")
     return method
-
-
-def _check_span(t_span: tuple[float, float]) -> tuple[float, float]:
-    span = check_vector("t_span", t_span, 2)
-    t0, t1 = float(span[0]), float(span[1])
-    if not t1 > t0:
-        raise ValueError(f"t_span must be (start, end) with end > start; given ({t0!r}, {t1!r})")
-    return t0, t1
-
-
-def _check_positive(name: str, value: Any, infinite: bool = False) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} must be a number; given {value!r} of type {type(value).__name__}")
-    if not value > 0.0 or (not infinite and value == np.inf):
-        raise ValueError(f"{name} must be positive{'' if infinite else ' and finite'}; given {value!r}")
-
-
-def _check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None) -> Array:
-    times = np.array(t_eval, dtype=np.float64)
-    if times.ndim != 1 or times.size == 0:
-        raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
-    if not np.isfinite(times).all() or times.min() < t0 or times.max() > t1:
-        raise ValueError(
-            f"t_eval must lie within t_span = ({t0:g}, {t1:g}); given times from {times.min():g} to {times.max():g}"
-        )
-    if (np.diff(times) <= 0.0).any():
-        where = int(np.flatnonzero(np.diff(times) <= 0.0)[0])
-        raise ValueError(
-            f"t_eval must be strictly increasing; entry {where + 1} ({times[where + 1]:g}) follows {times[where]:g}"
-        )
-    if step_size is not None:
-        ratio = (times - t0) / step_size
-        off = np.abs(ratio - np.round(ratio)) > 1e-6
-        off &= times != t1
-        if off.any():
-            raise ValueError(
-                f"t_eval must hold multiples of step_size = {step_size!r} from t = {t0:g} when the step is fixed; "
-                f"{times[off][0]!r} is not one"
-            )
-    return times
-
-
-def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> None:
-    """Call every callback once at the start and check shapes, finiteness, rank and consistency.
-
-    Raises
-    ------
-    TypeError, ValueError
-        Naming the callback or the argument, what was found and what to do.
-    """
-    matrix = system.mass(t0, q0)
-    jacobian = system.jacobian(t0, q0)
-    blame = _blame(system, t0, q0, v0)
-    if blame != _NOTHING_FOUND:
-        raise ValueError(f"at the start, t = {t0:g}, {blame}")
-    if np.abs(matrix - matrix.T).max() > 1e-10 * np.abs(matrix).max():
-        raise ValueError(
-            f"mass of {system.name!r} must be symmetric; at t = {t0:g} max|M - M^T| is "
-            f"{np.abs(matrix - matrix.T).max():.3g}"
-        )
-    redundant = redundant_rows(jacobian)
-    if redundant:
-        raise ValueError(
-            f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} at "
-            f"t = {t0:g}: row(s) {redundant} depend on the others. Leave these constraints out (redundant constraints "
-            "are not handled yet), or start from another position"
-        )
-    for name, violation, scale in (
-        ("q0", system.constraint(t0, q0), np.abs(q0).max()),
-        ("v0", system.velocity_constraint(t0, q0, v0), np.abs(v0).max()),
-    ):
-        row = int(np.abs(violation).argmax())
-        if abs(violation[row]) > CONSISTENT * max(1.0, scale):
-            equation = "C(t, q)" if name == "q0" else "C_q v + C_t"
-            raise ValueError(
-                f"{name} is not consistent with the constraints of {system.name!r}: max|{equation}| is "
-                f"{abs(violation[row]):.3g} (row {row}) at t = {t0:g}, at most {CONSISTENT:g} is accepted. Project it "
-                "with twoloop.consistent_state(system, t, q, v)"
-            )
-
-
-def redundant_rows(jacobian: Array) -> list[int]:
-    """Rows of a Jacobian that depend on the others: those that full pivoting leaves without a pivot."""
-    A = jacobian.copy()
-    rows = np.arange(A.shape[0])
-    largest = np.abs(A).max()
-    for k in range(A.shape[0]):
-        i, j = np.unravel_index(np.abs(A[k:]).argmax(), A[k:].shape)
-        i += k
-        if not abs(A[i, j]) > 1e-11 * largest:
-            return sorted(int(r) for r in rows[k:])
-        A[[k, i]], rows[[k, i]] = A[[i, k]], rows[[i, k]]
-        A[k + 1 :] -= np.outer(A[k + 1 :, j] / A[k, j], A[k])
-        A[k + 1 :, j] = 0.0
-    return []
-
-
-def _dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
-    rows = redundant_rows(system.jacobian(t, q))
-    return f"row(s) {rows} depend on the others" if rows else "its pivots are below the rank tolerance"
-
-
-_NOTHING_FOUND = "no callback was found at fault"
-
-
-def _blame(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str:
-    """Which callback gives values that are not finite at (t, q, v)."""
-    values = {
-        "mass": lambda: system.mass(t, q),
-        "force": lambda: system.force(t, q, v),
-        "constraint": lambda: system.constraint(t, q),
-        "jacobian": lambda: system.jacobian(t, q),
-        "constraint_rate": lambda: system.constraint_rate(t, q),
-        "gamma": lambda: system.gamma(t, q, v),
-    }
-    guilty = [kind for kind, value in values.items() if not np.isfinite(value()).all()]
-    if not guilty:
-        return _NOTHING_FOUND
-    return f"{' and '.join(guilty)} of {system.name!r} returned values that are not finite"
 
 
 @contextmanager

@@ -7,8 +7,12 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.callbacks import KINDS, PythonFunctions, compile_returning, no_gamma, no_rate
 from twoloop.callbacks import (
+    KINDS,
+    PythonFunctions,
+    compile_returning,
+    no_gamma,
+    no_rate,
     python_constraint,
     python_constraint_rate,
     python_force,
@@ -16,7 +20,8 @@ from twoloop.callbacks import (
     python_jacobian,
     python_mass,
 )
-from twoloop.kernels.common import CONSTANT_MASS, DIAGONAL_MASS, GAMMA_GIVEN, Functions
+from twoloop.checks import check_size, check_vector
+from twoloop.kernels.common import CONSTANT_MASS, GAMMA_GIVEN, Functions
 
 Array = NDArray[np.float64]
 
@@ -28,15 +33,6 @@ _THROUGH_PYTHON = {
     "constraint_rate": python_constraint_rate,
     "gamma": python_gamma,
 }
-
-
-def check_size(name: str, value: Any, least: int) -> int:
-    """Return `value` as an int of at least `least`, or say what is wrong with it."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name} must be an int; given {value!r} of type {type(value).__name__}")
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}; given {value}")
-    return int(value)
 
 
 class ConstrainedSystem:
@@ -266,16 +262,3 @@ def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: Array
         )
     v = v - np.linalg.lstsq(system.jacobian(t, q), system.velocity_constraint(t, q, v), rcond=1e-10)[0]
     return q, v
-
-
-def check_vector(name: str, value: ArrayLike, n: int) -> Array:
-    """Return `value` as a new float vector of length n, or say what is wrong with it."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be {n} real numbers; given {value!r}") from error
-    if array.shape != (n,):
-        raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite; entries {np.flatnonzero(~np.isfinite(array)).tolist()} are not")
-    return array

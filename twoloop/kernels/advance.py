@@ -4,17 +4,18 @@
 """
 
 import numpy as np
-from numba import types
 
 from twoloop.kernels.common import (
     DONE,
     FUNCTIONS,
+    INNER_DIVERGED,
     INTEGERS,
     MATRIX,
     N_ACCEPTED,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
     NOT_FINITE,
+    SINGULAR,
     VECTOR,
     WORK,
     Functions,
@@ -24,6 +25,7 @@ from twoloop.kernels.common import (
     kernel,
 )
 from twoloop.kernels.inner import accelerations, factor_dependent, factor_mass
+from twoloop.kernels.linalg import copy
 from twoloop.kernels.partition import partition, partition_is_worn
 
 # what advance() returns
@@ -69,7 +71,7 @@ _ADVANCE = i8(
     *FUNCTIONS,  # the functions come one by one: only so does numba take them as first-class functions
     WORK,
     StepFunction,
-    *(VECTOR,) * 8,
+    *(VECTOR,) * 9,
     MATRIX,
     VECTOR,
     INTEGERS,
@@ -94,6 +96,7 @@ def advance(
     control,
     clock,
     state,
+    new_state,
     outputs,
     out_t,
     out_state,
@@ -106,10 +109,10 @@ def advance(
     out_t / out_state and the entries of out_h that this call wrote.
     """
     f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
-    new_state = np.empty_like(state)
     fixed = control[FIXED_STEP] > 0.0
     n = w.Q.size
-    filled[:] = 0
+    filled[0] = 0
+    filled[1] = 0
     while True:
         if filled[0] == out_t.size or filled[1] == out_h.size:
             return BUFFER_FULL
@@ -117,8 +120,6 @@ def advance(
             return MAX_STEPS_REACHED
         t = clock[T]
         target = outputs[int(clock[NEXT_OUTPUT])]
-        if partition_is_worn(w) and partition(f, w, t, state[:n]) != DONE:
-            return RANK_LOST
         h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
         left = target - t
         lands = h >= left * (1.0 - 1e-10)
@@ -143,7 +144,7 @@ def advance(
             clock[H_LIMIT] = control[LIMIT_FACTOR] * size
             clock[LIMIT_AGE] = 0.0
             clock[H_NEXT] = 0.5 * size
-            if partition(f, w, t, state[:n]) != DONE:
+            if (code == SINGULAR or code == INNER_DIVERGED) and partition(f, w, t, state[:n]) != DONE:
                 return RANK_LOST
             continue
         factor = control[FACTOR_MAX]
@@ -162,12 +163,12 @@ def advance(
         else:
             # no accumulated rounding in the times of a fixed-step run
             clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
-        state[:] = new_state
+        copy(new_state, state)
         out_h[filled[1]] = size
         filled[1] += 1
         if lands or control[STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[T]
-            out_state[filled[0], :] = state
+            copy(state, out_state[filled[0]])
             filled[0] += 1
         # a step cut short by an output time says little about the next
         clock[H_NEXT] = proposal if size == h else max(proposal, h)
@@ -178,3 +179,6 @@ def advance(
             clock[NEXT_OUTPUT] += 1.0
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
+        # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
+        if partition_is_worn(w) and partition(f, w, clock[T], state[:n]) != DONE:
+            return RANK_LOST

@@ -63,12 +63,12 @@ class Work(NamedTuple):
     """Arrays that an evaluation writes; made once a run. Sizes: n_q coordinates, n_c constraints."""
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) its Cholesky factor; for a constant diagonal M, 1/sqrt(M_jj) on the diagonal
+    L: Any  # (n_q, n_q) its factors, see ldl_factor
     Cq: Any  # (n_c, n_q) constraint Jacobian at the last position
     Cqd: Any  # (n_c, n_c) LU factors of its dependent columns
-    S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its Cholesky factor
-    W: Any  # (n_c, n_q) rows L^-1 Cq^T; scratch for full pivoting
-    Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences)
+    S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its factors
+    W: Any  # (n_q, n_c) Cq^T
+    Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences); scratch for full pivoting
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     C: Any  # (n_c) constraint, and corrections
@@ -81,7 +81,7 @@ class Work(NamedTuple):
     pivots: Any  # (n_c) row exchanges of the LU factors
     order: Any  # (n_q) scratch: column order of the full pivoting
     counters: Any  # (N_COUNTERS) see below
-    quality: Any  # (2) pivot ratio of Cqd: [best since the partition was chosen, now]
+    sensitivity: Any  # (1) max|Cqd^-1 Cqi| when the partition was chosen; 0: not known yet
 
 
 _INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters")
@@ -124,14 +124,13 @@ def _package_stamp() -> tuple[float, int]:
 _STAMP = _package_stamp()
 
 
-def kernel(signature: Any, stamp: tuple[float, int] | None = _STAMP) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Compile a function once for `signature` and keep the machine code on disk."""
+def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """Compile a function of the integrator for `signature` and keep the machine code on disk."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
-        dispatcher = njit(cache=True, error_model="numpy")(function)
-        if stamp is not None:
-            # without this, an edit of linalg.py would leave a stale advance.py in the cache
-            dispatcher._cache._cache_file._source_stamp = stamp
+        dispatcher = njit(cache=True, **_OPTIONS)(function)
+        # without this, an edit of linalg.py would leave a stale advance.py in the cache
+        dispatcher._cache._cache_file._source_stamp = _STAMP
         dispatcher.compile(signature)
         dispatcher.disable_compile()
         return dispatcher
@@ -139,17 +138,28 @@ def kernel(signature: Any, stamp: tuple[float, int] | None = _STAMP) -> Callable
     return compile_now
 
 
-inlined = njit(error_model="numpy")  # a helper that is compiled into the kernels which call it
+# NaN and infinity keep their meaning. Without numba's runtime no array can be allocated and none is counted: a step
+# that would allocate does not compile, and an evaluation takes two thirds of the time
+_OPTIONS: dict[str, Any] = {
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+    "_nrt": False,
+}
+compiled = njit(**_OPTIONS)  # a helper that kernels call
+# a helper that vanishes in its caller: a call that passes Functions and Work costs about 0.1 us, an inlined one nothing
+inlined = njit(**_OPTIONS, inline="always")
 
 
 def make_work(n_q: int, n_c: int) -> Work:
     """Allocate the workspace of one run."""
-    matrices = {name: np.zeros((n_c, n_q)) for name in ("Cq", "W", "Cqx")}
     return Work(
         M=np.zeros((n_q, n_q)),
         L=np.zeros((n_q, n_q)),
         Cqd=np.zeros((n_c, n_c)),
         S=np.zeros((n_c, n_c)),
+        W=np.zeros((n_q, n_c)),
+        Cq=np.zeros((n_c, n_q)),
+        Cqx=np.zeros((n_c, n_q)),
         Q=np.zeros(n_q),
         x=np.zeros(n_q),
         C=np.zeros(n_c),
@@ -162,6 +172,5 @@ def make_work(n_q: int, n_c: int) -> Work:
         pivots=np.zeros(n_c, dtype=np.int64),
         order=np.zeros(n_q, dtype=np.int64),
         counters=np.zeros(N_COUNTERS, dtype=np.int64),
-        quality=np.zeros(2),
-        **matrices,
+        sensitivity=np.zeros(1),
     )

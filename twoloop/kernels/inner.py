@@ -17,9 +17,10 @@ from twoloop.kernels.common import (
     N_INNER,
     NOT_FINITE,
     SINGULAR,
+    compiled,
     inlined,
 )
-from twoloop.kernels.linalg import back_substitute, cholesky, forward_substitute, lu_factor, lu_solve
+from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.partition import RANK_TOLERANCE
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
@@ -35,9 +36,9 @@ def factor_dependent(f, w, t, q):
     for i in range(n_c):
         for k in range(n_c):
             w.Cqd[i, k] = w.Cq[i, w.dependent[k]]
-    w.quality[1] = lu_factor(w.Cqd, w.pivots)
+    ratio = lu_factor(w.Cqd, w.pivots)
     w.counters[N_FACTORIZATIONS] += 1
-    if not w.quality[1] > RANK_TOLERANCE:
+    if not ratio > RANK_TOLERANCE:
         for i in range(n_c):
             for j in range(w.Q.size):
                 if not np.isfinite(w.Cq[i, j]):
@@ -47,7 +48,7 @@ def factor_dependent(f, w, t, q):
 
 
 @inlined
-def positions(f, w, t, q, tolerance):
+def _positions(f, w, t, q, tolerance):
     """Eq. (15): Newton on the dependent positions of q, update first, then test the correction."""
     for _ in range(MAX_INNER):
         code = factor_dependent(f, w, t, q)
@@ -69,7 +70,7 @@ def positions(f, w, t, q, tolerance):
 
 
 @inlined
-def velocities(f, w, t, q, v):
+def _velocities(f, w, t, q, v):
     """Eq. (14): the dependent velocities of v, C_qd v_d = -C_t - C_qi v_i; leaves C_q at q in w.Cq."""
     code = factor_dependent(f, w, t, q)
     if code != DONE:
@@ -122,26 +123,56 @@ def gamma_by_differences(f, w, t, q, v):
 
 @inlined
 def factor_mass(f, w, t, q):
-    """M(t, q) and its Cholesky factor; for a constant diagonal M the inverse roots."""
+    """M(t, q) and its factors; of a constant diagonal M the inverse diagonal."""
     w.M[:, :] = 0.0
     f.mass(t, q, f.p, w.M)
-    n = w.Q.size
-    w.L[:, :] = w.M
-    if f.flags[DIAGONAL_MASS] == 1:
-        for j in range(n):
-            if not w.M[j, j] > 0.0:
-                return MASS_NOT_DEFINITE
-            w.L[j, j] = 1.0 / np.sqrt(w.M[j, j])
-        return DONE
-    return DONE if cholesky(w.L) else MASS_NOT_DEFINITE
+    for i in range(w.Q.size):
+        copy(w.M[i], w.L[i])
+    return DONE if ldl_factor(w.L) else MASS_NOT_DEFINITE
 
 
 @inlined
-def accelerations(f, w, t, q, v, a, lam):
-    """Eqs. (6)-(8) with M = L L^T, W = (L^-1 C_q^T)^T, S = W W^T; needs C_q(t, q) in w.Cq."""
+def _times_inverse_mass(f, w, x):
+    """x becomes M^-1 x."""
+    if f.flags[DIAGONAL_MASS] == 1:
+        for j in range(x.size):
+            x[j] *= w.L[j, j]
+    else:
+        ldl_solve(w.L, x)
+
+
+@inlined
+def _schur_complement(f, w):
+    """Upper triangle of S = C_q M^-1 C_q^T into w.S."""
+    n_c, n_q = w.Cq.shape
+    w.S[:, :] = 0.0
+    for j in range(n_q):
+        for i in range(n_c):
+            w.W[j, i] = w.Cq[i, j]
+    if f.flags[DIAGONAL_MASS] == 1:
+        for j in range(n_q):
+            for i in range(n_c):
+                if w.W[j, i] != 0.0:
+                    factor = w.W[j, i] * w.L[j, j]
+                    for k in range(i, n_c):
+                        w.S[i, k] += factor * w.W[j, k]
+        return
+    for i in range(n_c):
+        copy(w.Cq[i], w.x)
+        ldl_solve(w.L, w.x)
+        for j in range(n_q):
+            if w.x[j] != 0.0:
+                for k in range(i, n_c):
+                    w.S[i, k] += w.x[j] * w.W[j, k]
+
+
+@inlined
+def _accelerations(f, w, t, q, v, a, lam):
+    """Eqs. (6)-(8); needs C_q(t, q) in w.Cq."""
     n_c, n_q = w.Cq.shape
     w.counters[N_EVALUATIONS] += 1
     if f.flags[CONSTANT_MASS] == 0:
+        w.counters[N_FACTORIZATIONS] += 1
         code = factor_mass(f, w, t, q)
         if code != DONE:
             return code
@@ -152,60 +183,53 @@ def accelerations(f, w, t, q, v, a, lam):
         gamma_by_differences(f, w, t, q, v)
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
-    diagonal = f.flags[DIAGONAL_MASS] == 1
-    for j in range(n_q):
-        w.x[j] = w.Q[j]
-    if diagonal:
-        for j in range(n_q):
-            w.x[j] *= w.L[j, j]
-        for i in range(n_c):
-            for j in range(n_q):
-                w.W[i, j] = w.Cq[i, j] * w.L[j, j]
-    else:
-        forward_substitute(w.L, w.x)
-        for i in range(n_c):
-            for j in range(n_q):
-                w.W[i, j] = w.Cq[i, j]
-            forward_substitute(w.L, w.W[i])
-    for i in range(n_c):
-        total = -w.Qd[i]
-        for j in range(n_q):
-            total += w.W[i, j] * w.x[j]
-        lam[i] = total
-        for k in range(i + 1):
-            total = 0.0
-            for j in range(n_q):
-                total += w.W[i, j] * w.W[k, j]
-            w.S[i, k] = total
+    _schur_complement(f, w)
     w.counters[N_FACTORIZATIONS] += 1
-    if not cholesky(w.S):
+    if not ldl_factor(w.S):
         for i in range(n_c):
             if not np.isfinite(w.S[i, i]):
                 return NOT_FINITE
         return SINGULAR
-    forward_substitute(w.S, lam)
-    back_substitute(w.S, lam)
+    copy(w.Q, w.x)
+    _times_inverse_mass(f, w, w.x)
+    for i in range(n_c):
+        total = -w.Qd[i]
+        for j in range(n_q):
+            total += w.Cq[i, j] * w.x[j]
+        lam[i] = total
+    ldl_solve(w.S, lam)  # (7)
+    copy(w.Q, a)
     for i in range(n_c):
         for j in range(n_q):
-            w.x[j] -= w.W[i, j] * lam[i]
-    if diagonal:
-        for j in range(n_q):
-            w.x[j] *= w.L[j, j]
-    else:
-        back_substitute(w.L, w.x)
+            a[j] -= w.Cq[i, j] * lam[i]
+    _times_inverse_mass(f, w, a)  # (8)
     for j in range(n_q):
-        a[j] = w.x[j]
         if not np.isfinite(a[j]):
             return NOT_FINITE
     return DONE
 
 
-@inlined
+@compiled
 def evaluate(f, w, t, q, v, tolerance, a, lam):
     """One evaluation of the right side: dependents of q and v from their independents, then a and lam."""
-    code = positions(f, w, t, q, tolerance)
+    code = _positions(f, w, t, q, tolerance)
     if code == DONE:
-        code = velocities(f, w, t, q, v)
+        code = _velocities(f, w, t, q, v)
     if code == DONE:
-        code = accelerations(f, w, t, q, v, a, lam)
+        code = _accelerations(f, w, t, q, v, a, lam)
     return code
+
+
+@compiled
+def restore(f, w, t, q, v, tolerance):
+    """Dependents of q and v from their independents; leaves C_q at q for `accelerations`."""
+    code = _positions(f, w, t, q, tolerance)
+    if code == DONE:
+        code = _velocities(f, w, t, q, v)
+    return code
+
+
+@compiled
+def accelerations(f, w, t, q, v, a, lam):
+    """Eqs. (6)-(8) at a state that was restored just before."""
+    return _accelerations(f, w, t, q, v, a, lam)

@@ -1,11 +1,24 @@
-"""Small dense factorisations, in place and without allocation."""
+"""Small dense factorisations, in place and without allocation.
+
+All run along rows and skip zero factors: constraint Jacobians are sparse even where they are small.
+"""
 
 from twoloop.kernels.common import inlined
 
 
 @inlined
+def copy(source, target):
+    """Element by element: numba's slice assignment allocates."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@inlined
 def lu_factor(A, pivots):
-    """LU factors of A with row exchanges, in place; returns min|u_kk| / max|u_kk| (0: singular)."""
+    """LU factors of A with row exchanges, in place, 1/u_kk on the diagonal.
+
+    Returns min|u_kk| / max|u_kk|; 0 for a singular matrix or one with values that are not finite.
+    """
     n = A.shape[0]
     smallest = 1e300
     largest = 0.0
@@ -25,10 +38,10 @@ def lu_factor(A, pivots):
             for j in range(n):
                 A[k, j], A[p, j] = A[p, j], A[k, j]
         inverse = 1.0 / A[k, k]
+        A[k, k] = inverse
         for i in range(k + 1, n):
-            factor = A[i, k]
-            if factor != 0.0:
-                factor *= inverse
+            if A[i, k] != 0.0:
+                factor = A[i, k] * inverse
                 A[i, k] = factor
                 for j in range(k + 1, n):
                     A[i, j] -= factor * A[k, j]
@@ -52,42 +65,40 @@ def lu_solve(A, pivots, x):
         total = x[i]
         for j in range(i + 1, n):
             total -= A[i, j] * x[j]
-        x[i] = total / A[i, i]
+        x[i] = total * A[i, i]
 
 
 @inlined
-def cholesky(A):
-    """Lower Cholesky factor of A, in place (the upper part is left alone); False if A is not positive definite."""
+def ldl_factor(A):
+    """Factors U^T D^-1 U of a symmetric A from its upper triangle, in place: 1/d_k on the diagonal, U above it.
+
+    Returns False if A is not positive definite or has values that are not finite.
+    """
     n = A.shape[0]
-    for i in range(n):
-        for j in range(i):
-            total = A[i, j]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            A[i, j] = total / A[j, j]
-        total = A[i, i]
-        for k in range(i):
-            total -= A[i, k] * A[i, k]
-        if not total > 0.0:
+    for k in range(n):
+        if not A[k, k] > 0.0:
             return False
-        A[i, i] = total**0.5
+        inverse = 1.0 / A[k, k]
+        A[k, k] = inverse
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                factor = A[k, i] * inverse
+                for j in range(i, n):
+                    A[i, j] -= factor * A[k, j]
     return True
 
 
 @inlined
-def forward_substitute(L, x):
-    """x becomes L^-1 x."""
-    for i in range(x.size):
-        total = x[i]
-        for j in range(i):
-            total -= L[i, j] * x[j]
-        x[i] = total / L[i, i]
-
-
-@inlined
-def back_substitute(L, x):
-    """x becomes L^-T x."""
-    for i in range(x.size - 1, -1, -1):
-        x[i] /= L[i, i]
-        for j in range(i):
-            x[j] -= L[i, j] * x[i]
+def ldl_solve(A, x):
+    """Solve with the factors of `ldl_factor`; x is overwritten."""
+    n = A.shape[0]
+    for k in range(n):
+        if x[k] != 0.0:
+            factor = x[k] * A[k, k]
+            for j in range(k + 1, n):
+                x[j] -= factor * A[k, j]
+    for k in range(n - 1, -1, -1):
+        total = x[k]
+        for j in range(k + 1, n):
+            total -= A[k, j] * x[j]
+        x[k] = total * A[k, k]

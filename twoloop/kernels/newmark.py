@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, inlined, kernel
+from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, kernel
 from twoloop.kernels.inner import evaluate
+from twoloop.kernels.linalg import copy
 
 MAX_SWEEPS = 60
 ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinking has converged
@@ -12,7 +13,7 @@ ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinkin
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
-@inlined
+@compiled
 def _error(options, tolerances, h, q, a, a1):
     """|beta - 1/6| h^2 |a1 - a|: the leading local error of q, for any beta and gamma = 1/2.
 
@@ -53,8 +54,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             difference = h * abs(a_new[m] - a1[m])
             change = max(change, gamma * difference / max(abs(v1[m]), 1.0))
             change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
-        for m in range(n):
-            a1[m] = a_new[m]
+        copy(a_new, a1)
         if change <= options[OUTER_TOL] or (change >= before and change <= ROUNDING_FLOOR):
             error = _error(options, tolerances, h, q, a, a1) if tolerances[ESTIMATE] == 1.0 else 0.0
             return DONE, error

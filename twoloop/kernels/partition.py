@@ -1,25 +1,22 @@
 """LU coordinate partitioning: which coordinates are independent."""
 
-from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, SINGULAR, inlined
+from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, SINGULAR, compiled, inlined
+from twoloop.kernels.linalg import lu_solve
 
 RANK_TOLERANCE = 1e-11  # a pivot below this fraction of the largest one counts as zero
-WORSE = 0.1  # a partition is renewed when its pivot ratio falls below this fraction of its best
+WORSE = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
 
 
-@inlined
-def full_pivoting(A, order, rows):
+@compiled
+def full_pivoting(A, order):
     """Gauss elimination of A (n_c, n_q) with full pivoting, in place.
 
-    `order` becomes the column order (the first n_c are the dependent coordinates), `rows` the row order.
-    Returns the numerical rank and min|pivot| / max|pivot| over the pivots that count.
+    `order` becomes the column order: the first n_c are the dependent coordinates. Returns the numerical rank.
     """
     n_c, n_q = A.shape
     for j in range(n_q):
         order[j] = j
-    for i in range(n_c):
-        rows[i] = i
     largest = 0.0
-    smallest = 0.0
     for k in range(n_c):
         top = 0.0
         r = k
@@ -33,10 +30,8 @@ def full_pivoting(A, order, rows):
         if k == 0:
             largest = top
         if not top > RANK_TOLERANCE * largest:
-            return k, 0.0
-        smallest = top if k == 0 else min(smallest, top)
+            return k
         if r != k:
-            rows[k], rows[r] = rows[r], rows[k]
             for j in range(n_q):
                 A[k, j], A[r, j] = A[r, j], A[k, j]
         if s != k:
@@ -48,32 +43,51 @@ def full_pivoting(A, order, rows):
             if factor != 0.0:
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
-    return n_c, smallest / largest if n_c > 0 else 1.0
+    return n_c
 
 
 @inlined
+def _insert_sorted(source, target):
+    for k in range(source.size):
+        i = k
+        while i > 0 and target[i - 1] > source[k]:
+            target[i] = target[i - 1]
+            i -= 1
+        target[i] = source[k]
+
+
+@compiled
 def partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q); SINGULAR where C_q has not full rank."""
-    w.W[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.W)
+    w.Cqx[:, :] = 0.0
+    f.jacobian(t, q, f.p, w.Cqx)
     n_c = w.C.size
-    rank, _ = full_pivoting(w.W, w.order, w.pivots)
+    rank = full_pivoting(w.Cqx, w.order)
     w.counters[N_PARTITIONS] += 1
     w.counters[N_FACTORIZATIONS] += 1
     if rank < n_c:
         return SINGULAR
-    w.dependent[:] = w.order[:n_c]
-    w.independent[:] = w.order[n_c:]
     # ascending, so that the same set is always the same partition
-    w.dependent.sort()
-    w.independent.sort()
-    w.quality[0] = 0.0
+    _insert_sorted(w.order[:n_c], w.dependent)
+    _insert_sorted(w.order[n_c:], w.independent)
+    w.sensitivity[0] = 0.0
     return DONE
 
 
-@inlined
+@compiled
 def partition_is_worn(w):
-    """Whether C_qd, as factored last, is much worse conditioned than at its best under this partition."""
-    if w.quality[1] > w.quality[0]:
-        w.quality[0] = w.quality[1]
-    return w.quality[1] < WORSE * w.quality[0]
+    """Whether dependents move much faster per independent than when the partition was chosen.
+
+    Measures max|C_qd^-1 C_qi| with C_q and the factors of C_qd as they stand after an accepted step. Full pivoting
+    leaves it near 1; it grows without bound where the independent coordinates stop being valid.
+    """
+    largest = 0.0
+    for m in w.independent:
+        for i in range(w.g.size):
+            w.g[i] = w.Cq[i, m]
+        lu_solve(w.Cqd, w.pivots, w.g)
+        for i in range(w.g.size):
+            largest = max(largest, abs(w.g[i]))
+    if w.sensitivity[0] == 0.0:  # first look at a new partition
+        w.sensitivity[0] = max(largest, 1.0)
+    return not largest <= WORSE * w.sensitivity[0]

@@ -17,10 +17,12 @@ from twoloop.kernels.common import (
     OUTER_DIVERGED,
     RTOL,
     STEP,
+    compiled,
     inlined,
     kernel,
 )
-from twoloop.kernels.inner import accelerations, evaluate, positions, velocities
+from twoloop.kernels.inner import accelerations, evaluate, restore
+from twoloop.kernels.linalg import copy
 
 MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
@@ -30,7 +32,7 @@ ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinkin
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
-STAGES, INNER_TOL, OUTER_TOL, DIVISOR, N_SCALARS = range(5)
+STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, N_SCALARS = range(5)
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
@@ -38,11 +40,11 @@ Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, N_VECTORS = range(8)
 
 
 def options_array(
-    A: ArrayLike, b: ArrayLike, c: ArrayLike, inner_tol: float, outer_tol: float, divisor: float
+    A: ArrayLike, b: ArrayLike, c: ArrayLike, inner_tol: float, outer_tol: float, extrapolation: float
 ) -> NDArray[np.float64]:
     """The parameter block that the steps of this file read."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
-    scalars = np.array([float(len(b)), inner_tol, outer_tol, divisor])
+    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation])
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
 
 
@@ -73,7 +75,7 @@ def _vector(memory, s, n, which):
     return memory[start : start + n]
 
 
-@inlined
+@compiled
 def _interpolate(c, theta, A_stage, weights, a):
     """The polynomial through (c_j, A_stage_j) at theta."""
     s = c.size
@@ -90,7 +92,7 @@ def _interpolate(c, theta, A_stage, weights, a):
         a[m] = total
 
 
-@inlined
+@compiled
 def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
     """One step of size h from (q, v) by sweeps on the stage accelerations; A_stage holds their prediction on entry.
 
@@ -131,8 +133,7 @@ def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1
                 difference = h * abs(q1[m] - A_stage[j, m])
                 change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
                 change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
-            for m in range(n):
-                A_stage[j, m] = q1[m]
+            copy(q1, A_stage[j])
         if change <= options[OUTER_TOL]:
             converged = True
             break
@@ -157,13 +158,10 @@ def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1
             in_v += b[k] * A_stage[k, m]
         q1[m] = q[m] + h * v[m] + h * h * in_q
         v1[m] = v[m] + h * in_v
-    code = positions(f, w, t + h, q1, tolerance)
-    if code == DONE:
-        code = velocities(f, w, t + h, q1, v1)
-    return code
+    return restore(f, w, t + h, q1, v1, tolerance)
 
 
-@inlined
+@compiled
 def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
     """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
 
@@ -180,10 +178,9 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     if code != DONE:
         return code
     for j in range(s):
-        for m in range(n):
-            A_stage[j, m] = A_stage[0, m]
-            V_stage[j, m] = v1[m]
-            Q_stage[j, m] = q1[m]
+        copy(A_stage[0], A_stage[j])
+        copy(v1, V_stage[j])
+        copy(q1, Q_stage[j])
     norm_before = np.inf
     for _ in range(MAX_SWEEPS_PAPER):
         w.counters[N_OUTER] += 1
@@ -202,9 +199,8 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j], w.lam)
             if code != DONE:
                 return code
-        for m in range(n):
-            q_old[m] = q1[m]
-            v_old[m] = v1[m]
+        copy(q1, q_old)
+        copy(v1, v_old)
         change = 0.0
         for m in w.independent:
             in_q = 0.0
@@ -216,9 +212,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
             v1[m] = v[m] + h * in_v
             change = max(change, abs(q1[m] - q_old[m]) / max(abs(q1[m]), 1.0))
             change = max(change, abs(v1[m] - v_old[m]) / max(abs(v1[m]), 1.0))
-        code = positions(f, w, t + h, q1, tolerance)
-        if code == DONE:
-            code = velocities(f, w, t + h, q1, v1)
+        code = restore(f, w, t + h, q1, v1, tolerance)
         if code != DONE:
             return code
         if change <= options[OUTER_TOL]:  # (32)
@@ -233,26 +227,30 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     return OUTER_DIVERGED
 
 
-@inlined
-def _richardson_norm(tolerances, divisor, q, v, q_full, v_full, q1, v1):
-    """Eqs. (26), (27) over positions and velocities, dependent and independent."""
+@compiled
+def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
+    """Difference of one step and two half steps over (26), for positions and velocities, dependents too.
+
+    Its largest component, or the root mean square (27).
+    """
     atol = tolerances[ATOL]
     rtol = tolerances[RTOL]
-    n = q.size
     total = 0.0
-    for m in range(n):
-        scale = atol + rtol * max(abs(q[m]), abs(q_full[m]))
-        total += ((q_full[m] - q1[m]) / scale) ** 2
-        scale = atol + rtol * max(abs(v[m]), abs(v_full[m]))
-        total += ((v_full[m] - v1[m]) / scale) ** 2
-    return np.sqrt(total / (2 * n)) / divisor
+    top = 0.0
+    for m in range(q.size):
+        in_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
+        in_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
+        total += in_q * in_q + in_v * in_v
+        top = max(top, abs(in_q), abs(in_v))
+    return top if largest else np.sqrt(total / (2 * q.size))
 
 
 @kernel(STEP)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt by sweeps on the accelerations; the result is that of the two half steps where error is estimated.
+    """One attempt by sweeps on the accelerations; where the error is estimated, a step of h and two of h/2.
 
-    Stages are predicted from the polynomial through the stage accelerations of the last accepted step, those of the
+    The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
+    step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the last accepted step, those of the
     half steps from the whole step's.
     """
     s, _, _, _, _, c = _tableau(options)
@@ -268,7 +266,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_mid, v_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID)
     weights = memory[memory.size - s :]
     if memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0:
-        previous[:, :] = trial
+        for j in range(s):
+            copy(trial[j], previous[j])
         memory[H_PREVIOUS] = memory[H_TRIAL]
         memory[HAS_PREVIOUS] = 1.0
     memory[HAS_TRIAL] = 0.0
@@ -277,14 +276,14 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if ratio <= FARTHEST:
             _interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
-            trial[j, :] = a
+            copy(a, trial[j])
     code = sweep_accelerations(f, w, options, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
     if code != DONE:
         return code, np.inf
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        q_full[:] = q1
-        v_full[:] = v1
+        copy(q1, q_full)
+        copy(v1, v_full)
         for j in range(s):
             _interpolate(c, 0.5 * c[j], trial, weights, half[j])
         code = sweep_accelerations(f, w, options, t, 0.5 * h, q, v, half, Q_stage, V_stage, q_mid, v_mid)
@@ -295,7 +294,15 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = sweep_accelerations(f, w, options, t + 0.5 * h, 0.5 * h, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
         if code != DONE:
             return code, np.inf
-        error = _richardson_norm(tolerances, options[DIVISOR], q, v, q_full, v_full, q1, v1)
+        share = options[EXTRAPOLATION]
+        error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
+        if share > 0.0 and error <= 1.0:
+            for m in range(n):
+                q1[m] += share * (q1[m] - q_full[m])
+                v1[m] += share * (v1[m] - v_full[m])
+            code = restore(f, w, t + h, q1, v1, options[INNER_TOL])
+            if code != DONE:
+                return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
@@ -320,8 +327,8 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return code, np.inf
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        q_full[:] = q1
-        v_full[:] = v1
+        copy(q1, q_full)
+        copy(v1, v_full)
         g = 0.5 * h
         code = sweep_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
         if code == DONE:
@@ -333,7 +340,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return code, np.inf
-        error = _richardson_norm(tolerances, options[DIVISOR], q, v, q_full, v_full, q1, v1)
+        error = _richardson_error(tolerances, options[EXTRAPOLATION] > 0.0, q, v, q_full, v_full, q1, v1)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     return code, error
 

@@ -10,8 +10,9 @@ import math
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.checks import check_vector
 from twoloop.mechanisms.problem import Array, Problem, Reference
-from twoloop.system import ConstrainedSystem, check_vector
+from twoloop.system import ConstrainedSystem
 
 GRAVITY = 9.81  # m/s^2
 DENSITY = 1.0  # kg/m
@@ -122,7 +123,9 @@ def four_bar(
         raise ValueError(f"ground must be positive; given {ground!r}")
     theta3 = float(check_vector("theta3", [theta3], 1)[0])
     if branch not in (-1, 1):
-        raise ValueError(f"branch must be 1 (joint 1-2 above the line from O to joint 2-3) or -1 (below); given {branch!r}")
+        raise ValueError(
+            f"branch must be 1 (joint 1-2 above the line from O to joint 2-3) or -1 (below); given {branch!r}"
+        )
     q0 = _assemble(lengths_array, ground, theta3, branch)
     is_default = (*lengths_array.tolist(), ground, theta3, branch) == (*DEFAULT_LENGTHS, DEFAULT_GROUND, 0.0, -1)
     L1, L2, L3 = lengths_array.tolist()
@@ -199,26 +202,26 @@ _DEFAULT_REFERENCE = Reference(
         [
             0.4655397991275497159,
             0.1824080465009168962,
-            0.3734352752626592494,
-            1.5353585493399318298,
+            0.3734352752626592493,
+            1.5353585493399318297,
             -0.4319567411710029097,
-            -0.9219357319797583371,
-            2.5698187502123821139,
-            -0.6143647876719198060,
+            -0.9219357319797583370,
+            2.5698187502123821138,
+            -0.6143647876719198059,
             0.9599328424023562726,
         ]
     ),
     v=np.array(
         [
-            -0.1890158742421557268,
+            -0.1890158742421557267,
             0.4824042240163405336,
             1.0362255277000930739,
-            -0.6180230129644702498,
+            -0.6180230129644702497,
             0.7827971352095650157,
-            -0.3012041251749048318,
-            -0.4290071387143225145,
+            -0.3012041251749048317,
+            -0.4290071387223145229,
             0.3003929111932244821,
-            -0.6982938269427819414,
+            -0.6982938269427819115,
         ]
     ),
     source=(

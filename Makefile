@@ -1,0 +1,66 @@
+# Everything runs in .venv, which `make install` fills with the exact versions of requirements.lock.
+# PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
+
+.DEFAULT_GOAL := help
+.PHONY: help install table3 reports test lint lock clean
+
+# one thread: CPU times can be compared, and nobody's BLAS changes a count
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export VECLIB_MAXIMUM_THREADS := 1
+
+RUN := .venv/bin/python
+STAMP := .venv/installed
+PIP := -m pip --disable-pip-version-check --quiet
+CANDIDATES := $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python3.14)
+FITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
+
+define FIND_PYTHON
+python=""; \
+for candidate in $(CANDIDATES); do \
+	if "$$candidate" -c "$(FITS)" >/dev/null 2>&1; then python="$$candidate"; break; fi; \
+done; \
+if [ -z "$$python" ]; then \
+	echo "twoloop needs Python 3.11 to 3.14 with the module venv; tried: $(CANDIDATES)." >&2; \
+	echo "Install one, or name it: make PYTHON=/path/to/python3.11 ..." >&2; \
+	exit 1; \
+fi
+endef
+
+help: ## say what there is
+	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+install: $(STAMP) ## make .venv; runs by itself when it must
+
+$(STAMP): requirements.lock pyproject.toml
+	@$(FIND_PYTHON); \
+	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for half a minute."; \
+	"$$python" -m venv --clear .venv
+	@$(RUN) $(PIP) install -r requirements.lock
+	@$(RUN) $(PIP) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes seconds
+	$(RUN) -m studies.table3 $(ARGS)
+
+reports: install ## all studies into reports/
+	$(RUN) -m studies all $(ARGS)
+
+test: install ## the tests; ARGS="-m ''" takes the slow ones too
+	$(RUN) -m pytest $(ARGS)
+
+lint: install ## ruff and mypy
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+	$(RUN) -m mypy
+
+lock: ## renew requirements.lock from pyproject.toml; PYTHON=python3.11, the oldest supported
+	@$(FIND_PYTHON); "$$python" -m venv --clear .venv
+	@$(RUN) $(PIP) install ".[references,studies,dev]" hatchling
+	@{ grep '^#' requirements.lock; $(RUN) -m pip freeze --exclude twoloop; } > requirements.new
+	@mv requirements.new requirements.lock
+
+clean: ## remove caches (numba's too) and builds; .venv stays
+	find . -name .venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache build dist

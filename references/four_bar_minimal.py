@@ -1,0 +1,198 @@
+"""The four-bar linkage with one degree of freedom: a truth that shares nothing with the absolute coordinates.
+
+The three angles (th1, th2, th3) of a closed loop move along a curve. Its tangent is the cross product of the two
+gradients of the loop closure,
+
+    N = (L2 L3 sin(th3 - th2), L3 L1 sin(th1 - th3), L1 L2 sin(th2 - th1)),
+
+which vanishes only where all three bars are in line, so that no angle has to be singled out as the independent one.
+With th' = N u and the kinetic energy m(th) u^2 / 2, the motion is one scalar equation for u.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import solve_ivp
+
+Array = NDArray[np.float64]
+
+RTOL, ATOL = 1e-13, 1e-14
+STEPS = 400  # least number of steps over half a period; the interpolant is then as good as the steps
+LONGEST = 1000.0  # s; a linkage that has not come to rest by then started too near an equilibrium
+
+
+class MinimalFourBar:
+    """Motion of a four-bar linkage of uniform rods, released from rest under gravity.
+
+    Such a motion is periodic: it swings between two positions of rest, and back the same way. Half a period is
+    integrated (DOP853, rtol 1e-13) and all other times are folded into it, so the error grows only by the number of
+    periods times the error of the period (about 1e-15 s).
+
+    Parameters
+    ----------
+    lengths : (float, float, float)
+        Lengths of the bars from O to A, m.
+    ground : float
+        Distance of the ground joints O = (0, 0) and A = (ground, 0), m.
+    theta3 : float
+        Initial angle of bar 3, from joint 2-3 to A, rad.
+    branch : {-1, 1}
+        1: joint 1-2 lies above the line from O to joint 2-3; -1: below.
+    density : float
+        Mass per length of the rods, kg/m.
+    gravity : float
+        m/s^2, along -y.
+
+    Attributes
+    ----------
+    period : float
+        Period of the motion, s.
+
+    Raises
+    ------
+    ValueError
+        If the linkage cannot be assembled, starts in equilibrium or singular, or does not come to rest again.
+    """
+
+    def __init__(
+        self,
+        lengths: tuple[float, float, float],
+        ground: float,
+        theta3: float,
+        branch: int,
+        density: float,
+        gravity: float,
+    ):
+        self._lengths = np.array(lengths, dtype=np.float64)
+        self._masses = density * self._lengths
+        self._gravity = gravity
+        angles = _assemble(self._lengths, ground, theta3, branch)
+        start = np.append(angles, 0.0)
+        push = self._rate(0.0, start)[3]
+        if not abs(push) > 1e-9:
+            raise ValueError(f"the linkage must not start in equilibrium; its initial u' is {push:.3g}")
+        half = self._swing(start)
+        self.period = 2.0 * float(half.t_events[0][0])
+        self._dense = half.sol
+
+    @classmethod
+    def from_parameters(cls, parameters: Mapping[str, Any]) -> "MinimalFourBar":
+        """Make the linkage of `four_bar(...).parameters`: L1, L2, L3, L, theta3, branch, density, gravity."""
+        p = parameters
+        return cls((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], int(p["branch"]), p["density"], p["gravity"])
+
+    def states(self, times: ArrayLike) -> tuple[Array, Array]:
+        """Absolute coordinates and velocities at any times.
+
+        Parameters
+        ----------
+        times : array_like (n_t,)
+            s, any sign and order.
+
+        Returns
+        -------
+        q, v : ndarray (9, n_t)
+            [x1 y1 th1 x2 y2 th2 x3 y3 th3], m and rad, and their rates. The angles are continuous from the start.
+        """
+        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        folded = np.mod(times, self.period)
+        back = folded > 0.5 * self.period
+        folded[back] = self.period - folded[back]
+        state = self._dense(folded)
+        angles = state[:3]
+        rates = _tangent(self._lengths, angles) * np.where(back, -state[3], state[3])
+        q, v = np.empty((9, times.size)), np.empty((9, times.size))
+        q[0::3], q[1::3] = _centres(self._lengths, np.cos(angles)), _centres(self._lengths, np.sin(angles))
+        v[0::3] = _centres(self._lengths, -np.sin(angles) * rates)
+        v[1::3] = _centres(self._lengths, np.cos(angles) * rates)
+        q[2::3], v[2::3] = angles, rates
+        return q, v
+
+    def _swing(self, start: Array) -> Any:
+        """Integrate from rest to the next position of rest."""
+
+        def rest(t, y):  # type: ignore[no-untyped-def]
+            return y[3]
+
+        rest.terminal = True  # type: ignore[attr-defined]
+        rest.direction = -math.copysign(1.0, self._rate(0.0, start)[3])  # type: ignore[attr-defined]
+        rough = solve_ivp(self._rate, (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
+        if rough.status != 1:
+            raise ValueError(
+                f"the linkage does not come to rest within {LONGEST:g} s: it starts too near an equilibrium"
+            )
+        end = float(rough.t[-1])
+        return solve_ivp(
+            self._rate,
+            (0.0, 1.1 * end),
+            start,
+            "DOP853",
+            rtol=RTOL,
+            atol=ATOL,
+            max_step=end / STEPS,
+            events=rest,
+            dense_output=True,
+        )
+
+    def _rate(self, t: float, state: Array) -> Array:
+        """(th', u') from Lagrange's equation for u; x and y are the centres' displacements along the tangent."""
+        L, masses = self._lengths, self._masses
+        angles, u = state[:3], state[3]
+        n = _tangent(L, angles)
+        n_s = _tangent_rate(L, angles, n)
+        c, s = np.cos(angles), np.sin(angles)
+        x, x_s = _centres(L, -s * n), _centres(L, -s * n_s - c * n**2)
+        y, y_s = _centres(L, c * n), _centres(L, c * n_s - s * n**2)
+        inertias = masses * L**2 / 12.0
+        inertia = masses @ (x * x + y * y) + inertias @ (n * n)
+        coupling = masses @ (x * x_s + y * y_s) + inertias @ (n * n_s)
+        return np.append(n * u, -(coupling * u**2 + self._gravity * (masses @ y)) / inertia)
+
+
+def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:
+    """States of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
+    return MinimalFourBar.from_parameters(parameters).states(times)
+
+
+def _centres(lengths: Array, directions: Array) -> Array:
+    """One coordinate of the centres of a chain of bars with these direction cosines (3,) or (3, n)."""
+    bars = lengths.reshape(-1, *(1,) * (directions.ndim - 1)) * directions
+    return np.cumsum(bars, axis=0) - 0.5 * bars
+
+
+def _tangent(lengths: Array, angles: Array) -> Array:
+    """Direction in which the angles can move, (3,) or (3, n)."""
+    L1, L2, L3 = lengths
+    th1, th2, th3 = angles
+    return np.array([L2 * L3 * np.sin(th3 - th2), L3 * L1 * np.sin(th1 - th3), L1 * L2 * np.sin(th2 - th1)])
+
+
+def _tangent_rate(lengths: Array, angles: Array, n: Array) -> Array:
+    """Differentiate the tangent along itself, (3,)."""
+    L1, L2, L3 = lengths
+    th1, th2, th3 = angles
+    return np.array(
+        [
+            L2 * L3 * np.cos(th3 - th2) * (n[2] - n[1]),
+            L3 * L1 * np.cos(th1 - th3) * (n[0] - n[2]),
+            L1 * L2 * np.cos(th2 - th1) * (n[1] - n[0]),
+        ]
+    )
+
+
+def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:
+    """Find the three angles: joint 1-2 is where the circles about O and about joint 2-3 meet."""
+    L1, L2, L3 = lengths
+    joint = complex(ground, 0.0) - L3 * complex(math.cos(theta3), math.sin(theta3))
+    distance = abs(joint)
+    along = (distance**2 + L1**2 - L2**2) / (2.0 * distance)
+    if not abs(along) < L1:
+        raise ValueError(
+            f"bars 1 and 2 cannot reach joint 2-3, which is {distance:.6g} m from O, with theta3 = {theta3:g}"
+        )
+    crank = complex(along, branch * math.sqrt(L1**2 - along**2)) * joint / distance
+    coupler = joint - crank
+    return np.array([math.atan2(crank.imag, crank.real), math.atan2(coupler.imag, coupler.real), theta3])

@@ -1,0 +1,348 @@
+"""SUNDIALS IDA, by scikit-sundae, on any ConstrainedSystem: residual and Jacobian compiled from its callbacks.
+
+IDA solves F(t, y, y') = 0 by variable-order BDF (orders 1 to 5). The index-3 equations are brought to index 1 in one
+of the two ways of `FORMS`; nothing here uses the integrator of twoloop.
+"""
+
+import io
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import sksundae
+from numba import njit, types
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks import check_positive, check_span, check_start, check_times, check_vector
+from twoloop.kernels.common import GAMMA_GIVEN
+from twoloop.result import Result, Statistics, Status
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+FORMS = {
+    "index1": "index 1: C_q v' = Q_d; multipliers out of the error test (atol 1e12)",
+    "stabilised": "GGL, integrated multipliers: C = 0 and C_q v + C_t = 0; multipliers' integrals in the error test",
+}
+
+NOT_TESTED = 1e12  # the absolute tolerance that takes an unknown out of IDA's error test
+SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
+DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
+GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
+
+_READ = types.Array(types.float64, 1, "C", readonly=True)  # IDA hands y and y' over as read-only arrays
+_VECTOR = types.float64[::1]
+_MATRIX = types.float64[:, ::1]
+_SIZES = (types.int64, types.int64)
+_RESIDUAL = types.void(types.float64, _READ, _READ, _VECTOR, *_SIZES, _VECTOR)
+_JACOBIAN = types.void(types.float64, _READ, _READ, types.float64, _MATRIX, *_SIZES, _VECTOR)
+
+
+def solve_ida(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    form: str = "index1",
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    *,
+    t_eval: ArrayLike | None = None,
+) -> Result:
+    """Integrate a constrained mechanical system with IDA.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem. Its callbacks are compiled into a residual and a Jacobian at the first run (a few seconds).
+    t_span : (float, float)
+        Start and end, s; the end after the start.
+    q0, v0 : array_like (n_q,)
+        Consistent initial coordinates and velocities.
+    form : {"index1", "stabilised"}
+        How the index is reduced; `FORMS` describes each in a line fit for a table.
+
+        "index1": unknowns q, v, lam; q' = v, M v' + C_q^T lam = Q, C_q v' = Q_d. Drifts off the constraints.
+
+        "stabilised": Gear, Gupta and Leimkuhler (1985) with the multipliers as time derivatives of further unknowns
+        Lam, Mu; q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0.
+    rtol, atol : float
+        IDA's tolerances for q, v (and Lam, Mu in the stabilised form). At a given tolerance the error at the end
+        scatters by a factor of 2 to 24 (15 runs) with rounding alone, which changes IDA's choice of steps and orders.
+    t_eval : array_like, optional
+        Increasing times in t_span at which to store the solution, interpolated by IDA. None: every step is stored.
+
+    Returns
+    -------
+    Result
+        `a` and `lam` as IDA has them, with the sign of M a + C_q^T lam = Q. `h` holds the steps when every step is
+        stored and is empty otherwise. Of the statistics IDA tells residual evaluations (n_evaluations), Jacobian
+        evaluations, each with its factorisation (n_factorizations), and, when every step is stored, n_accepted.
+        A failure of IDA gives what was computed before it, `Status.SOLVER_FAILED` and IDA's status and text.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
+    """
+    if not isinstance(system, ConstrainedSystem):
+        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
+    if form not in FORMS:
+        raise ValueError(f"form must be one of {', '.join(FORMS)}; given {form!r}")
+    t0, t1 = check_span(t_span)
+    q0 = check_vector("q0", q0, system.n_q)
+    v0 = check_vector("v0", v0, system.n_q)
+    check_positive("rtol", rtol)
+    check_positive("atol", atol)
+    times = None if t_eval is None else check_times(t_eval, t0, t1, None)
+    check_start(system, t0, q0, v0)
+
+    solver = _solver(system, form, float(rtol), float(atol), t1 - t0)
+    y0, yp0 = _start(system, form, t0, q0, v0)
+    tspan = np.array([t0, t1]) if times is None else _stops(t0, t1, times)
+    said = io.StringIO()
+    with redirect_stdout(said):
+        began = time.process_time()
+        outcome = solver.solve(tspan, y0, yp0)
+        cpu = time.process_time() - began
+    return _result(system, form, outcome, times, said.getvalue(), cpu)
+
+
+def _solver(system: ConstrainedSystem, form: str, rtol: float, atol: float, length: float) -> Any:
+    """IDA with its callbacks and options."""
+    f = system.functions
+    residual, jacobian = _compiled(form, *f[:6], bool(f.flags[GAMMA_GIVEN]))
+    sizes_and_p = (system.n_q, system.n_c, f.p)
+
+    def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
+        residual(t, y, yp, res, *sizes_and_p)
+
+    def jacfn(t, y, yp, res, cj, JJ):  # type: ignore[no-untyped-def]
+        jacobian(t, y, yp, cj, JJ, *sizes_and_p)
+
+    n = 2 * system.n_q
+    tolerances = np.full(n + _n_multipliers(system, form), atol)
+    if form == "index1":
+        tolerances[n:] = NOT_TESTED
+    return sksundae.ida.IDA(
+        resfn,
+        jacfn=jacfn,
+        rtol=rtol,
+        atol=tolerances,
+        min_step=SMALLEST_STEP * length,
+        max_step=length,
+        max_num_steps=10**9,  # per output time
+    )
+
+
+def _n_multipliers(system: ConstrainedSystem, form: str) -> int:
+    return system.n_c if form == "index1" else 2 * system.n_c
+
+
+def _start(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> tuple[Array, Array]:
+    """Unknowns and their derivatives at the start; accelerations and multipliers from one linear system."""
+    n, m = system.n_q, system.n_c
+    jacobian = system.jacobian(t0, q)
+    kkt = np.block([[system.mass(t0, q), jacobian.T], [jacobian, np.zeros((m, m))]])
+    gamma = system.gamma(t0, q, v) if system.functions.flags[GAMMA_GIVEN] else _gamma(system, t0, q, v)
+    solution = np.linalg.solve(kkt, np.concatenate([system.force(t0, q, v), gamma]))
+    a, lam = solution[:n], solution[n:]
+    zeros = np.zeros(m)
+    if form == "index1":
+        return np.concatenate([q, v, lam]), np.concatenate([v, a, zeros])
+    return np.concatenate([q, v, zeros, zeros]), np.concatenate([v, a, lam, zeros])
+
+
+def _gamma(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array:
+    """Q_d = -d/de [C_q v + C_t](t + e, q + e v), by central differences of order 4."""
+    e = GAMMA_DIFFERENCE / max(1.0, float(np.abs(v).max()))
+
+    def rate(k: int) -> Array:
+        return system.velocity_constraint(t + k * e, q + k * e * v, v)
+
+    return -(rate(-2) - 8.0 * rate(-1) + 8.0 * rate(1) - rate(2)) / (12.0 * e)
+
+
+def _stops(t0: float, t1: float, times: Array) -> Array:
+    """Output times with both ends, and at least three: given two, IDA returns every step."""
+    stops = np.unique(np.concatenate([[t0], times, [t1]]))
+    return stops if stops.size > 2 else np.array([t0, 0.5 * (t0 + t1), t1])
+
+
+def _result(system: ConstrainedSystem, form: str, outcome: Any, times: Array | None, said: str, cpu: float) -> Result:
+    n, m = system.n_q, system.n_c
+    y, yp = outcome.y.T, outcome.yp.T
+    lam = (y if form == "index1" else yp)[2 * n : 2 * n + m]
+    keep = np.ones(outcome.t.size, dtype=bool) if times is None else np.isin(outcome.t, times)
+    failed = outcome.status < 0
+    end = float(outcome.t[-1])
+    told = " ".join([outcome.message, *said.split()])
+    return Result(
+        t=outcome.t[keep],
+        q=y[:n, keep],
+        v=y[n : 2 * n, keep],
+        a=yp[n : 2 * n, keep],
+        lam=lam[:, keep],
+        h=np.diff(outcome.t) if times is None else np.empty(0),
+        status=Status.SOLVER_FAILED if failed else Status.REACHED_END,
+        message=(
+            f"IDA failed after t = {end:.10g} with status {outcome.status}: {told} "
+            "Look for a discontinuity, a singular position or a value that is not finite near this time, or try the "
+            "other form or other tolerances."
+            if failed
+            else f"IDA reached the end, t = {end:g}."
+        ),
+        stats=Statistics(
+            n_accepted=outcome.t.size - 1 if times is None else None,
+            n_evaluations=int(outcome.nfev),
+            n_factorizations=int(outcome.njev),
+            cpu_time=cpu,
+        ),
+    )
+
+
+@lru_cache(maxsize=64)
+def _compiled(
+    form: str,
+    mass: Dispatcher,
+    force: Dispatcher,
+    constraint: Dispatcher,
+    jacobian: Dispatcher,
+    constraint_rate: Dispatcher,
+    gamma: Dispatcher,
+    gamma_given: bool,
+) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Residual (t, y, y', res, n, m, p) and Jacobian (t, y, y', cj, JJ, n, m, p) of a form.
+
+    Closures, not the first-class functions that twoloop's kernels take: IDA calls from Python, where each
+    first-class argument costs tens of microseconds a call.
+    """
+    if form == "index1":
+        right_side = gamma if gamma_given else _gamma_by_differences(jacobian, constraint_rate)
+        residual = _index1_residual(mass, force, jacobian, right_side)
+    else:
+        residual = _stabilised_residual(mass, force, constraint, jacobian, constraint_rate)
+    return residual, _iteration_matrix(residual, mass, jacobian, form == "index1")
+
+
+def _gamma_by_differences(jacobian: Dispatcher, constraint_rate: Dispatcher) -> Callable[..., None]:
+    """Compile what `_gamma` does."""
+
+    @njit(error_model="numpy")
+    def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
+        speed = 1.0
+        for i in range(v.size):
+            speed = max(speed, abs(v[i]))
+        e = GAMMA_DIFFERENCE / speed
+        Cq, Ct, moved = np.zeros((Qd.size, q.size)), np.zeros(Qd.size), np.zeros(q.size)
+        for j in range(4):
+            shift = (-2.0, -1.0, 1.0, 2.0)[j] * e
+            weight = (-1.0, 8.0, -8.0, 1.0)[j] / (12.0 * e)
+            for i in range(q.size):
+                moved[i] = q[i] + shift * v[i]
+            Cq[:, :] = 0.0
+            Ct[:] = 0.0
+            jacobian(t + shift, moved, p, Cq)
+            constraint_rate(t + shift, moved, p, Ct)
+            for k in range(Qd.size):
+                Qd[k] += weight * Ct[k]
+                for i in range(v.size):
+                    Qd[k] += weight * Cq[k, i] * v[i]
+
+    return gamma  # type: ignore[no-any-return]
+
+
+def _index1_residual(
+    mass: Dispatcher, force: Dispatcher, jacobian: Dispatcher, gamma: Callable[..., None]
+) -> Callable[..., None]:
+    """Residual of the form "index1" at y = [q, v, lam]."""
+
+    @njit(_RESIDUAL, error_model="numpy")
+    def residual(t, y, yp, res, n, m, p):  # type: ignore[no-untyped-def]
+        q, v, a = y[:n].copy(), y[n : 2 * n].copy(), yp[n : 2 * n]
+        M, Cq, Q, Qd = np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m)
+        mass(t, q, p, M)
+        jacobian(t, q, p, Cq)
+        force(t, q, v, p, Q)
+        gamma(t, q, v, p, Qd)
+        for i in range(n):
+            res[i] = yp[i] - v[i]
+            res[n + i] = -Q[i]
+            for j in range(n):
+                res[n + i] += M[i, j] * a[j]
+        for k in range(m):
+            res[2 * n + k] = -Qd[k]
+            for i in range(n):
+                res[n + i] += Cq[k, i] * y[2 * n + k]
+                res[2 * n + k] += Cq[k, i] * a[i]
+
+    return residual  # type: ignore[no-any-return]
+
+
+def _stabilised_residual(
+    mass: Dispatcher, force: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
+) -> Callable[..., None]:
+    """Residual of the form "stabilised" at y = [q, v, Lam, Mu]."""
+
+    @njit(_RESIDUAL, error_model="numpy")
+    def residual(t, y, yp, res, n, m, p):  # type: ignore[no-untyped-def]
+        q, v, a = y[:n].copy(), y[n : 2 * n].copy(), yp[n : 2 * n]
+        M, Cq, Q, C, Ct = np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(m)
+        mass(t, q, p, M)
+        jacobian(t, q, p, Cq)
+        force(t, q, v, p, Q)
+        constraint(t, q, p, C)
+        constraint_rate(t, q, p, Ct)
+        for i in range(n):
+            res[i] = yp[i] - v[i]
+            res[n + i] = -Q[i]
+            for j in range(n):
+                res[n + i] += M[i, j] * a[j]
+        for k in range(m):
+            res[2 * n + k] = C[k]
+            res[2 * n + m + k] = Ct[k]
+            for i in range(n):
+                res[2 * n + m + k] += Cq[k, i] * v[i]
+                res[i] += Cq[k, i] * yp[2 * n + m + k]
+                res[n + i] += Cq[k, i] * yp[2 * n + k]
+
+    return residual  # type: ignore[no-any-return]
+
+
+def _iteration_matrix(
+    residual: Callable[..., None], mass: Dispatcher, jacobian: Dispatcher, index1: bool
+) -> Callable[..., None]:
+    """dF/dy + cj dF/dy': columns of q and v by differences of the residual, all others and dF/dy' exact."""
+
+    @njit(_JACOBIAN, error_model="numpy")
+    def iteration_matrix(t, y, yp, cj, JJ, n, m, p):  # type: ignore[no-untyped-def]
+        q, moved, here, there = y[:n].copy(), y.copy(), np.zeros(y.size), np.zeros(y.size)
+        M, Cq = np.zeros((n, n)), np.zeros((m, n))
+        mass(t, q, p, M)
+        jacobian(t, q, p, Cq)
+        JJ[:, :] = 0.0  # it arrives as the last call left it
+        residual(t, y, yp, here, n, m, p)
+        for j in range(2 * n):
+            step = DIFFERENCE * max(1.0, abs(y[j]))
+            moved[j] = y[j] + step
+            residual(t, moved, yp, there, n, m, p)
+            moved[j] = y[j]
+            for i in range(y.size):
+                JJ[i, j] = (there[i] - here[i]) / step
+        for i in range(n):
+            JJ[i, i] += cj
+            for j in range(n):
+                JJ[n + i, n + j] += cj * M[i, j]
+            for k in range(m):
+                if index1:
+                    JJ[n + i, 2 * n + k] = Cq[k, i]
+                    JJ[2 * n + k, n + i] += cj * Cq[k, i]
+                else:
+                    JJ[n + i, 2 * n + k] = cj * Cq[k, i]
+                    JJ[i, 2 * n + m + k] = cj * Cq[k, i]
+
+    return iteration_matrix  # type: ignore[no-any-return]

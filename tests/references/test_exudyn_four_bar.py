@@ -1,0 +1,87 @@
+"""Exudyn's own four-bar linkage against the published and the one-degree-of-freedom truth."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from references.exudyn_four_bar import SOLVERS, solve_exudyn
+from references.four_bar_minimal import MinimalFourBar
+from twoloop.mechanisms import four_bar
+from twoloop.result import Status
+
+# largest position error at 10 s with h = 1e-3, about twice what was measured (peers.md gives the first two too)
+BOUNDS = {
+    ("default", "GeneralizedAlpha"): 1.3e-4,
+    ("default", "TrapezoidalIndex2"): 6e-5,
+    ("collinear", "GeneralizedAlpha"): 1e-3,
+    ("collinear", "TrapezoidalIndex2"): 5e-4,
+}
+PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
+
+
+@cache
+def truth(name):
+    return MinimalFourBar.from_parameters(PROBLEMS[name].parameters)
+
+
+def final_error(result, name):
+    q, v = truth(name).states(result.t[-1:])
+    return np.abs(result.q[:, -1] - q[:, 0]).max(), np.abs(result.v[:, -1] - v[:, 0]).max()
+
+
+@pytest.mark.parametrize(("name", "solver"), BOUNDS)
+def test_agrees_and_is_of_second_order(name, solver):
+    problem = PROBLEMS[name]
+    coarse, fine = (final_error(solve_exudyn(problem, 10.0, n, solver, store_every=1000), name) for n in (5000, 10000))
+    assert fine[0] < BOUNDS[name, solver]
+    assert 3.5 < coarse[0] / fine[0] < 4.5
+    assert 3.5 < coarse[1] / fine[1] < 4.5
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_stores_every_step_in_our_order(solver):
+    problem = PROBLEMS["default"]
+    result = solve_exudyn(problem, 1.0, 1000, solver)
+    assert result.status is Status.REACHED_END
+    assert result.q.shape == result.v.shape == result.a.shape == (9, 1001) and result.lam.shape == (8, 1001)
+    assert result.h.size == result.stats.n_accepted == 1000
+    assert np.array_equal(result.q[:, 0], problem.q0) and not result.v[:, 0].any()
+    assert np.isnan(result.lam).all()
+    assert max(np.abs(problem.system.constraint(t, q)).max() for t, q in zip(result.t, result.q.T, strict=True)) < 1e-5
+    rate = (result.v[:, 2:] - result.v[:, :-2]) / (result.t[2:] - result.t[:-2])
+    assert np.abs(rate - result.a[:, 1:-1])[:, 5:].max() < 0.02
+
+
+@pytest.mark.parametrize(("n_steps", "store_every"), [(1000, 8), (20000, 100)])
+def test_stores_every_so_many_steps(n_steps, store_every):
+    result = solve_exudyn(PROBLEMS["default"], 2.0, n_steps, store_every=store_every)
+    assert np.allclose(result.t, np.linspace(0.0, 2.0, n_steps // store_every + 1), rtol=0.0, atol=1e-11)
+    assert result.stats.n_accepted == n_steps and result.h.size == 0
+
+
+def test_failure_comes_back_as_a_row(capfd):
+    result = solve_exudyn(PROBLEMS["default"], 10.0, 200)
+    assert result.status is Status.SOLVER_FAILED and not result.success
+    assert "SolveDynamic terminated" in result.message and "Take more steps" in result.message
+    assert 0.0 < result.t[-1] < 10.0 and result.q.shape == (9, result.t.size)
+    assert result.stats.n_accepted == result.h.size == result.t.size - 1
+    assert capfd.readouterr().out == ""
+
+
+def test_writes_no_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    solve_exudyn(PROBLEMS["default"], 0.1, 10)
+    assert not list(tmp_path.iterdir())
+
+
+def test_wrong_arguments_are_named():
+    problem = PROBLEMS["default"]
+    with pytest.raises(ValueError, match="solver must be one of GeneralizedAlpha, TrapezoidalIndex2"):
+        solve_exudyn(problem, 1.0, 10, "RK44")
+    with pytest.raises(ValueError, match="multiple of store_every = 3"):
+        solve_exudyn(problem, 1.0, 10, store_every=3)
+    with pytest.raises(ValueError, match="t_end must be positive"):
+        solve_exudyn(problem, -1.0, 10)
+    with pytest.raises(TypeError, match="n_steps must be an int"):
+        solve_exudyn(problem, 1.0, 10.0)

@@ -1,0 +1,128 @@
+"""The one-degree-of-freedom truth against the published state, energy conservation and a time-of-flight integral."""
+
+import cmath
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from references.four_bar_minimal import MinimalFourBar, trajectory
+from twoloop.mechanisms import four_bar
+
+PROBLEMS = [four_bar(), four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0), four_bar((1.0, 1.2, 0.5), 1.0, math.pi, 1)]
+IDS = [problem.name for problem in PROBLEMS]
+
+
+@cache
+def minimal_form(k):
+    return MinimalFourBar.from_parameters(PROBLEMS[k].parameters)
+
+
+@pytest.fixture(params=range(len(PROBLEMS)), ids=IDS)
+def case(request):
+    return PROBLEMS[request.param], minimal_form(request.param)
+
+
+def test_published_state_and_period():
+    problem, minimal = PROBLEMS[0], minimal_form(0)
+    reference = problem.reference
+    q, v = minimal.states([reference.t])
+    assert np.abs(q[:, 0] - reference.q).max() < 1e-13
+    assert np.abs(v[:, 0] - reference.v).max() < 1e-12
+    assert abs(minimal.period - reference.period) < 1e-13
+
+
+def test_starts_where_the_problem_does(case):
+    problem, minimal = case
+    q, v = minimal.states([0.0, minimal.period])
+    assert np.abs(q - problem.q0[:, None]).max() < 1e-13
+    assert np.abs(v).max() < 1e-12
+
+
+def test_keeps_energy_and_constraints_for_100_s(case):
+    problem, minimal = case
+    times = np.linspace(0.0, 100.0, 1001)
+    q, v = minimal.states(times)
+    energy = problem.energy(times, q, v)
+    assert np.abs(energy - problem.energy(0.0, problem.q0, problem.v0)).max() < 1e-12
+    for k in range(0, times.size, 10):
+        assert np.abs(problem.system.constraint(times[k], q[:, k])).max() < 1e-13
+        assert np.abs(problem.system.velocity_constraint(times[k], q[:, k], v[:, k])).max() < 1e-13
+
+
+def test_velocities_are_the_rates_of_the_positions(case):
+    _, minimal = case
+    times = np.linspace(0.0, minimal.period, 41)
+    e = 1e-3
+    far, near = (minimal.states(times + k * e)[0] - minimal.states(times - k * e)[0] for k in (2, 1))
+    assert np.abs((8.0 * near - far) / (12.0 * e) - minimal.states(times)[1]).max() < 1e-7
+
+
+def test_folds_times_of_any_sign_and_order():
+    minimal = minimal_form(1)
+    times = np.array([40.0, 0.3, -0.3, 7.0])
+    q, v = minimal.states(times)
+    assert np.allclose(q[:, 1], q[:, 2], atol=1e-15) and np.allclose(v[:, 1], -v[:, 2], atol=1e-15)
+    again = trajectory(PROBLEMS[1].parameters, times + 3 * minimal.period)
+    assert np.abs(q - again[0]).max() < 1e-12 and np.abs(v - again[1]).max() < 1e-11
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_period_by_energy_quadrature(k):
+    assert abs(_period_by_quadrature(PROBLEMS[k]) - minimal_form(k).period) < 1e-11
+
+
+def test_second_geometry_passes_positions_where_bars_are_in_line():
+    q, _ = minimal_form(1).states(np.linspace(0.0, 1.0, 1001))
+    bend = np.sin(q[5] - q[2])
+    assert bend.min() < 0.0 < bend.max()
+
+
+def test_wrong_geometry_is_named():
+    with pytest.raises(ValueError, match="cannot reach joint 2-3"):
+        MinimalFourBar((1.0, 1.0, 1.0), 4.0, 0.0, -1, 1.0, 9.81)
+    with pytest.raises(ValueError, match="equilibrium"):
+        MinimalFourBar((1.0, 2.0, 1.5), 3.0, 0.0, -1, 1.0, 0.0)
+
+
+def _period_by_quadrature(problem):
+    """T = 2 int dth2 sqrt(m / (2 (V0 - V))), with th2, which is a valid coordinate of the first two cases."""
+    L1, L2, L3, L = (problem.parameters[name] for name in ("L1", "L2", "L3", "L"))
+    start = problem.q0[5]
+    side = math.copysign(1.0, math.sin(problem.q0[2] - problem.q0[8]))
+
+    def potential_and_inertia(th2):
+        rest = L - L2 * cmath.exp(1j * th2)  # what bars 1 and 3 have to span
+        corner = math.acos((L1**2 + abs(rest) ** 2 - L3**2) / (2.0 * L1 * abs(rest)))
+        bar1 = L1 * rest / abs(rest) * cmath.exp(1j * side * corner)
+        bar2, bar3 = L2 * cmath.exp(1j * th2), rest - bar1
+        matrix = np.array([[-bar1.imag, -bar3.imag], [bar1.real, bar3.real]])
+        w1, w3 = np.linalg.solve(matrix, [bar2.imag, -bar2.real])
+        u1, u2, u3 = 1j * bar1 * w1, 1j * bar2, 1j * bar3 * w3  # velocities of the bars' ends over their beginnings
+        inertia = potential = 0.0
+        centres = ((bar1 / 2, u1 / 2), (bar1 + bar2 / 2, u1 + u2 / 2), (bar1 + bar2 + bar3 / 2, u1 + u2 + u3 / 2))
+        for length, rate, (centre, velocity) in zip((L1, L2, L3), (w1, 1.0, w3), centres, strict=True):
+            inertia += length * (abs(velocity) ** 2 + (length * rate) ** 2 / 12.0)
+            potential += 9.81 * length * centre.imag
+        return potential, inertia
+
+    v0 = potential_and_inertia(start)[0]
+
+    def excess(th2):
+        return potential_and_inertia(th2)[0] - v0
+
+    step = 1e-3 if excess(start + 1e-4) < 0.0 else -1e-3
+    end = start + step
+    while excess(end + step) < 0.0:
+        end += step
+    end = brentq(excess, end, end + step, xtol=1e-15, rtol=1e-15)
+    middle, reach = 0.5 * (start + end), 0.5 * (start - end)
+
+    def rate(angle):
+        potential, inertia = potential_and_inertia(middle + reach * math.cos(angle))
+        return abs(reach) * math.sin(angle) * math.sqrt(inertia / (2.0 * (v0 - potential)))
+
+    return 2.0 * quad(rate, 0.0, math.pi, epsabs=1e-13, epsrel=1e-13, limit=200)[0]
