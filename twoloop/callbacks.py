@@ -3,7 +3,7 @@
 import inspect
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -88,7 +88,7 @@ class PythonFunctions:
     """Plain Python functions of one system, called through the compiled wrappers below."""
 
     _count = itertools.count(1)
-    registry: "WeakValueDictionary[int, PythonFunctions]" = WeakValueDictionary()
+    registry: ClassVar[WeakValueDictionary[int, "PythonFunctions"]] = WeakValueDictionary()
 
     def __init__(self, name: str, functions: dict[str, Callable[..., Any]]):
         self.name = name
@@ -186,28 +186,20 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
     arguments, signature = KINDS[kind]
     user = function if isinstance(function, Dispatcher) else njit(function)
     message = f"{kind} returned an array of the wrong shape"
-    if "v" in arguments:
 
-        def in_place(t, q, v, p, out):
-            value = user(t, q, v)
-            if value.shape != out.shape:
-                raise ValueError(message)
-            out[:] = value
-    elif signature is MATRIX_CALLBACK:
+    def with_v(t, q, v, p, out):
+        value = user(t, q, v)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
 
-        def in_place(t, q, p, out):
-            value = user(t, q)
-            if value.shape != out.shape:
-                raise ValueError(message)
-            out[:, :] = value
-    else:
+    def without_v(t, q, p, out):
+        value = user(t, q)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
 
-        def in_place(t, q, p, out):
-            value = user(t, q)
-            if value.shape != out.shape:
-                raise ValueError(message)
-            out[:] = value
-
+    in_place = with_v if "v" in arguments else without_v
     try:
         return njit(signature, error_model="numpy")(in_place)
     except NumbaError as error:

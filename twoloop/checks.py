@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
 
 if TYPE_CHECKING:
     from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # largest violation that an initial state may have, relative to max(1, |q|) or max(1, |v|)
 
 
@@ -38,6 +40,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
 
 
 def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
+    """Return start and end, or say what is wrong with them."""
     span = check_vector("t_span", t_span, 2)
     t0, t1 = float(span[0]), float(span[1])
     if not t1 > t0:
@@ -46,6 +49,7 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
 
 
 def check_positive(name: str, value: Any, infinite: bool = False) -> None:
+    """Raise unless `value` is a positive number, finite unless `infinite`."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} must be a number; given {value!r} of type {type(value).__name__}")
     if not value > 0.0 or (not infinite and value == np.inf):
@@ -53,6 +57,7 @@ def check_positive(name: str, value: Any, infinite: bool = False) -> None:
 
 
 def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None) -> Array:
+    """Return the output times as an array, or say what is wrong with them."""
     times = np.array(t_eval, dtype=np.float64)
     if times.ndim != 1 or times.size == 0:
         raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
@@ -98,9 +103,9 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> N
     redundant = redundant_rows(jacobian)
     if redundant:
         raise ValueError(
-            f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} at "
-            f"t = {t0:g}: row(s) {redundant} depend on the others. Leave these constraints out (redundant constraints "
-            "are not handled yet), or start from another position"
+            f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} "
+            f"at t = {t0:g}: row(s) {redundant} depend on the others. Leave these constraints out (redundant "
+            "constraints are not handled yet), or start from another position"
         )
     for name, violation, scale in (
         ("q0", system.constraint(t0, q0), np.abs(q0).max()),
@@ -117,22 +122,15 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> N
 
 
 def redundant_rows(jacobian: Array) -> list[int]:
-    """Rows of a Jacobian that depend on the others: those that full pivoting leaves without a pivot."""
-    A = jacobian.copy()
-    rows = np.arange(A.shape[0])
-    largest = np.abs(A).max()
-    for k in range(A.shape[0]):
-        i, j = np.unravel_index(np.abs(A[k:]).argmax(), A[k:].shape)
-        i += k
-        if not abs(A[i, j]) > 1e-11 * largest:
-            return sorted(int(r) for r in rows[k:])
-        A[[k, i]], rows[[k, i]] = A[[i, k]], rows[[i, k]]
-        A[k + 1 :] -= np.outer(A[k + 1 :, j] / A[k, j], A[k])
-        A[k + 1 :, j] = 0.0
-    return []
+    """Rows of a Jacobian that depend on the others, by QR with pivoting."""
+    R, order = qr(jacobian.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diagonal(R))
+    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
+    return sorted(order[rank:].tolist())
 
 
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
+    """Which rows of C_q(t, q) depend on the others, in words."""
     rows = redundant_rows(system.jacobian(t, q))
     return f"row(s) {rows} depend on the others" if rows else "its pivots are below the rank tolerance"
 

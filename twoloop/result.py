@@ -98,10 +98,7 @@ class Result:
         return self.status >= 0
 
     def __repr__(self) -> str:
-        counts = ", ".join(
-            f"{f.name}={getattr(self.stats, f.name)}"
-            for f in fields(self.stats)
-            if getattr(self.stats, f.name) is not None
-        )
+        known = {f.name: getattr(self.stats, f.name) for f in fields(self.stats)}
+        counts = ", ".join(f"{name}={value}" for name, value in known.items() if value is not None)
         end = f"t[-1]={self.t[-1]:g}" if self.t.size else "no output"
         return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"

@@ -199,7 +199,7 @@ class _Run:
             z, rate = self.state[: 2 * n], self.state[n : 3 * n]
             scale = self.tolerances[common.ATOL] + self.tolerances[common.RTOL] * np.abs(z)
             size, speed = np.linalg.norm(z / scale), np.linalg.norm(rate / scale)
-            first_step = 0.01 * size / speed if size > 1e-5 and speed > 1e-5 else 1e-6
+            first_step = float(0.01 * size / speed) if size > 1e-5 and speed > 1e-5 else 1e-6
         self.clock[self.a.H_NEXT] = min(first_step, t1 - self.t0)
         self.control[self.a.MAX_STEP] = max_step
 

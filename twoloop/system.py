@@ -174,9 +174,11 @@ class ConstrainedSystem:
         functions = {kind: function for kind, function in given.items() if function is not None}
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "constant_mass": constant_mass, "name": name}
         if compile:
-            return cls(**sizes, **{kind: compile_returning(kind, function) for kind, function in functions.items()})
+            compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
+            return cls(**sizes, **compiled)
         python = PythonFunctions(name, functions)
-        system = cls(**sizes, **{kind: _THROUGH_PYTHON[kind] for kind in functions}, parameters=[python.handle])
+        wrappers: dict[str, Any] = {kind: _THROUGH_PYTHON[kind] for kind in functions}
+        system = cls(**sizes, **wrappers, parameters=[python.handle])
         system._python = python  # the registry holds it weakly
         return system
 

@@ -144,7 +144,7 @@ def advance(
             clock[H_LIMIT] = control[LIMIT_FACTOR] * size
             clock[LIMIT_AGE] = 0.0
             clock[H_NEXT] = 0.5 * size
-            if (code == SINGULAR or code == INNER_DIVERGED) and partition(f, w, t, state[:n]) != DONE:
+            if code in (SINGULAR, INNER_DIVERGED) and partition(f, w, t, state[:n]) != DONE:
                 return RANK_LOST
             continue
         factor = control[FACTOR_MAX]

@@ -184,7 +184,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     norm_before = np.inf
     for _ in range(MAX_SWEEPS_PAPER):
         w.counters[N_OUTER] += 1
-        for m in w.independent:
+        for m in range(n):  # for the dependents this is where Newton starts
             for j in range(s):
                 total = 0.0
                 for k in range(s):
@@ -202,7 +202,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
         copy(q1, q_old)
         copy(v1, v_old)
         change = 0.0
-        for m in w.independent:
+        for m in range(n):
             in_q = 0.0
             in_v = 0.0
             for k in range(s):
@@ -210,6 +210,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
                 in_v += b[k] * A_stage[k, m]
             q1[m] = q[m] + h * in_q
             v1[m] = v[m] + h * in_v
+        for m in w.independent:
             change = max(change, abs(q1[m] - q_old[m]) / max(abs(q1[m]), 1.0))
             change = max(change, abs(v1[m] - v_old[m]) / max(abs(v1[m]), 1.0))
         code = restore(f, w, t + h, q1, v1, tolerance)
@@ -250,8 +251,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by sweeps on the accelerations; where the error is estimated, a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
-    step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the last accepted step, those of the
-    half steps from the whole step's.
+    step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
+    last accepted step, those of the half steps from the whole step's.
     """
     s, _, _, _, _, c = _tableau(options)
     n = w.Q.size
