@@ -221,7 +221,8 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     - (26): "Rotol" is read as Rtol. (27): n is 2 n_q, because z holds positions and velocities.
     - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
     - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta sweep iterates the K_i, and so does this.
-    - Left open by the text and chosen: stages swept in the manner of Jacobi; the accepted state is that of the two
+    - Left open by the text and chosen: the K_i are calculated one after another with the latest of the others, as the
+      loop is printed (all from the old ones would need a third more evaluations at loose err_out); the accepted state is that of the two
       half steps; Newton starts from the last iterate of the same stage; err_in bounds the largest correction;
       200 sweeps at the most; the first step size, by solve_dae; c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
     - "Once in a time step or several time steps": the partition is checked at every step, and chosen anew when the

@@ -165,8 +165,8 @@ def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1
 def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
     """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
 
-    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. The stages are swept
-    in the manner of Jacobi. On return (q1, v1) is the end of the step, on the constraints.
+    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. A sweep goes from stage
+    to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on the constraints.
     """
     s, A, _, b, _, c = _tableau(options)
     n = q.size
@@ -184,25 +184,22 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     norm_before = np.inf
     for _ in range(MAX_SWEEPS_PAPER):
         w.counters[N_OUTER] += 1
-        for m in range(n):  # for the dependents this is where Newton starts
-            for j in range(s):
-                total = 0.0
-                for k in range(s):
-                    total += A[j, k] * V_stage[k, m]
-                Q_stage[j, m] = q[m] + h * total
-            for j in range(s):
-                total = 0.0
-                for k in range(s):
-                    total += A[j, k] * A_stage[k, m]
-                V_stage[j, m] = v[m] + h * total
         for j in range(s):
+            for m in w.independent:
+                in_q = 0.0
+                in_v = 0.0
+                for k in range(s):
+                    in_q += A[j, k] * V_stage[k, m]
+                    in_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + h * in_q
+                V_stage[j, m] = v[m] + h * in_v
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j], w.lam)
             if code != DONE:
                 return code
         copy(q1, q_old)
         copy(v1, v_old)
         change = 0.0
-        for m in range(n):
+        for m in w.independent:
             in_q = 0.0
             in_v = 0.0
             for k in range(s):
@@ -210,7 +207,6 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
                 in_v += b[k] * A_stage[k, m]
             q1[m] = q[m] + h * in_q
             v1[m] = v[m] + h * in_v
-        for m in w.independent:
             change = max(change, abs(q1[m] - q_old[m]) / max(abs(q1[m]), 1.0))
             change = max(change, abs(v1[m] - v_old[m]) / max(abs(v1[m]), 1.0))
         code = restore(f, w, t + h, q1, v1, tolerance)

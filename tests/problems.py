@@ -1,0 +1,283 @@
+"""Small problems with references that share nothing with the integrator."""
+
+from functools import cache
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.special import ellipj, ellipk
+
+from twoloop import ConstrainedSystem
+
+G = 9.81
+TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
+
+
+def worst(a, b):
+    return float(np.abs(np.asarray(a) - np.asarray(b)).max())
+
+
+# --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
+
+
+def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
+    functions = {
+        "mass": np.eye(2) if constant_mass else lambda t, q: np.eye(2),
+        "force": lambda t, q, v: np.array([0.0, -9.81]),
+        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+        "jacobian": lambda t, q: q.reshape((1, 2)),
+        "gamma": (lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])])) if gamma else None,
+        "name": "pendulum",
+    }
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, compile=compile, **{**functions, **changed})
+
+
+def pendulum_state(t, angle=-0.5 * np.pi):
+    """q, v, lam at t of the pendulum released from rest at `angle` from the downward vertical."""
+    k, w = np.sin(0.5 * angle), np.sqrt(G)
+    sn, cn, dn, _ = ellipj(w * np.asarray(t, dtype=float), k * k)
+    theta = 2.0 * np.arcsin(k * cn / dn)
+    rate = -2.0 * k * w * np.sqrt(1.0 - k * k) * sn / dn
+    q = np.array([np.sin(theta), -np.cos(theta)])
+    v = rate * np.array([np.cos(theta), np.sin(theta)])
+    return q, v, rate**2 - G * q[1]
+
+
+def pendulum_period(angle=-0.5 * np.pi):
+    return 4.0 * ellipk(np.sin(0.5 * angle) ** 2) / np.sqrt(G)
+
+
+def pendulum_energy(q, v):
+    return 0.5 * (v * v).sum(axis=0) + G * q[1]
+
+
+# --- rheonomic: the same pendulum under a pivot that moves both ways, so that C_t and C_tt are not zero
+
+
+def _pivot(t):
+    p = np.array([0.3 * np.sin(3.0 * t), 0.1 * np.cos(5.0 * t)])
+    rate = np.array([0.9 * np.cos(3.0 * t), -0.5 * np.sin(5.0 * t)])
+    acceleration = np.array([-2.7 * np.sin(3.0 * t), -2.5 * np.cos(5.0 * t)])
+    return p, rate, acceleration
+
+
+def moving_pivot(*, compile=False, gamma=True):
+    pivot = _pivot
+    if compile:
+        from numba import njit
+
+        pivot = njit(_pivot)
+
+    def constraint(t, q):
+        d = q - pivot(t)[0]
+        return np.array([0.5 * (d[0] * d[0] + d[1] * d[1] - 1.0)])
+
+    def jacobian(t, q):
+        return (q - pivot(t)[0]).reshape((1, 2))
+
+    def constraint_rate(t, q):
+        p, rate, _ = pivot(t)
+        d = q - p
+        return np.array([-(d[0] * rate[0] + d[1] * rate[1])])
+
+    def right_side(t, q, v):
+        p, rate, acceleration = pivot(t)
+        d, u = q - p, v - rate
+        return np.array([d[0] * acceleration[0] + d[1] * acceleration[1] - u[0] * u[0] - u[1] * u[1]])
+
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=lambda t, q: np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=constraint,
+        jacobian=jacobian,
+        constraint_rate=constraint_rate,
+        gamma=right_side if gamma else None,
+        compile=compile,
+        name="moving pivot",
+    )
+
+
+MOVING_PIVOT_START = (1.0, 0.5)  # angle from the downward vertical and its rate
+
+
+@cache
+def _moving_pivot_solution(start, end):
+    def rate(t, y):
+        _, _, a = _pivot(t)
+        return [y[1], -(G + a[1]) * np.sin(y[0]) - a[0] * np.cos(y[0])]
+
+    return solve_ivp(rate, (0.0, end), start, "DOP853", **TIGHT).sol
+
+
+def moving_pivot_state(t, start=MOVING_PIVOT_START, end=10.0):
+    """q, v at t, by Lagrange's equation for the angle."""
+    t = np.asarray(t, dtype=float)
+    theta, rate = _moving_pivot_solution(start, end)(t)
+    p, u, _ = _pivot(t)
+    return p + np.array([np.sin(theta), -np.cos(theta)]), u + rate * np.array([np.cos(theta), np.sin(theta)])
+
+
+# --- oblique polar coordinates: x = r(cos phi, sin phi), r = q0, phi = q1 + 0.3 q0; a damped pendulum whose pivot is
+# not the origin. M(t, q) is full and varies, forces depend on velocities; a mass factor m(t) scales M, Q and lam alike
+
+PIVOT, DAMPING = np.array([0.5, 0.0]), 0.2
+OBLIQUE_START = (1.2, -0.5)
+
+
+def _point(q):
+    phi = q[1] + 0.3 * q[0]
+    return q[0] * np.array([np.cos(phi), np.sin(phi)])
+
+
+def _point_jacobian(q):
+    phi = q[1] + 0.3 * q[0]
+    radial = np.array([np.cos(phi), np.sin(phi)])
+    across = q[0] * np.array([-np.sin(phi), np.cos(phi)])
+    return np.array([radial + 0.3 * across, across]).T
+
+
+def _point_bias(q, v):
+    """What remains of the acceleration of the point when q'' = 0."""
+    phi, rate = q[1] + 0.3 * q[0], v[1] + 0.3 * v[0]
+    return -q[0] * rate**2 * np.array([np.cos(phi), np.sin(phi)]) + 2.0 * v[0] * rate * np.array(
+        [-np.sin(phi), np.cos(phi)]
+    )
+
+
+def mass_factor(t):
+    return 2.0 + np.sin(t)
+
+
+def oblique_pendulum(gamma=True):
+    def force(t, q, v):
+        J = _point_jacobian(q)
+        return mass_factor(t) * J.T @ (np.array([0.0, -G]) - DAMPING * (J @ v) - _point_bias(q, v))
+
+    def right_side(t, q, v):
+        u = _point_jacobian(q) @ v
+        return np.array([-(u @ u) - (_point(q) - PIVOT) @ _point_bias(q, v)])
+
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=lambda t, q: mass_factor(t) * _point_jacobian(q).T @ _point_jacobian(q),
+        force=force,
+        constraint=lambda t, q: np.array([0.5 * ((_point(q) - PIVOT) @ (_point(q) - PIVOT) - 1.0)]),
+        jacobian=lambda t, q: ((_point(q) - PIVOT) @ _point_jacobian(q))[None, :],
+        gamma=right_side if gamma else None,
+        name="oblique pendulum",
+    )
+
+
+@cache
+def _oblique_solution(end):
+    def rate(t, y):
+        return [y[1], -G * np.sin(y[0]) - DAMPING * y[1]]
+
+    return solve_ivp(rate, (0.0, end), OBLIQUE_START, "DOP853", **TIGHT).sol
+
+
+def oblique_point(t, end=5.0):
+    """Cartesian position, velocity and multiplier at t, by the equation for the angle at the pivot."""
+    t = np.asarray(t, dtype=float)
+    theta, rate = _oblique_solution(end)(t)
+    x = PIVOT.reshape(2, *(1,) * t.ndim) + np.array([np.sin(theta), -np.cos(theta)])
+    lam = mass_factor(t) * (rate**2 + G * np.cos(theta))
+    return x, rate * np.array([np.cos(theta), np.sin(theta)]), lam
+
+
+def oblique_start():
+    x, u, _ = oblique_point(0.0)
+    r = np.hypot(*x)
+    q = np.array([r, np.arctan2(x[1], x[0]) - 0.3 * r])
+    return q, np.linalg.solve(_point_jacobian(q), u)
+
+
+def oblique_to_point(result):
+    """Cartesian positions and velocities of a result in oblique coordinates."""
+    columns = range(result.t.size)
+    x = np.array([_point(result.q[:, k]) for k in columns]).T
+    u = np.array([_point_jacobian(result.q[:, k]) @ result.v[:, k] for k in columns]).T
+    return x, u
+
+
+# --- the four-bar linkage by one angle
+
+
+def one_angle(lengths, ground, theta3, branch):
+    """The linkage released from rest, by Lagrange's equation for theta_2 alone: a function of the times.
+
+    Valid where theta_2 determines the others, as it does in the default linkage. Nothing is shared with twoloop.
+    """
+    L1, L2, L3 = lengths
+    masses = np.array(lengths)
+
+    def angles(th2, side):
+        rest = ground - L2 * np.exp(1j * th2)  # bars 1 and 3 together
+        corner = np.arccos((L1**2 + abs(rest) ** 2 - L3**2) / (2.0 * L1 * abs(rest)))
+        th1 = np.angle(rest) + side * corner
+        return np.array([th1, th2, np.angle(rest - L1 * np.exp(1j * th1))])
+
+    joint = ground - L3 * np.exp(1j * theta3)
+    d = abs(joint)
+    th1 = np.angle(joint) + branch * np.arccos((L1**2 + d**2 - L2**2) / (2.0 * L1 * d))
+    th2 = np.angle(joint - L1 * np.exp(1j * th1))
+    side = min((1, -1), key=lambda s: abs(np.exp(1j * angles(th2, s)[0]) - np.exp(1j * th1)))
+
+    def kinematics(th2):
+        """Angles, d angles / d th2 and the second derivative, by differentiating the closure twice."""
+        e = np.array(lengths) * np.exp(1j * angles(th2, side))
+        closure = np.array([[-e[0].imag, -e[2].imag], [e[0].real, e[2].real]])
+        w1, w3 = np.linalg.solve(closure, [e[1].imag, -e[1].real])
+        w = np.array([w1, 1.0, w3])
+        left = (e * w**2).sum()
+        b1, b3 = np.linalg.solve(closure, [left.real, left.imag])
+        return e, w, np.array([b1, 0.0, b3])
+
+    def centres(ends):
+        return np.cumsum(ends) - 0.5 * ends
+
+    def rate(t, y):
+        e, w, b = kinematics(y[0])
+        u = centres(1j * e * w)
+        bias = centres(1j * e * b - e * w**2)
+        inertias = masses * np.array(lengths) ** 2 / 12.0
+        inertia = masses @ (abs(u) ** 2) + inertias @ w**2
+        coupling = masses @ (u.conj() * bias).real + inertias @ (w * b)
+        return [y[1], -(coupling * y[1] ** 2 + G * (masses @ u.imag)) / inertia]
+
+    def state(t):
+        end = float(np.max(t))
+        y = solve_ivp(rate, (0.0, end), [th2, 0.0], "DOP853", **TIGHT).sol(np.atleast_1d(t))
+        q, v = np.empty((9, y.shape[1])), np.empty((9, y.shape[1]))
+        for k, (angle, speed) in enumerate(y.T):
+            e, w, _ = kinematics(angle)
+            x, u = centres(e), centres(1j * e * w) * speed
+            q[0::3, k], q[1::3, k], q[2::3, k] = x.real, x.imag, angles(angle, side)
+            v[0::3, k], v[1::3, k], v[2::3, k] = u.real, u.imag, w * speed
+        return q, v
+
+    return state
+
+
+# --- what every test of a run wants to know
+
+
+def violations(system, result):
+    """Largest violation of the position and of the velocity constraints over all stored states."""
+    columns = range(result.t.size)
+    position = max(np.abs(system.constraint(result.t[k], result.q[:, k])).max() for k in columns)
+    velocity = max(
+        np.abs(system.velocity_constraint(result.t[k], result.q[:, k], result.v[:, k])).max() for k in columns
+    )
+    return float(position), float(velocity)
+
+
+def force_residual(system, result):
+    """Largest |M a + C_q^T lam - Q| over all stored states."""
+    largest = 0.0
+    for t, q, v, a, lam in zip(result.t, result.q.T, result.v.T, result.a.T, result.lam.T, strict=True):
+        residual = system.mass(t, q) @ a + system.jacobian(t, q).T @ lam - system.force(t, q, v)
+        largest = max(largest, np.abs(residual).max())
+    return float(largest)
