@@ -22,9 +22,9 @@ from exudyn.itemInterface import (
 )
 from numpy.typing import NDArray
 
+from twoloop.checks import check_size, check_vector
 from twoloop.mechanisms.problem import Problem
 from twoloop.result import Result, Statistics, Status
-from twoloop.system import check_size, check_vector
 
 Array = NDArray[np.float64]
 

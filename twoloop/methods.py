@@ -222,11 +222,11 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
     - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta sweep iterates the K_i, and so does this.
     - Left open by the text and chosen: the K_i are calculated one after another with the latest of the others, as the
-      loop is printed (all from the old ones would need a third more evaluations at loose err_out); the accepted state is that of the two
-      half steps; Newton starts from the last iterate of the same stage; err_in bounds the largest correction;
-      200 sweeps at the most; the first step size, by solve_dae; c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
-    - "Once in a time step or several time steps": the partition is checked at every step, and chosen anew when the
-      pivot ratio of C_qd has fallen to a tenth of its best, and after every step that did not converge.
+      loop is printed; the accepted state is that of the two half steps; Newton starts from the last iterate of the
+      same stage; err_in bounds the largest correction; 200 sweeps at the most; the first step size, by solve_dae;
+      c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
+    - "Once in a time step or several time steps": the partition is looked at after every step, and chosen anew when
+      max|C_qd^-1 C_qi| has grown to three times what it was, or when C_qd became singular within a step.
 
     Parameters
     ----------

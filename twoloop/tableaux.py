@@ -63,8 +63,8 @@ def _collocation(c: Array) -> tuple[Array, Array]:
     basis = [Legendre.basis(k) for k in range(s)]
     values = np.column_stack([p(x) for p in basis])
     integrals = np.column_stack([p.integ(lbnd=-1)(x) / 2.0 for p in basis])
-    A: Array = np.linalg.solve(values.T, integrals.T).T
-    b: Array = np.linalg.solve(values.T, np.eye(s)[0])  # only P_0 has an integral over [0, 1]
+    A = np.asarray(np.linalg.solve(values.T, integrals.T).T, dtype=np.float64)
+    b = np.asarray(np.linalg.solve(values.T, np.eye(s)[0]), dtype=np.float64)  # only P_0 has an integral over [0, 1]
     return A, b
 
 

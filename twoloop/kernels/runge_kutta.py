@@ -166,7 +166,8 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
 
     `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. A sweep goes from stage
-    to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on the constraints.
+    to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on the
+    constraints.
     """
     s, A, _, b, _, c = _tableau(options)
     n = q.size

@@ -1,0 +1,1 @@
+"""Studies: `python -m studies.NAME [--quick] [--out DIR] [--redraw]`; `python -m studies` lists them."""

@@ -1,0 +1,54 @@
+"""Pictures of the four-bar linkage in its motion: both geometries over half a period."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from references.four_bar_minimal import MinimalFourBar
+from studies.report import parse
+from twoloop import solve_dae
+from twoloop.mechanisms import Problem, four_bar
+
+INSTANTS = 9
+PROBLEMS = (four_bar(), four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0))
+
+
+def _joints(problem: Problem, q):  # type: ignore[no-untyped-def]
+    """The joints from O to A, (2, 4), from the bars' ends."""
+    points = np.zeros((2, 4))
+    for i, name in enumerate(("L1", "L2", "L3")):
+        half = 0.5 * problem.parameters[name]
+        points[:, i + 1] = q[3 * i] + half * np.cos(q[3 * i + 2]), q[3 * i + 1] + half * np.sin(q[3 * i + 2])
+    return points
+
+
+def draw(axes: plt.Axes, problem: Problem) -> None:
+    """Draw the bars at equal intervals over half a period, from the start (dark) to the other position of rest."""
+    half = 0.5 * MinimalFourBar.from_parameters(problem.parameters).period
+    times = np.linspace(0.0, half, INSTANTS)
+    result = solve_dae(problem.system, (0.0, half), problem.q0, problem.v0, t_eval=times)
+    fine = solve_dae(problem.system, (0.0, half), problem.q0, problem.v0, t_eval=np.linspace(0.0, half, 200))
+    axes.plot(fine.q[6], fine.q[7], color="tab:red", lw=1.2, label="centre of bar 3")
+    for k in range(INSTANTS):
+        x, y = _joints(problem, result.q[:, k])
+        shade = plt.cm.viridis(0.9 * k / (INSTANTS - 1))
+        axes.plot(x, y, "-o", color=shade, lw=2.4 if k == 0 else 1.3, ms=3.5)
+    axes.plot([0.0, problem.parameters["L"]], [0.0, 0.0], "^", color="black", ms=9, zorder=5)
+    axes.annotate("O", (0.0, 0.0), (-12, 6), textcoords="offset points")
+    axes.annotate("A", (problem.parameters["L"], 0.0), (6, 6), textcoords="offset points")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"{problem.name}, half a period: {half:.3f} s")
+    axes.legend(loc="lower left")
+
+
+def main(words: list[str] | None = None, command: str | None = None) -> None:
+    """Draw `linkage.png`."""
+    call = parse("linkage", __doc__, words, command)
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.0), layout="constrained")
+    for one, problem in zip(axes, PROBLEMS, strict=True):
+        draw(one, problem)
+    figure.suptitle("Released from rest (dark), drawn at equal intervals of time", fontsize=9)
+    figure.savefig(call.out / "linkage.png")
+    print(f"wrote {call.out / 'linkage.png'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""What every study writes: rows with a stamp (CSV), markdown, figures; and how it is called."""
+
+import argparse
+import os
+import platform
+import subprocess
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import matplotlib as mpl
+import pandas as pd
+
+mpl.use("Agg")
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("twoloop", "numpy", "scipy", "numba", "scikit-sundae", "exudyn")
+
+mpl.rcParams.update(
+    {
+        "figure.dpi": 130,
+        "savefig.bbox": "tight",
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "font.size": 9,
+        "legend.frameon": False,
+    }
+)
+
+
+@dataclass(frozen=True)
+class Call:
+    """How a study was called."""
+
+    quick: bool
+    out: Path
+    redraw: bool
+    command: str
+
+
+def parse(name: str, description: str | None, words: list[str] | None, command: str | None) -> Call:
+    """Read the command line of a study."""
+    parser = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=description)
+    parser.add_argument("--quick", action="store_true", help="a small version in seconds, into reports/quick")
+    parser.add_argument("--out", type=Path, help="folder for the report (default: reports)")
+    parser.add_argument("--redraw", action="store_true", help="write report and figures again from the saved rows")
+    given = parser.parse_args(words)
+    out = given.out or ROOT / "reports" / ("quick" if given.quick else "")
+    out.mkdir(parents=True, exist_ok=True)
+    line = command or " ".join([f"python -m studies.{name}", *(["--quick"] if given.quick else [])])
+    return Call(given.quick, out, given.redraw, line)
+
+
+def stamp(command: str) -> str:
+    """One line: command, date, commit, machine, versions."""
+    versions = []
+    for package in PACKAGES:
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            versions.append(f"{package} (not installed)")
+    return "; ".join(
+        [
+            f"`{command}`",
+            date.today().isoformat(),
+            f"commit {_commit()}",
+            f"{_cpu()}, {os.cpu_count()} cores",
+            f"{platform.system()}, Python {platform.python_version()}",
+            *versions,
+        ]
+    )
+
+
+def _commit() -> str:
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--", "twoloop", "references", "studies")
+        return git("rev-parse", "--short=10", "HEAD") + (" with uncommitted changes" if changed else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown (not a git checkout)"
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def save_rows(path: Path, rows: pd.DataFrame, line: str) -> None:
+    """Write the rows, the stamp above them as a comment."""
+    path.write_text(f"# {line}\n" + rows.to_csv(index=False))
+
+
+def load_rows(path: Path) -> tuple[pd.DataFrame, str]:
+    """Read what `save_rows` wrote."""
+    first, rest = path.read_text().split("\n", 1)
+    from io import StringIO
+
+    return pd.read_csv(StringIO(rest)), first.removeprefix("# ")
+
+
+def markdown_table(header: list[str], rows: list[list[str]]) -> str:
+    """A markdown table of ready strings; the first column to the left, the others to the right."""
+    lines = ["| " + " | ".join(header) + " |", "|---" + "|--:" * (len(header) - 1) + "|"]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def number(value: float, digits: int = 2) -> str:
+    """A number for a table: few digits, powers of ten only where needed; a dash for what does not exist."""
+    if value is None or pd.isna(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    if 1e-2 <= abs(value) < 1e4:
+        return f"{value:.{digits + 1}g}" if abs(value) < 10 else f"{value:.4g}"
+    mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"

@@ -1,0 +1,100 @@
+"""Coordinate partitioning: what full pivoting chooses, the rank it sees, and runs that one partition cannot make."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from references.four_bar_minimal import trajectory
+from tests.problems import worst
+from twoloop import solve_dae
+from twoloop.kernels import advance, common
+from twoloop.kernels.partition import full_pivoting
+from twoloop.mechanisms import four_bar
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def pivoted(A):
+    order = np.zeros(A.shape[1], dtype=np.int64)
+    return full_pivoting(A.copy(), order), order
+
+
+@given(st.integers(1, 8), st.integers(0, 6), seeds)
+def test_dependent_columns_are_regular_and_the_independent_ones_their_complement(n_c, n_free, seed):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n_c, n_c + n_free)) * 10.0 ** rng.integers(-4, 5)
+    rank, order = pivoted(A)
+    assert rank == n_c
+    assert sorted(order) == list(range(n_c + n_free))
+    dependent, independent = A[:, order[:n_c]], A[:, order[n_c:]]
+    assert np.linalg.matrix_rank(dependent) == n_c
+    # full pivoting keeps the dependents from moving much faster than the independents
+    assert np.abs(np.linalg.solve(dependent, independent)).max(initial=0.0) < 2.0**n_c
+
+
+@given(st.integers(2, 8), st.integers(0, 6), seeds, st.data())
+def test_rank_is_seen(n_c, n_free, seed, data):
+    rng = np.random.default_rng(seed)
+    rank = data.draw(st.integers(1, n_c - 1))
+    A = rng.normal(size=(n_c, rank)) @ rng.normal(size=(rank, n_c + n_free))
+    assert pivoted(A)[0] == rank
+
+
+def test_no_rank_in_zeros_and_nan():
+    assert pivoted(np.zeros((2, 3)))[0] == 0
+    assert pivoted(np.full((2, 3), np.nan))[0] == 0
+
+
+@given(st.floats(-3.0, 3.0), st.sampled_from([-1, 1]))
+def test_the_chosen_partition_of_the_linkage_is_well_conditioned_everywhere(theta3, branch):
+    try:
+        problem = four_bar(lengths=(1.0, 2.0, 1.5), ground=3.0, theta3=theta3, branch=branch)
+    except ValueError:
+        return  # does not assemble there
+    system = problem.system
+    work = common.make_work(9, 8)
+    state = np.concatenate([problem.q0, problem.v0, np.zeros(17)])
+    assert advance.start(*system.functions, work, 0.0, state) == common.DONE
+    assert sorted([*work.dependent, *work.independent]) == list(range(9))
+    Cq = system.jacobian(0.0, problem.q0)
+    rates = np.linalg.solve(Cq[:, work.dependent], Cq[:, work.independent])
+    assert np.abs(rates).max() < 5.0
+
+
+def test_bars_in_line_force_another_partition_and_nothing_jumps(collinear_four_bar):
+    problem = collinear_four_bar
+    times = np.linspace(0.0, 10.0, 101)
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    assert result.success
+    theta1, theta2 = result.q[2], result.q[5]
+    assert (np.diff(np.sign(np.sin(theta2 - theta1))) != 0).sum() >= 5  # bars 1 and 2 pass through one line
+    assert result.stats.n_partitions > 1
+    energy = problem.energy(result.t, result.q, result.v)
+    assert np.abs(np.diff(energy)).max() < 1e-8  # no jump at a switch
+    assert worst(energy, energy[0]) < 1e-8
+    # the state is carried over: positions move no farther in a step than their velocities allow
+    reach = np.maximum(np.abs(result.v[:, 1:]), np.abs(result.v[:, :-1])) * result.h + 50.0 * result.h**2
+    assert (np.abs(np.diff(result.q, axis=1)) <= reach).all()
+    landed = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10, t_eval=times)
+    assert worst(landed.q, trajectory(problem.parameters, times)[0]) < 1e-9
+
+
+@pytest.mark.parametrize("method", ["Newmark", "Gauss8", "PaperIRK", "RadauIIA5"])
+def test_every_method_passes_the_collinear_positions(collinear_four_bar, method):
+    problem = collinear_four_bar
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=1e-6, atol=1e-6)
+    assert result.success, result.message
+    assert result.stats.n_partitions > 1
+    truth = trajectory(problem.parameters, [10.0])[0][:, 0]
+    assert worst(result.q[:, -1], truth) < {"Newmark": 5e-2, "PaperIRK": 1e-3}.get(method, 1e-4)
+
+
+def test_no_single_angle_serves_the_default_linkage_for_a_period(default_four_bar):
+    # theta_1 and theta_3 both come to turning points of their own, where the others still move
+    q, v = trajectory(default_four_bar.parameters, np.linspace(0.01, 2.2, 2000))
+    moving = np.abs(v).max(axis=0)
+    for angle in (2, 8):
+        assert (np.abs(v[angle]) / moving).min() < 5e-2
+    problem = default_four_bar
+    assert solve_dae(problem.system, (0.0, 2.25), problem.q0, problem.v0).stats.n_partitions > 1

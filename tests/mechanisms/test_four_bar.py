@@ -1,0 +1,188 @@
+"""The four-bar linkage: derivatives, power balance, assembly, and its motion by routes with one degree of freedom."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from references.four_bar_minimal import MinimalFourBar
+from tests.problems import one_angle, violations, worst
+from twoloop import solve_dae
+from twoloop.mechanisms import four_bar
+
+lengths = st.floats(0.3, 3.0)
+angles = st.floats(-math.pi, math.pi)
+states = st.lists(st.floats(-4.0, 4.0), min_size=9, max_size=9).map(np.array)
+branches = st.sampled_from([-1, 1])
+
+
+def assembled(L1, L2, L3, ground, theta3, branch):
+    """The problem, or a discarded example where the bars do not reach."""
+    reach = abs(ground - L3 * np.exp(1j * theta3))
+    assume(abs(L1 - L2) * 1.02 + 0.02 < reach < 0.98 * (L1 + L2))
+    return four_bar(lengths=(L1, L2, L3), ground=ground, theta3=theta3, branch=branch)
+
+
+def system_of(L1, L2, L3, ground):
+    """A system of these lengths; its callbacks take any q, so it need not hold together there."""
+    system = four_bar().system
+    system.parameters[:] = L1, L2, L3, ground
+    return system
+
+
+def slope(f, e=1e-3):
+    """df(s)/ds at s = 0, central differences of order 4."""
+    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
+
+
+@given(lengths, lengths, lengths, lengths, states, states)
+def test_jacobian_is_the_derivative_of_the_constraint(L1, L2, L3, ground, q, v):
+    system = system_of(L1, L2, L3, ground)
+    difference = slope(lambda s: system.constraint(0.0, q + s * v))
+    assert worst(system.jacobian(0.0, q) @ v, difference) < 1e-8
+    for j in range(9):
+        column = slope(lambda s, j=j: system.constraint(0.0, q + s * np.eye(9)[j]))
+        assert worst(system.jacobian(0.0, q)[:, j], column) < 1e-10
+
+
+@given(lengths, lengths, lengths, lengths, states, states)
+def test_gamma_is_the_rate_of_the_velocity_constraint(L1, L2, L3, ground, q, v):
+    system = system_of(L1, L2, L3, ground)
+    difference = slope(lambda s: system.jacobian(s, q + s * v) @ v + system.constraint_rate(s, q + s * v))
+    assert worst(system.gamma(0.0, q, v), -difference) < 1e-7
+
+
+def test_constraints_do_not_depend_on_time(default_four_bar):
+    system, q = default_four_bar.system, default_four_bar.q0
+    assert (system.constraint(0.0, q) == system.constraint(7.0, q)).all()
+    assert (system.constraint_rate(3.0, q) == 0.0).all()
+
+
+@given(states, states)
+def test_energy_changes_with_the_power_of_the_forces(q, v):
+    # along q'' = a without constraints: dE/dt = v . (M a - Q) for any a
+    problem = four_bar()
+    system = problem.system
+    a = np.sin(np.arange(9.0))
+    rate = slope(lambda s: problem.energy(s, q + s * v + 0.5 * s * s * a, v + s * a))
+    assert abs(rate - v @ (system.mass(0.0, q) @ a - system.force(0.0, q, v))) < 1e-7
+
+
+def test_energy_takes_one_state_or_many(default_four_bar):
+    problem = default_four_bar
+    many = problem.energy(np.zeros(3), np.tile(problem.q0[:, None], 3), np.ones((9, 3)))
+    assert many.shape == (3,)
+    assert worst(many, problem.energy(0.0, problem.q0, np.ones(9))) < 1e-14
+
+
+def test_masses_are_those_of_uniform_rods(default_four_bar):
+    expected = [1.0, 1.0, 1.0 / 12.0, 2.0, 2.0, 8.0 / 12.0, 1.5, 1.5, 1.5**3 / 12.0]
+    assert worst(default_four_bar.system.mass(0.0, default_four_bar.q0), np.diag(expected)) < 1e-15
+
+
+@given(lengths, lengths, lengths, lengths, angles, branches)
+def test_assembled_linkages_satisfy_their_constraints_on_the_branch_asked_for(L1, L2, L3, ground, theta3, branch):
+    problem = assembled(L1, L2, L3, ground, theta3, branch)
+    q = problem.q0
+    assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-12
+    assert q[8] == theta3
+    assert (problem.v0 == 0.0).all()
+    joint12 = 2.0 * complex(q[0], q[1])
+    joint23 = ground - L3 * np.exp(1j * theta3)
+    side = (joint23.conjugate() * joint12).imag  # positive: to the left of the line from O to joint 2-3
+    assert math.copysign(1.0, side) == branch
+
+
+def test_branch_minus_one_is_below_and_one_above():
+    assert four_bar(branch=-1).q0[1] < 0.0 < four_bar(branch=1).q0[1]
+
+
+@given(lengths, lengths, lengths, lengths, angles, branches)
+def test_energy_is_kept_by_any_geometry_over_a_short_run(L1, L2, L3, ground, theta3, branch):
+    problem = assembled(L1, L2, L3, ground, theta3, branch)
+    result = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-9, atol=1e-9)
+    assert result.success, (problem.name, result.message)
+    energy = problem.energy(result.t, result.q, result.v)
+    assert worst(energy, energy[0]) < 1e-6
+    assert violations(problem.system, result)[0] < 1e-12
+
+
+def test_default_is_marked_as_assumed_and_others_carry_no_reference(default_four_bar, collinear_four_bar):
+    assert "assumed" in default_four_bar.note
+    assert "*assumed*" in four_bar.__doc__
+    assert default_four_bar.reference is not None
+    assert collinear_four_bar.reference is None
+    p = default_four_bar.parameters
+    assert (p["L1"], p["L2"], p["L3"], p["L"], p["gravity"]) == (1.0, 2.0, 1.5, 3.0, 9.81)
+
+
+def test_reference_is_the_motion_of_an_equation_in_one_angle(default_four_bar):
+    q, v = one_angle((1.0, 2.0, 1.5), 3.0, 0.0, -1)([0.0, 10.0])
+    reference = default_four_bar.reference
+    assert reference.t == 10.0
+    assert worst(q[:, 0], default_four_bar.q0) < 1e-14
+    assert worst(q[:, 1], reference.q) < 2e-12
+    assert worst(v[:, 1], reference.v) < 1e-11
+
+
+def test_reference_period_is_the_one_at_which_the_linkage_rests_again(default_four_bar):
+    period = default_four_bar.reference.period
+    q, v = one_angle((1.0, 2.0, 1.5), 3.0, 0.0, -1)([0.5 * period, period])
+    assert np.abs(v).max() < 1e-10
+    assert worst(q[:, 1], default_four_bar.q0) < 1e-11
+    assert worst(q[:, 0], default_four_bar.q0) > 0.1
+    assert abs(MinimalFourBar.from_parameters(default_four_bar.parameters).period - period) < 1e-12
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "RadauIIA5"])
+def test_default_linkage_agrees_with_its_reference_to_nine_digits(default_four_bar, method):
+    problem = default_four_bar
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=1e-10, atol=1e-10)
+    assert result.success
+    assert worst(result.q[:, -1], problem.reference.q) < 5e-10
+    assert worst(result.v[:, -1], problem.reference.v) < 1e-9
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "RadauIIA5"])
+def test_second_geometry_agrees_with_the_minimal_form_to_nine_digits(collinear_four_bar, method):
+    problem = collinear_four_bar
+    times = np.linspace(0.0, 10.0, 41)
+    result = solve_dae(
+        problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=1e-10, atol=1e-10, t_eval=times
+    )
+    q, v = MinimalFourBar.from_parameters(problem.parameters).states(times)
+    assert worst(result.q, q) < 1e-9
+    assert worst(result.v, v) < 5e-9
+
+
+def test_default_linkage_for_100_s(default_four_bar):
+    problem = default_four_bar
+    result = solve_dae(problem.system, (0.0, 100.0), problem.q0, problem.v0, method="Gauss12", rtol=1e-10, atol=1e-10)
+    q, _ = MinimalFourBar.from_parameters(problem.parameters).states([100.0])
+    assert worst(result.q[:, -1], q[:, 0]) < 1e-8
+    energy = problem.energy(result.t, result.q, result.v)
+    assert worst(energy, energy[0]) < 1e-9
+    assert violations(problem.system, result)[0] < 1e-9
+    assert result.q[7].max() < 1e-9  # bar 3 comes back to y = 0 and does not pass it, as the paper says
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"lengths": (1.0, 1.0, 0.5), "ground": 5.0}, ValueError, "cannot be assembled.*4.5 m.*between 0 and 2"),
+        ({"lengths": (3.0, 1.0, 0.5), "ground": 1.0}, ValueError, "cannot be assembled.*0.5 m.*between 2 and 4"),
+        ({"lengths": (1.0, 1.0, 1.0), "ground": 3.0}, ValueError, "cannot be assembled.*ends excluded"),
+        ({"lengths": (1.0, -1.0, 1.0)}, ValueError, "lengths must be positive.*-1"),
+        ({"lengths": (1.0, 2.0)}, ValueError, r"lengths must have shape \(3,\)"),
+        ({"lengths": "long"}, TypeError, "lengths must be"),
+        ({"ground": 0.0}, ValueError, "ground must be positive"),
+        ({"ground": math.nan}, ValueError, "ground must be finite"),
+        ({"theta3": math.inf}, ValueError, "theta3 must be finite"),
+        ({"branch": 0}, ValueError, r"branch must be 1 .*above.*-1 .*below.*given 0"),
+    ],
+)
+def test_impossible_linkages_say_why(arguments, error, words):
+    with pytest.raises(error, match=words):
+        four_bar(**arguments)
