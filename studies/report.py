@@ -7,6 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
+from io import StringIO
 from pathlib import Path
 
 import matplotlib as mpl
@@ -15,6 +16,7 @@ import pandas as pd
 mpl.use("Agg")
 
 ROOT = Path(__file__).parent.parent
+REPORTS = ROOT / "reports"
 PACKAGES = ("twoloop", "numpy", "scipy", "numba", "scikit-sundae", "exudyn")
 
 mpl.rcParams.update(
@@ -48,7 +50,7 @@ def parse(name: str, description: str | None, words: list[str] | None, command: 
     parser.add_argument("--out", type=Path, help="folder for the report (default: reports)")
     parser.add_argument("--redraw", action="store_true", help="write report and figures again from the saved rows")
     given = parser.parse_args(words)
-    out = given.out or ROOT / "reports" / ("quick" if given.quick else "")
+    out = given.out or (REPORTS / "quick" if given.quick else REPORTS)
     out.mkdir(parents=True, exist_ok=True)
     line = command or " ".join([f"python -m studies.{name}", *(["--quick"] if given.quick else [])])
     return Call(given.quick, out, given.redraw, line)
@@ -101,9 +103,15 @@ def save_rows(path: Path, rows: pd.DataFrame, line: str) -> None:
 def load_rows(path: Path) -> tuple[pd.DataFrame, str]:
     """Read what `save_rows` wrote."""
     first, rest = path.read_text().split("\n", 1)
-    from io import StringIO
-
     return pd.read_csv(StringIO(rest)), first.removeprefix("# ")
+
+
+def put_in_readme(text: str) -> None:
+    """Put a generated piece between its two marks in the README."""
+    path = ROOT / "README.md"
+    before, rest = path.read_text().split("<!-- generated: begin -->\n", 1)
+    after = rest.split("<!-- generated: end -->", 1)[1]
+    path.write_text(f"{before}<!-- generated: begin -->\n{text}\n<!-- generated: end -->{after}")
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:
