@@ -40,7 +40,9 @@ def test_constraints_hold_at_every_accepted_step_of_a_long_run(request, name, ge
     assert position < 1e-9
     assert velocity < 1e-9
     half = result.t.size // 2  # no growth: the second half is as good as the first
-    late = max(np.abs(problem.system.constraint(t, q)).max() for t, q in zip(result.t[half:], result.q.T[half:]))
+    late = max(
+        np.abs(problem.system.constraint(t, q)).max() for t, q in zip(result.t[half:], result.q.T[half:], strict=True)
+    )
     assert late < 1e-9
 
 

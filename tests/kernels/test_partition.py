@@ -83,11 +83,12 @@ def test_bars_in_line_force_another_partition_and_nothing_jumps(collinear_four_b
 @pytest.mark.parametrize("method", ["Newmark", "Gauss8", "PaperIRK", "RadauIIA5"])
 def test_every_method_passes_the_collinear_positions(collinear_four_bar, method):
     problem = collinear_four_bar
-    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=1e-6, atol=1e-6)
+    tolerance = 1e-8 if method == "Newmark" else 1e-6
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method, tolerance, tolerance)
     assert result.success, result.message
     assert result.stats.n_partitions > 1
     truth = trajectory(problem.parameters, [10.0])[0][:, 0]
-    assert worst(result.q[:, -1], truth) < {"Newmark": 5e-2, "PaperIRK": 1e-3}.get(method, 1e-4)
+    assert worst(result.q[:, -1], truth) < {"Newmark": 1e-2, "PaperIRK": 1e-3}.get(method, 1e-4)
 
 
 def test_no_single_angle_serves_the_default_linkage_for_a_period(default_four_bar):

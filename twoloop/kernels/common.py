@@ -4,7 +4,9 @@ Every callback of a mechanism has one fixed signature and works in place, so tha
 and takes any mechanism (and any method) as a first-class function.
 """
 
+import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,6 +126,17 @@ def _package_stamp() -> tuple[float, int]:
 _STAMP = _package_stamp()
 
 
+@cache
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _announce(index: str) -> None:
+    """Say, once a process, why the first run ever takes so long."""
+    if not Path(index).exists():
+        _say("twoloop: compiling the integrator, about a minute; later processes read it from the disk")
+
+
 def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     """Compile a function of the integrator for `signature` and keep the machine code on disk."""
 
@@ -131,6 +144,7 @@ def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
         dispatcher = njit(cache=True, **_OPTIONS)(function)
         # without this, an edit of linalg.py would leave a stale advance.py in the cache
         dispatcher._cache._cache_file._source_stamp = _STAMP
+        _announce(dispatcher._cache._cache_file._index_path)
         dispatcher.compile(signature)
         dispatcher.disable_compile()
         return dispatcher

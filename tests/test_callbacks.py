@@ -1,0 +1,121 @@
+"""The decorator of compiled callbacks, and the doors for plain Python functions."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from twoloop import ConstrainedSystem, callback, solve_dae
+from twoloop.callbacks import KINDS
+
+SOURCE = """
+import numpy as np
+from twoloop import ConstrainedSystem, callback, solve_dae
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = p[0]
+
+@callback("force")
+def force(t, q, v, p, Q):
+    Q[1] = -9.81 * p[0]
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    Cq[0, 0] = q[0]
+    Cq[0, 1] = q[1]
+
+system = ConstrainedSystem(n_q=2, n_c=1, mass=mass, force=force, constraint=constraint, jacobian=jacobian,
+                           parameters=[2.0], constant_mass=True, name="typed")
+print(solve_dae(system, (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0]).success)
+"""
+
+
+@pytest.mark.parametrize("how", ["-c", "stdin"])
+def test_callbacks_may_be_typed_at_a_prompt(how):
+    command, given = ([sys.executable, "-c", SOURCE], None) if how == "-c" else ([sys.executable, "-"], SOURCE)
+    done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "True"
+
+
+@callback("mass")
+def heavy(t, q, p, M):
+    M[0, 0] = M[1, 1] = p[0]
+
+
+@callback("force")
+def gravity(t, q, v, p, Q):
+    Q[1] = -9.81 * p[0]
+
+
+@callback("constraint")
+def circle(t, q, p, C):
+    C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)
+
+
+@callback("jacobian")
+def radius(t, q, p, Cq):
+    Cq[0, 0] = q[0]
+    Cq[0, 1] = q[1]
+
+
+PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}
+
+
+def test_parameters_reach_every_callback():
+    # the mass does not matter to the motion, but the tension is proportional to it
+    runs = [
+        solve_dae(ConstrainedSystem(**PENDULUM, parameters=[m]), (0.0, 1.0), [-1.0, 0.0], [0.0, 0.0])
+        for m in (1.0, 3.0)
+    ]
+    np.testing.assert_allclose(runs[0].q[:, -1], runs[1].q[:, -1], atol=1e-9)
+    np.testing.assert_allclose(3.0 * runs[0].lam[:, -1], runs[1].lam[:, -1], rtol=1e-6)
+
+
+def test_a_constant_mass_is_factored_once():
+    def run(constant):
+        system = ConstrainedSystem(**PENDULUM, parameters=[2.0], constant_mass=constant)
+        return solve_dae(system, (0.0, 1.0), [-1.0, 0.0], [0.0, 0.0])
+
+    once, always = run(True), run(False)
+    np.testing.assert_allclose(once.q[:, -1], always.q[:, -1], atol=1e-10)
+    assert always.stats.n_factorizations - once.stats.n_factorizations >= 0.9 * always.stats.n_evaluations
+
+
+def test_unknown_kind_lists_the_known():
+    with pytest.raises(ValueError, match=r"kind must be one of mass, force.*gamma; given 'stiffness'"):
+        callback("stiffness")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_arguments_than_the_kind_has_are_named(kind):
+    def wrong(t, q):
+        pass
+
+    with pytest.raises(TypeError, match=rf"wrong.*'{kind}'.*arguments are \(t, q, .*it has \(t, q\)"):
+        callback(kind)(wrong)
+
+
+def test_a_function_that_numba_cannot_compile_says_why():
+    with pytest.raises(TypeError, match=r"(?s)force: numba cannot compile the function 'force'.*undefined_name"):
+
+        @callback("force")
+        def force(t, q, v, p, Q):
+            Q[0] = undefined_name  # noqa: F821
+
+
+@pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"])
+def test_plain_functions_are_sent_to_from_python(kind):
+    with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):
+        ConstrainedSystem(**{**PENDULUM, kind: lambda t, q, p, x: None})
+
+
+def test_a_callback_of_another_kind_is_refused():
+    with pytest.raises(TypeError, match=r"mass must be compiled by @twoloop.callback\('mass'\)"):
+        ConstrainedSystem(**{**PENDULUM, "mass": gravity})

@@ -1,0 +1,85 @@
+"""Method objects and presets: options, their checks, and what they say about the paper."""
+
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+
+from twoloop import Newmark, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop.methods import PRESETS
+from twoloop.tableaux import gauss, sun_radau_iib
+
+
+def test_presets_are_those_promised():
+    gausses = {f"Gauss{order}" for order in range(4, 17, 2)}
+    assert set(PRESETS) >= {"SunRadau5", "RadauIIA5", "Newmark", "PaperIRK", "PaperNewmark"} | gausses
+
+
+@pytest.mark.parametrize("order", range(4, 17, 2))
+def test_gauss_presets_have_the_order_of_their_name(order):
+    tableau = PRESETS[f"Gauss{order}"].tableau
+    assert tableau.order == order
+    assert tableau.stages == order // 2
+
+
+@pytest.mark.parametrize("name", ["SunRadau5", "PaperIRK"])
+def test_suns_presets_use_table_1(name):
+    assert np.abs(PRESETS[name].tableau.A - sun_radau_iib(3).A).max() == 0.0
+
+
+def test_methods_are_frozen():
+    with pytest.raises(FrozenInstanceError):
+        RungeKutta(gauss(2)).inner_tol = 1.0
+    with pytest.raises(FrozenInstanceError):
+        Newmark().beta = 1.0
+
+
+def test_papers_newmark_has_beta_as_printed_and_takes_another():
+    assert paper_newmark().beta == 0.5
+    assert paper_newmark().gamma == 0.5
+    assert paper_newmark(beta=0.25).beta == 0.25
+    assert paper_newmark(1e-5, 1e-7).inner_tol == 1e-5
+    assert paper_newmark(1e-5, 1e-7).error_tol == 1e-7
+
+
+def test_papers_presets_name_their_deviations():
+    for words in ("(26)", "(27)", "(31)", "(32)", "(33)", "(34)", "Jacobi", "Rotol", "exponent"):
+        assert words in paper_irk.__doc__ or words == "Jacobi"
+    for words in ("beta = 1/2", "1/4", "Hussein", "err_out"):
+        assert words in paper_newmark.__doc__
+
+
+def test_a_tableau_by_hand_is_a_method_too(default_four_bar):
+    problem = default_four_bar
+    span = (0.0, 1.0)
+    named = solve_dae(problem.system, span, problem.q0, problem.v0, method="Gauss6")
+    made = solve_dae(problem.system, span, problem.q0, problem.v0, method=RungeKutta(gauss(3)))
+    assert (named.q == made.q).all()
+
+
+def test_names_are_different():
+    assert len({method.name for method in PRESETS.values()}) == len(PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: RungeKutta("gauss"), TypeError, r"tableau.*'gauss'"),
+        (lambda: RungeKutta(gauss), TypeError, "tableau"),
+        (lambda: RungeKutta(gauss(2), outer="newton"), ValueError, "outer must be.*fixed-point.*paper.*'newton'"),
+        (lambda: RungeKutta(gauss(2), error="none"), ValueError, "error must be.*richardson.*'none'"),
+        (lambda: RungeKutta(gauss(2), inner_tol=0.0), ValueError, "inner_tol must be positive"),
+        (lambda: RungeKutta(gauss(2), outer_tol=np.nan), ValueError, "outer_tol must be positive"),
+        (lambda: RungeKutta(gauss(2), outer_tol="1"), TypeError, "outer_tol must be a number"),
+        (lambda: Newmark(beta=-0.1), ValueError, "beta must be between 0 and 1.*-0.1"),
+        (lambda: Newmark(gamma=1.5), ValueError, "gamma must be between 0 and 1.*1.5"),
+        (lambda: Newmark(beta=np.nan), ValueError, "beta"),
+        (lambda: Newmark(beta="half"), TypeError, "beta must be a number.*'half'"),
+        (lambda: Newmark(error_tol=-1.0), ValueError, "error_tol must be positive"),
+        (lambda: Newmark(inner_tol=True), TypeError, "inner_tol must be a number"),
+        (lambda: Newmark(outer_tol=np.inf), ValueError, "outer_tol must be positive and finite"),
+    ],
+)
+def test_wrong_options_are_named(make, error, words):
+    with pytest.raises(error, match=words):
+        make()

@@ -1,0 +1,402 @@
+"""solve_dae: output times, step sizes, limits, statistics, partial results, plain and compiled Python, prices."""
+
+import numpy as np
+import pytest
+
+from references.four_bar_minimal import trajectory
+from tests.problems import pendulum, pendulum_energy, pendulum_state, violations, worst
+from twoloop import Newmark, RungeKutta, Status, paper_irk, paper_newmark, solve_dae
+from twoloop.methods import PRESETS
+from twoloop.tableaux import gauss, sun_radau_iib
+
+PAPER_IRK_EVALUATIONS = 200_000
+PAPER_IRK_ENERGY = 1e-2
+PAPER_IRK_ERROR = 1e-2
+START = ([-1.0, 0.0], [0.0, 0.0])
+
+
+def swing(end=2.0, system=None, **options):
+    return solve_dae(system or pendulum(), (0.0, end), *START, **options)
+
+
+def run(problem, end=10.0, **options):
+    return solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, **options)
+
+
+# --- accuracy
+
+
+@pytest.mark.parametrize("constant_mass", [True, False])
+def test_pendulum_in_plain_python_agrees_with_its_closed_form_to_nine_digits(constant_mass):
+    times = np.linspace(0.0, 10.0, 21)
+    system = pendulum(constant_mass=constant_mass)
+    result = swing(10.0, system, rtol=1e-10, atol=1e-10, t_eval=times)
+    q, v, _ = pendulum_state(times)
+    assert result.success
+    assert worst(result.q, q) < 5e-10
+    assert worst(result.v, v) < 2e-9
+
+
+@pytest.mark.parametrize("method", PRESETS)
+def test_every_preset_solves_the_pendulum(method):
+    result = swing(1.0, method=method, rtol=1e-5, atol=1e-5)
+    assert result.success
+    q, v, _ = pendulum_state(1.0)
+    assert worst(result.q[:, -1], q) < 2e-3
+    assert worst(result.v[:, -1], v) < 1e-2
+    assert violations(pendulum(), result)[0] < 1e-9
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "Newmark"])
+def test_a_smaller_tolerance_gives_a_smaller_error(default_four_bar, method):
+    errors = [
+        worst(run(default_four_bar, method=method, rtol=tol, atol=tol).q[:, -1], default_four_bar.reference.q)
+        for tol in (1e-4, 1e-6, 1e-8)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[2] < 0.5 * errors[1]
+
+
+def test_angles_beyond_a_turn():
+    # fast enough to go round and round: every coordinate becomes dependent in turn
+    result = solve_dae(pendulum(), (0.0, 3.0), [0.0, -1.0], [9.0, 0.0], rtol=1e-9, atol=1e-9)
+    energy = pendulum_energy(result.q, result.v)
+    assert result.stats.n_partitions > 8
+    assert worst(energy, energy[0]) < 1e-6
+    assert result.q[1].max() > 0.99
+
+
+def test_time_may_start_anywhere(default_four_bar):
+    problem = default_four_bar
+    late = solve_dae(problem.system, (-3.0, 2.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    assert late.t[0] == -3.0
+    assert late.t[-1] == 2.0
+    assert worst(late.q[:, -1], trajectory(problem.parameters, [5.0])[0][:, 0]) < 1e-9
+
+
+# --- output
+
+
+def test_every_accepted_step_is_stored_by_default():
+    result = swing()
+    assert result.t[0] == 0.0
+    assert result.t[-1] == 2.0
+    assert result.t.size == result.stats.n_accepted + 1
+    np.testing.assert_allclose(np.diff(result.t), result.h, rtol=0, atol=1e-14)
+    assert (result.q[:, 0] == START[0]).all()
+
+
+@pytest.mark.parametrize("times", [[0.0, 0.5, 2.0], [0.3, 0.31, 0.7, 1.9], [2.0], [0.0], [1.0], [0.0, 2.0]])
+def test_output_times_are_landed_on_exactly(times):
+    result = swing(t_eval=times, rtol=1e-9, atol=1e-9)
+    assert result.success
+    assert (result.t == times).all()
+    q, v, _ = pendulum_state(np.array(times))
+    assert worst(result.q, q) < 1e-8
+    assert worst(result.v, v) < 1e-7
+    assert result.h.sum() == pytest.approx(2.0, abs=1e-13)  # the run goes to its end all the same
+
+
+def test_shapes_are_one_column_an_instant(default_four_bar):
+    result = run(default_four_bar, 1.0, t_eval=[0.0, 0.25, 0.5])
+    assert result.t.shape == (3,)
+    assert result.q.shape == result.v.shape == result.a.shape == (9, 3)
+    assert result.lam.shape == (8, 3)
+
+
+def test_more_output_than_a_buffer_holds(default_four_bar):
+    times = np.linspace(0.0, 10.0, 3001)
+    result = run(default_four_bar, t_eval=times, method="Gauss6")
+    assert (result.t == times).all()
+    assert worst(result.q, trajectory(default_four_bar.parameters, times)[0]) < 1e-7
+    assert worst(run(default_four_bar, method="Newmark").h.sum(), 10.0) < 1e-11  # more steps than a buffer holds
+
+
+def test_many_output_times_cost_no_accuracy_in_the_times():
+    times = np.arange(1, 200) * 0.01
+    assert (swing(t_eval=times).t == times).all()
+
+
+# --- step sizes
+
+
+def test_step_sizes_sum_to_the_span(default_four_bar):
+    result = run(default_four_bar)
+    assert result.h.sum() == pytest.approx(10.0, abs=1e-12)
+    assert (result.h > 0.0).all()
+
+
+def test_first_step_is_tried_first():
+    assert swing(first_step=1e-3).h[0] == 1e-3
+    refused = swing(first_step=0.5, rtol=1e-10, atol=1e-10)
+    assert refused.h[0] < 0.5
+    assert refused.stats.n_rejected_error + refused.stats.n_rejected_convergence > 0
+
+
+def test_a_first_step_longer_than_the_span_is_cut():
+    result = solve_dae(pendulum(), (0.0, 1e-3), *START, first_step=1.0)
+    assert result.success
+    assert result.t[-1] == 1e-3
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark"])
+def test_max_step_is_respected(method):
+    free = swing(method=method, rtol=1e-5, atol=1e-5)
+    bound = 0.5 * free.h.max()
+    bounded = swing(method=method, rtol=1e-5, atol=1e-5, max_step=bound)
+    assert bounded.h.max() <= bound
+    assert bounded.stats.n_accepted > free.stats.n_accepted
+
+
+def test_fixed_steps_are_all_equal_and_times_exact_multiples():
+    result = solve_dae(pendulum(), (0.25, 2.25), *START, step_size=0.01)
+    assert (result.h[:-1] == 0.01).all()
+    assert result.h[-1] == pytest.approx(0.01, abs=1e-12)
+    assert result.h.size == 200
+    assert (result.t[:-1] == 0.25 + 0.01 * np.arange(200)).all()
+    assert result.t[-1] == 2.25
+
+
+def test_the_last_fixed_step_is_shortened():
+    result = swing(1.05, step_size=0.1, method="Gauss8")
+    np.testing.assert_allclose(result.h, [0.1] * 10 + [0.05], atol=1e-12)
+    assert result.t[-1] == 1.05
+    assert worst(result.q[:, -1], pendulum_state(1.05)[0]) < 1e-5
+
+
+def test_fixed_steps_store_at_multiples_and_at_the_end():
+    result = swing(1.05, step_size=0.1, method="Gauss8", t_eval=[0.0, 0.3, 1.0, 1.05])
+    assert (result.t == [0.0, 0.3, 1.0, 1.05]).all()
+    assert len(result.h) == 11
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Newmark", "PaperIRK"])
+def test_a_fixed_step_that_cannot_converge_says_so_and_does_not_change(default_four_bar, method):
+    result = run(default_four_bar, step_size=2.0, method=method)
+    assert result.status == Status.NOT_CONVERGED
+    assert not result.success
+    assert "step_size = 2" in result.message
+    assert "smaller step_size" in result.message
+    assert (result.h == 2.0).all()
+    assert result.stats.n_rejected_convergence == 1
+
+
+def test_a_fixed_step_estimates_nothing(default_four_bar):
+    coarse = run(default_four_bar, step_size=0.01, rtol=1e-3, atol=1e-3)
+    fine = run(default_four_bar, step_size=0.01, rtol=1e-12, atol=1e-12)
+    assert (coarse.q == fine.q).all()
+    assert coarse.stats.n_rejected_error == 0
+
+
+# --- endings
+
+
+def test_max_steps_ends_the_run_with_what_there_is():
+    whole, part = swing(), swing(max_steps=7)
+    assert part.status == Status.MAX_STEPS
+    assert not part.success
+    assert part.stats.n_accepted == len(part.h) == 7
+    assert part.t.size == 8
+    assert (part.q == whole.q[:, :8]).all()
+    assert "max_steps = 7" in part.message
+    assert f"t = {part.t[-1]:.6g}"[:8] in part.message
+    assert swing(max_steps=whole.stats.n_accepted).success  # just enough
+
+
+def test_max_steps_with_output_times_keeps_those_reached():
+    part = swing(max_steps=20, t_eval=[0.0, 0.01, 1.999])
+    assert part.status == Status.MAX_STEPS
+    assert (part.t == [0.0, 0.01]).all()
+
+
+def test_reaching_the_end_is_said():
+    result = swing()
+    assert result.status == Status.REACHED_END == 0
+    assert result.success
+    assert "end" in result.message
+    assert result.sol is None
+    assert result.t_events is None
+
+
+def test_a_singular_position_on_the_way_is_a_status():
+    # a point on two crossing lines, x^2 = y^2: no independent coordinate exists where they cross, at t = 1
+    system = pendulum(
+        constant_mass=True,
+        force=lambda t, q, v: np.zeros(2),
+        constraint=lambda t, q: np.array([0.5 * (q[0] ** 2 - q[1] ** 2)]),
+        jacobian=lambda t, q: np.array([[q[0], -q[1]]]),
+        gamma=lambda t, q, v: np.array([v[1] ** 2 - v[0] ** 2]),
+    )
+    result = solve_dae(system, (0.0, 2.0), [-1.0, -1.0], [1.0, 1.0], t_eval=[0.5, 1.0, 2.0])
+    assert not result.success
+    assert result.status in (Status.RANK_LOST, Status.STEP_TOO_SMALL)
+    assert (result.t == [0.5]).all()
+    assert "singular" in result.message
+
+
+def test_dense_output_and_events_say_that_they_come_later():
+    with pytest.raises(NotImplementedError, match=r"dense_output.*t_eval"):
+        swing(dense_output=True)
+    with pytest.raises(NotImplementedError, match="events"):
+        swing(events=lambda t, q, v: 0.0)
+
+
+def test_progress_draws_a_bar(capsys):
+    pytest.importorskip("rich")
+    quiet = swing()
+    assert capsys.readouterr().out == ""
+    shown = swing(progress=True)
+    assert "100%" in capsys.readouterr().out
+    assert (shown.q == quiet.q).all()
+
+
+# --- statistics
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "Newmark", "PaperNewmark"])
+def test_counts_are_consistent(default_four_bar, method):
+    result = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6)
+    stats = result.stats
+    assert len(result.h) == stats.n_accepted == result.t.size - 1
+    attempts = stats.n_accepted + stats.n_rejected_error + stats.n_rejected_convergence
+    assert stats.n_outer >= attempts
+    assert stats.n_evaluations >= attempts
+    assert stats.n_inner >= stats.n_evaluations - attempts - 1  # every evaluation but those at ends of steps iterates
+    assert 1 <= stats.n_partitions <= stats.n_factorizations
+    assert stats.n_factorizations > stats.n_inner
+    assert stats.cpu_time > 0.0
+
+
+def test_evaluations_are_calls_of_the_force():
+    calls = []
+
+    def force(t, q, v):
+        calls.append(t)
+        return np.array([0.0, -9.81])
+
+    result = swing(1.0, pendulum(force=force))
+    assert 0 <= len(calls) - result.stats.n_evaluations <= 5  # checks at the start
+    assert min(calls) >= 0.0
+    assert max(calls) <= 1.0 + 1e-12
+
+
+def test_the_same_run_twice_is_the_same(default_four_bar):
+    first, second = run(default_four_bar), run(default_four_bar)
+    assert (first.q == second.q).all()
+    assert first.stats.n_evaluations == second.stats.n_evaluations
+
+
+# --- functions in plain Python
+
+
+def test_compiled_functions_give_the_same_run():
+    plain, compiled = swing(), swing(system=pendulum(compile=True))
+    assert plain.stats.n_evaluations == compiled.stats.n_evaluations
+    assert worst(plain.q, compiled.q) < 1e-12
+
+
+def test_a_closure_that_changes_is_followed():
+    gravity = [9.81]
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -gravity[0]]))
+    heavy = swing(system=system)
+    gravity[0] = 1.0
+    light = swing(system=system)
+    assert worst(heavy.q[:, -1], pendulum_state(2.0)[0]) < 1e-6
+    assert worst(light.q[:, -1], heavy.q[:, -1]) > 0.1
+    gravity[0] = 9.81
+    assert (swing(system=system).q == heavy.q).all()
+
+
+def test_functions_get_copies_that_they_may_spoil():
+    def force(t, q, v):
+        q[:], v[:] = 7.0, 7.0
+        return np.array([0.0, -9.81])
+
+    assert (swing(system=pendulum(force=force)).q == swing().q).all()
+
+
+def test_lists_and_integers_may_be_returned():
+    system = pendulum(force=lambda t, q, v: [0, -9.81], jacobian=lambda t, q: [list(q)])
+    assert (swing(system=system).q == swing().q).all()
+
+
+def test_systems_do_not_disturb_each_other():
+    first = pendulum()
+    second = pendulum(force=lambda t, q, v: np.array([0.0, -1.0]))
+    before = swing(system=first).q
+    swing(system=second)
+    del second
+    assert (swing(system=first).q == before).all()
+
+
+def test_input_is_not_changed(default_four_bar):
+    q0, v0, times = default_four_bar.q0.copy(), default_four_bar.v0.copy(), np.array([0.5, 1.0])
+    solve_dae(default_four_bar.system, (0.0, 1.0), q0, v0, t_eval=times)
+    assert (q0 == default_four_bar.q0).all()
+    assert (v0 == 0.0).all()
+    assert (times == [0.5, 1.0]).all()
+
+
+# --- tolerances of the loops and prices. Bounds are about 1.3 times what was counted when they were written
+
+
+def test_a_loose_outer_loop_is_cheaper_and_worse_a_tight_one_dearer_and_no_better(default_four_bar):
+    reference = default_four_bar.reference.q
+    cost, error = {}, {}
+    for outer_tol in (1e-5, None, 1e-13):
+        result = run(default_four_bar, method=RungeKutta(sun_radau_iib(3), outer_tol=outer_tol))
+        cost[outer_tol] = result.stats.n_evaluations
+        error[outer_tol] = worst(result.q[:, -1], reference)
+    assert cost[1e-5] < cost[None] < cost[1e-13]
+    assert error[1e-5] > 3.0 * error[None]
+    assert error[None] < 2.0 * error[1e-13]
+
+
+@pytest.mark.parametrize(("method", "bound"), [("SunRadau5", 35_000), ("Gauss6", 28_000), ("Gauss12", 19_000)])
+def test_price_of_ten_seconds_at_1e_8(default_four_bar, method, bound):
+    result = run(default_four_bar, method=method, rtol=1e-8, atol=1e-8)
+    assert result.stats.n_evaluations < bound
+    assert worst(result.q[:, -1], default_four_bar.reference.q) < 1e-8
+
+
+def test_price_and_accuracy_of_the_papers_method_over_100_s(default_four_bar):
+    result = run(default_four_bar, 100.0, method=paper_irk(1e-9, 1e-9), rtol=1e-5, atol=1e-5)
+    assert result.success
+    assert result.stats.n_evaluations < PAPER_IRK_EVALUATIONS
+    assert np.median(result.h) > 0.02  # "in most time", Sect. 4.1
+    assert violations(default_four_bar.system, result)[0] < 1e-9
+    energy = default_four_bar.energy(result.t, result.q, result.v)
+    assert worst(energy, energy[0]) < PAPER_IRK_ENERGY
+    truth = trajectory(default_four_bar.parameters, [100.0])[0][:, 0]
+    assert worst(result.q[:, -1], truth) < PAPER_IRK_ERROR
+
+
+@pytest.mark.parametrize("beta", [0.5, 0.25])
+def test_newmark_pays_three_to_five_times_as_much_per_two_decades(default_four_bar, beta):
+    counts, spans = [], []
+    for outer_tol in (1e-3, 1e-5, 1e-7, 1e-9):
+        result = run(default_four_bar, 30.0, method=paper_newmark(1e-9, outer_tol, beta))
+        counts.append(result.stats.n_evaluations)
+        spans.append(np.ptp(default_four_bar.energy(result.t, result.q, result.v)))
+    growth = np.array(counts[1:]) / counts[:-1]
+    assert (growth > 3.0).all()
+    assert (growth < 5.0).all()
+    assert spans[0] > 1.0  # err_out = 1e-3 loses the solution
+    assert spans[3] < 1e-2
+
+
+def test_symmetric_gauss_with_fixed_steps_does_not_drift(default_four_bar):
+    def drift(tableau):
+        result = run(default_four_bar, 100.0, method=RungeKutta(tableau), step_size=0.01)
+        energy = default_four_bar.energy(result.t, result.q, result.v)
+        return abs(energy[-2000:].mean() - energy[0])
+
+    assert drift(gauss(3)) < 1e-8
+    assert drift(gauss(3)) < 0.1 * drift(sun_radau_iib(3))
+
+
+def test_newmark_error_tolerance_is_its_own():
+    loose, tight = (swing(method=Newmark(error_tol=tol), rtol=1.0, atol=1.0) for tol in (1e-4, 1e-7))
+    assert tight.stats.n_accepted > 5 * loose.stats.n_accepted
+    other = swing(method=Newmark(error_tol=1e-7), rtol=1e-9, atol=1e-9)
+    assert other.stats.n_accepted == tight.stats.n_accepted

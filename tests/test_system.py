@@ -1,0 +1,159 @@
+"""ConstrainedSystem and consistent_state."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.problems import (
+    moving_pivot,
+    moving_pivot_state,
+    oblique_pendulum,
+    oblique_start,
+    pendulum,
+    worst,
+)
+from twoloop import ConstrainedSystem, consistent_state, solve_dae
+from twoloop.mechanisms import four_bar
+
+numbers = st.floats(-2.0, 2.0)
+vectors = st.tuples(numbers, numbers).map(np.array)
+SYSTEMS = {"moving pivot": moving_pivot(), "oblique": oblique_pendulum(), "pendulum": pendulum()}
+
+
+def slope(f, e=1e-3):
+    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@given(t=numbers, q=vectors, v=vectors)
+def test_derivatives_of_the_shared_problems(name, t, q, v):
+    system = SYSTEMS[name]
+    along = slope(lambda s: system.constraint(t, q + s * v))
+    assert worst(system.jacobian(t, q) @ v, along) < 1e-8
+    assert worst(system.constraint_rate(t, q), slope(lambda s: system.constraint(t + s, q))) < 1e-8
+    rate = slope(lambda s: system.velocity_constraint(t + s, q + s * v, v))
+    assert worst(system.gamma(t, q, v), -rate) < 1e-7
+
+
+def test_functions_can_be_called_one_by_one():
+    system = pendulum()
+    q, v = np.array([0.6, -0.8]), np.array([4.0, 3.0])
+    assert (system.mass(0.0, q) == np.eye(2)).all()
+    assert (system.force(0.0, q, v) == [0.0, -9.81]).all()
+    assert abs(system.constraint(0.0, q)[0]) < 1e-15
+    assert (system.jacobian(0.0, q) == [q]).all()
+    assert (system.constraint_rate(0.0, q) == 0.0).all()
+    assert (system.gamma(0.0, q, v) == -25.0).all()
+    assert abs(system.velocity_constraint(0.0, q, v)[0]) < 1e-15
+    assert worst(system.velocity_constraint(0.0, q, q), 1.0) < 1e-15
+
+
+def test_repr_has_name_and_sizes():
+    assert repr(pendulum()) == "ConstrainedSystem('pendulum', n_q=2, n_c=1)"
+
+
+def test_a_mass_array_is_constant_and_copied():
+    matrix = np.eye(2)
+    system = pendulum(mass=matrix)
+    matrix[:] = 0.0
+    assert system.constant_mass
+    assert (system.mass(0.0, np.zeros(2)) == np.eye(2)).all()
+
+
+def test_a_constant_mass_need_not_be_diagonal():
+    full = np.array([[2.0, 0.5], [0.5, 1.0]])
+    options = {"step_size": 0.01, "method": "Gauss6"}
+    runs = [
+        solve_dae(pendulum(mass=mass), (0.0, 1.0), [-1.0, 0.0], [0.0, 0.0], **options)
+        for mass in (full, lambda t, q: full)
+    ]
+    assert worst(runs[0].q, runs[1].q) < 1e-11
+    q, a, lam = runs[0].q, runs[0].a, runs[0].lam
+    assert worst(full @ a + q * lam, [[0.0], [-9.81]]) < 1e-11
+
+
+def test_as_many_constraints_as_coordinates_leave_no_freedom():
+    # driven completely: q = (cos t, sin t)
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=2,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.zeros(2),
+        constraint=lambda t, q: q - [np.cos(t), np.sin(t)],
+        jacobian=lambda t, q: np.eye(2),
+        constraint_rate=lambda t, q: np.array([np.sin(t), -np.cos(t)]),
+        gamma=lambda t, q, v: -np.array([np.cos(t), np.sin(t)]),
+    )
+    result = solve_dae(system, (0.0, 3.0), [1.0, 0.0], [0.0, 1.0])
+    assert result.success
+    expected = np.array([np.cos(result.t), np.sin(result.t)])
+    assert worst(result.q, expected) < 1e-12
+    assert worst(result.a, -expected) < 1e-12
+    assert worst(result.lam, expected) < 1e-12
+
+
+# --- consistent_state
+
+
+def test_consistent_input_stays_as_it_is(default_four_bar):
+    problem = default_four_bar
+    q, v = consistent_state(problem.system, 0.0, problem.q0, problem.v0)
+    assert worst(q, problem.q0) < 1e-15
+    assert worst(v, problem.v0) < 1e-15
+
+
+@given(st.lists(st.floats(-0.1, 0.1), min_size=9, max_size=9), st.lists(st.floats(-3, 3), min_size=9, max_size=9))
+def test_a_guess_is_projected_and_can_be_started_from(shift, speeds):
+    problem = four_bar()
+    q, v = consistent_state(problem.system, 0.0, problem.q0 + shift, speeds)
+    assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-13
+    assert np.abs(problem.system.velocity_constraint(0.0, q, v)).max() < 1e-12
+    assert worst(q, problem.q0) < 1.0
+    assert solve_dae(problem.system, (0.0, 0.01), q, v).success
+
+
+def test_velocities_change_as_little_as_they_can(default_four_bar):
+    system, q, guess = default_four_bar.system, default_four_bar.q0, np.arange(9.0)
+    _, v = consistent_state(system, 0.0, q, guess)
+    free = np.linalg.svd(system.jacobian(0.0, q))[2][8]  # the one direction that the constraints leave
+    assert abs(free @ (v - guess)) < 1e-12
+
+
+def test_moving_constraints_are_projected_at_their_time():
+    system = moving_pivot()
+    q, v = consistent_state(system, 0.7, [0.9, -0.9], [0.0, 0.0])
+    assert np.abs(system.constraint(0.7, q)).max() < 1e-14
+    assert np.abs(system.constraint(0.0, q)).max() > 1e-2
+    assert np.abs(system.velocity_constraint(0.7, q, v)).max() < 1e-13
+    assert np.abs(v).max() > 0.1
+
+
+def test_shared_starts_are_consistent():
+    for system, start in ((moving_pivot(), moving_pivot_state(0.0)), (oblique_pendulum(), oblique_start())):
+        q, v = consistent_state(system, 0.0, *start)
+        assert worst(q, start[0]) < 1e-13
+        assert worst(v, start[1]) < 1e-13
+
+
+def test_what_cannot_be_projected_says_how_far_it_is():
+    empty = pendulum(
+        constraint=lambda t, q: np.array([q @ q + 1.0]), jacobian=lambda t, q: 2.0 * q[None, :]
+    )  # no real position at all
+    with pytest.raises(ValueError, match=r"q cannot be projected.*'pendulum'.*max\|C\| is .*nearer"):
+        consistent_state(empty, 0.0, [1.0, 1.0], [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("q", "v", "error", "words"),
+    [
+        ([1.0], [0.0, 0.0], ValueError, r"q must have shape \(2,\); given shape \(1,\)"),
+        ([1.0, 0.0], [0.0, 0.0, 0.0], ValueError, r"v must have shape \(2,\); given shape \(3,\)"),
+        ([1.0, np.nan], [0.0, 0.0], ValueError, r"q must be finite; entries \[1\]"),
+        ([1.0, 0.0], [np.inf, 0.0], ValueError, r"v must be finite; entries \[0\]"),
+        (["one", 0.0], [0.0, 0.0], TypeError, "q must be 2 real numbers"),
+    ],
+)
+def test_wrong_guesses_are_named(q, v, error, words):
+    with pytest.raises(error, match=words):
+        consistent_state(pendulum(), 0.0, q, v)
