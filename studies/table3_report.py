@@ -326,7 +326,7 @@ def _notes(rows: pd.DataFrame) -> str:
         + ". Its own bodies and joints; only lengths, masses, gravity and the initial angles are shared. It counts no "
         "evaluations.",
         "**Not in this table**: explicit codes on the index-1 equations, such as SciPy's DOP853. They drift off the "
-        "constraints, but on a smooth problem like this one they are cheap, and a claim of efficiency against them would "
-        "need their rows.",
+        "constraints, but on a smooth problem like this one they are cheap, and a claim of efficiency against them "
+        "would need their rows.",
     ]
     return "\n".join(f"- {note}" for note in notes)

@@ -151,7 +151,7 @@ def test_what_cannot_be_projected_says_how_far_it_is():
         ([1.0, 0.0], [0.0, 0.0, 0.0], ValueError, r"v must have shape \(2,\); given shape \(3,\)"),
         ([1.0, np.nan], [0.0, 0.0], ValueError, r"q must be finite; entries \[1\]"),
         ([1.0, 0.0], [np.inf, 0.0], ValueError, r"v must be finite; entries \[0\]"),
-        (["one", 0.0], [0.0, 0.0], TypeError, "q must be 2 real numbers"),
+        (["one", 0.0], [0.0, 0.0], TypeError, "q must be an array of real numbers"),
     ],
 )
 def test_wrong_guesses_are_named(q, v, error, words):

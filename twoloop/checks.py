@@ -26,12 +26,17 @@ def check_size(name: str, value: Any, least: int) -> int:
     return int(value)
 
 
+def check_real(name: str, value: ArrayLike) -> Array:
+    """Return `value` as a new float array, or say that it is not one."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be an array of real numbers; given {value!r}") from error
+
+
 def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     """Return `value` as a new float vector of length n, or say what is wrong with it."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be {n} real numbers; given {value!r}") from error
+    array = check_real(name, value)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
     if not np.isfinite(array).all():
@@ -48,17 +53,23 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     return t0, t1
 
 
-def check_positive(name: str, value: Any, infinite: bool = False) -> None:
-    """Raise unless `value` is a positive number, finite unless `infinite`."""
+def check_number(name: str, value: Any) -> float:
+    """Return `value` as a float, or say that it is not a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} must be a number; given {value!r} of type {type(value).__name__}")
+    return float(value)
+
+
+def check_positive(name: str, value: Any, infinite: bool = False) -> None:
+    """Raise unless `value` is a positive number, finite unless `infinite`."""
+    check_number(name, value)
     if not value > 0.0 or (not infinite and value == np.inf):
         raise ValueError(f"{name} must be positive{'' if infinite else ' and finite'}; given {value!r}")
 
 
 def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None) -> Array:
     """Return the output times as an array, or say what is wrong with them."""
-    times = np.array(t_eval, dtype=np.float64)
+    times = check_real("t_eval", t_eval)
     if times.ndim != 1 or times.size == 0:
         raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
     if not np.isfinite(times).all() or times.min() < t0 or times.max() > t1:
@@ -90,6 +101,7 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> N
     TypeError, ValueError
         Naming the callback or the argument, what was found and what to do.
     """
+    system.check_returned(t0, q0, v0)
     matrix = system.mass(t0, q0)
     jacobian = system.jacobian(t0, q0)
     blame = not_finite(system, t0, q0, v0)
@@ -132,7 +144,7 @@ def redundant_rows(jacobian: Array) -> list[int]:
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
     rows = redundant_rows(system.jacobian(t, q))
-    return f"row(s) {rows} depend on the others" if rows else "its pivots are below the rank tolerance"
+    return f"row(s) {rows} depend on the others" if rows else "or so nearly that Newton cannot tell"
 
 
 _NOTHING_FOUND = "no callback was found at fault"

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks import check_number, check_positive
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]
@@ -46,13 +47,10 @@ class Method(Protocol):
         ...
 
 
-def _check_tolerance(name: str, value: float | None) -> None:
-    if value is None:
-        return
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)):
-        raise TypeError(f"{name} must be a number or None; given {value!r} of type {type(value).__name__}")
-    if not 0.0 < value < np.inf:
-        raise ValueError(f"{name} must be positive and finite; given {value!r}")
+def _check_tolerances(method: "RungeKutta | Newmark", *names: str) -> None:
+    for name in names:
+        if getattr(method, name) is not None:
+            check_positive(name, getattr(method, name))
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,7 @@ class RungeKutta:
             raise ValueError(f"outer must be 'fixed-point' or 'paper'; given {self.outer!r}")
         if self.error not in ("richardson", "richardson-paper"):
             raise ValueError(f"error must be 'richardson' or 'richardson-paper'; given {self.error!r}")
-        _check_tolerance("inner_tol", self.inner_tol)
-        _check_tolerance("outer_tol", self.outer_tol)
+        _check_tolerances(self, "inner_tol", "outer_tol")
 
     @property
     def name(self) -> str:
@@ -167,12 +164,11 @@ class Newmark:
     outer_tol: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.beta <= 1.0:
-            raise ValueError(f"beta must be between 0 and 1; given {self.beta!r}")
-        if not 0.0 <= self.gamma <= 1.0:
-            raise ValueError(f"gamma must be between 0 and 1; given {self.gamma!r}")
-        for name in ("error_tol", "inner_tol", "outer_tol"):
-            _check_tolerance(name, getattr(self, name))
+        for name in ("beta", "gamma"):
+            value = check_number(name, getattr(self, name))
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must be between 0 and 1; given {value!r}")
+        _check_tolerances(self, "error_tol", "inner_tol", "outer_tol")
 
     @property
     def name(self) -> str:

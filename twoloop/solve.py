@@ -25,6 +25,7 @@ from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+ROUNDING = 1e-15
 BUFFER_ROWS = 1024
 BUFFER_STEPS = 4096
 
@@ -61,8 +62,9 @@ def solve_dae(
         "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "PaperIRK", "PaperNewmark", or an
         object: `RungeKutta(...)`, `Newmark(...)`.
     rtol, atol : float
-        A step is accepted when the root mean square of error / (atol + rtol |value|) over all positions and
-        velocities is at most 1. A `Newmark` with `error_tol` has its own test.
+        A step is accepted when its estimated error over atol + rtol |value| is at most 1: the largest component of
+        positions and velocities for `RungeKutta` (the root mean square with error="richardson-paper"), the root mean
+        square of the positions for `Newmark`, unless it has `error_tol`, its own test.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution; steps are shortened to land on them. None: every
         accepted step is stored.
@@ -105,6 +107,10 @@ def solve_dae(
     v0 = check_vector("v0", v0, system.n_q)
     check_positive("rtol", rtol)
     check_positive("atol", atol)
+    if max(rtol, atol) < ROUNDING:
+        raise ValueError(
+            f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r}, {atol!r}"
+        )
     if first_step is not None:
         check_positive("first_step", first_step)
     check_positive("max_step", max_step, infinite=True)
@@ -289,7 +295,8 @@ class _Run:
                 f"Stopped at t = {t:.10g} after max_steps = {taken} accepted steps. Raise max_steps, loosen rtol and "
                 "atol, or shorten t_span.",
             )
-        if code == a.RANK_LOST:
+        failure = int(self.clock[a.FAILURE_CODE])
+        if code == a.RANK_LOST or (code == a.STEP_TOO_SMALL and failure == common.SINGULAR):
             return (
                 Status.RANK_LOST,
                 f"Stopped at t = {t:.10g}: the constraint Jacobian has lost rank there "
@@ -297,7 +304,6 @@ class _Run:
                 "Redundant constraints and singular positions are not handled yet: end t_span before, or change the "
                 "geometry.",
             )
-        failure = int(self.clock[a.FAILURE_CODE])
         if failure == common.NOT_FINITE:
             # the last attempt began at t: look where it went, to name the callback
             end = t + float(self.clock[a.H_FAILED])

@@ -19,8 +19,9 @@ from twoloop.callbacks import (
     python_gamma,
     python_jacobian,
     python_mass,
+    store,
 )
-from twoloop.checks import check_size, check_vector
+from twoloop.checks import check_real, check_size, check_vector
 from twoloop.kernels.common import CONSTANT_MASS, GAMMA_GIVEN, Functions
 
 Array = NDArray[np.float64]
@@ -105,6 +106,7 @@ class ConstrainedSystem:
         flags[GAMMA_GIVEN] = gamma is not None
         self.functions = Functions(**callbacks, p=self.parameters, flags=flags)
         self._python: PythonFunctions | None = None
+        self._returning: dict[str, Any] = {}
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
@@ -156,7 +158,7 @@ class ConstrainedSystem:
         n_q, n_c = check_size("n_q", n_q, 1), check_size("n_c", n_c, 1)
         constant_mass = not callable(mass)
         if not callable(mass):
-            matrix = np.array(mass, dtype=np.float64)
+            matrix = check_real("mass", mass)
             if matrix.shape != (n_q, n_q):
                 raise ValueError(f"mass must have shape {(n_q, n_q)}; given an array of shape {matrix.shape}")
             mass = _constant(matrix)
@@ -175,7 +177,9 @@ class ConstrainedSystem:
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "constant_mass": constant_mass, "name": name}
         if compile:
             compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
-            return cls(**sizes, **compiled)
+            system = cls(**sizes, **compiled)
+            system._returning = functions
+            return system
         python = PythonFunctions(name, functions)
         wrappers: dict[str, Any] = {kind: _THROUGH_PYTHON[kind] for kind in functions}
         system = cls(**sizes, **wrappers, parameters=[python.handle])
@@ -205,6 +209,16 @@ class ConstrainedSystem:
     def gamma(self, t: float, q: Array, v: Array) -> Array:
         """Q_d(t, q, v), (n_c,); zeros for a system that was given none."""
         return self._call(self.functions.gamma, (self.n_c,), t, q, v)
+
+    def check_returned(self, t: float, q: Array, v: Array) -> None:
+        """Say what is wrong with the arrays that functions given with `compile=True` return at (t, q, v).
+
+        Machine code can only say that a shape is wrong, not which.
+        """
+        for kind, function in self._returning.items():
+            arguments = (t, q, v) if "v" in KINDS[kind][0] else (t, q)
+            shapes = {"mass": (self.n_q, self.n_q), "force": (self.n_q,), "jacobian": (self.n_c, self.n_q)}
+            store(kind, self.name, t, function(*arguments), np.zeros(shapes.get(kind, (self.n_c,))))
 
     def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
         """C_q v + C_t, (n_c,): zero for consistent velocities (eq. (4))."""

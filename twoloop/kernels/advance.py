@@ -111,6 +111,7 @@ def advance(
     f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
     fixed = control[FIXED_STEP] > 0.0
     n = w.Q.size
+    retried = np.inf  # where a step of fixed size was tried again with a new partition
     filled[0] = 0
     filled[1] = 0
     while True:
@@ -140,7 +141,13 @@ def advance(
             clock[FAILURE_CODE] = code
             clock[H_FAILED] = size
             if fixed:
-                return FIXED_STEP_FAILED
+                # the step keeps its size; only a partition that went bad within it may be the reason
+                if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
+                    return FIXED_STEP_FAILED
+                if partition(f, w, t, state[:n]) != DONE:
+                    return RANK_LOST
+                retried = t
+                continue
             clock[H_LIMIT] = control[LIMIT_FACTOR] * size
             clock[LIMIT_AGE] = 0.0
             clock[H_NEXT] = 0.5 * size

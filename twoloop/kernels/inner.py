@@ -27,6 +27,15 @@ MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 DIFFERENCE = 2e-4  # displacement over which Q_d is differenced, see gamma_by_differences
 
 
+@compiled
+def _finite(A):
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            if not np.isfinite(A[i, j]):
+                return False
+    return True
+
+
 @inlined
 def factor_dependent(f, w, t, q):
     """C_q at (t, q), and the LU factors of its dependent columns."""
@@ -39,11 +48,7 @@ def factor_dependent(f, w, t, q):
     ratio = lu_factor(w.Cqd, w.pivots)
     w.counters[N_FACTORIZATIONS] += 1
     if not ratio > RANK_TOLERANCE:
-        for i in range(n_c):
-            for j in range(w.Q.size):
-                if not np.isfinite(w.Cq[i, j]):
-                    return NOT_FINITE
-        return SINGULAR
+        return SINGULAR if _finite(w.Cq) else NOT_FINITE
     return DONE
 
 
@@ -128,7 +133,9 @@ def factor_mass(f, w, t, q):
     f.mass(t, q, f.p, w.M)
     for i in range(w.Q.size):
         copy(w.M[i], w.L[i])
-    return DONE if ldl_factor(w.L) else MASS_NOT_DEFINITE
+    if ldl_factor(w.L):
+        return DONE
+    return MASS_NOT_DEFINITE if _finite(w.M) else NOT_FINITE
 
 
 @inlined
@@ -186,10 +193,7 @@ def _accelerations(f, w, t, q, v, a, lam):
     _schur_complement(f, w)
     w.counters[N_FACTORIZATIONS] += 1
     if not ldl_factor(w.S):
-        for i in range(n_c):
-            if not np.isfinite(w.S[i, i]):
-                return NOT_FINITE
-        return SINGULAR
+        return SINGULAR if _finite(w.S) else NOT_FINITE
     copy(w.Q, w.x)
     _times_inverse_mass(f, w, w.x)
     for i in range(n_c):
