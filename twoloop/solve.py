@@ -109,7 +109,8 @@ def solve_dae(
     check_positive("atol", atol)
     if max(rtol, atol) < ROUNDING:
         raise ValueError(
-            f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r}, {atol!r}"
+            f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r} and "
+            f"{atol!r}"
         )
     if first_step is not None:
         check_positive("first_step", first_step)
