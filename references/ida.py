@@ -17,7 +17,8 @@ from numba import njit, types
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks import check_positive, check_span, check_start, check_times, check_vector
+from twoloop.checks import check_positive, check_span, check_times, check_vector
+from twoloop.consistency import check_start
 from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem

@@ -1,10 +1,11 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0."""
 
 from twoloop.callbacks import callback
+from twoloop.consistency import consistent_state
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
-from twoloop.system import ConstrainedSystem, consistent_state
+from twoloop.system import ConstrainedSystem
 
 __version__ = "0.1.0"
 

@@ -8,16 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks import (
-    check_positive,
-    check_size,
-    check_span,
-    check_start,
-    check_times,
-    check_vector,
-    dependent_rows,
-    not_finite,
-)
+from twoloop.checks import check_positive, check_size, check_span, check_times, check_vector
+from twoloop.consistency import check_start, dependent_rows, not_finite
 from twoloop.kernels import common
 from twoloop.methods import PRESETS, Method, Plan
 from twoloop.result import Result, Statistics, Status

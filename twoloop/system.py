@@ -21,7 +21,7 @@ from twoloop.callbacks import (
     python_mass,
     store,
 )
-from twoloop.checks import check_real, check_size, check_vector
+from twoloop.checks import check_real, check_size
 from twoloop.kernels.common import CONSTANT_MASS, GAMMA_GIVEN, Functions
 
 Array = NDArray[np.float64]
@@ -236,45 +236,3 @@ def _constant(matrix: Array) -> Callable[[float, Array], Array]:
         return matrix
 
     return mass
-
-
-def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
-
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    t : float
-        Time, s.
-    q, v : array_like (n_q,)
-        Guess. Its distance to the constraints should be small against the mechanism.
-
-    Returns
-    -------
-    q, v : ndarray (n_q,)
-        With C(t, q) = 0 and C_q v + C_t = 0 to rounding.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a value is not finite, or no consistent position is found near the guess.
-    """
-    q = check_vector("q", q, system.n_q)
-    v = check_vector("v", v, system.n_q)
-    correction = np.inf
-    for _ in range(50):
-        step = np.linalg.lstsq(system.jacobian(t, q), -system.constraint(t, q), rcond=1e-10)[0]
-        q = q + step
-        before, correction = correction, float(np.abs(step).max())
-        if not np.isfinite(correction) or correction < 1e-15 * max(1.0, np.abs(q).max()):
-            break
-        if correction >= before and correction < 1e-12:
-            break  # rounding level
-    violation = float(np.abs(system.constraint(t, q)).max())
-    if not violation < 1e-10 * max(1.0, float(np.abs(q).max())):
-        raise ValueError(
-            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after 50 iterations "
-            f"max|C| is {violation:.3g}. Give a guess that is nearer to an assembled position"
-        )
-    v = v - np.linalg.lstsq(system.jacobian(t, q), system.velocity_constraint(t, q, v), rcond=1e-10)[0]
-    return q, v
