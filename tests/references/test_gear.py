@@ -1,0 +1,210 @@
+"""Fixed-step BDF on the index-3 form: order, damping, constraints, the start, failures."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from references.four_bar_minimal import MinimalFourBar
+from references.gear import HIGHEST, STARTS, _formulas, solve_gear
+from references.index1 import accelerations
+from tests.problems import (
+    force_residual,
+    moving_pivot,
+    moving_pivot_state,
+    oblique_pendulum,
+    oblique_point,
+    oblique_start,
+    oblique_to_point,
+    pendulum,
+    violations,
+    worst,
+)
+from twoloop.mechanisms import four_bar
+from twoloop.result import Status
+
+PROBLEM = four_bar()
+
+
+@cache
+def truth():
+    return MinimalFourBar.from_parameters(PROBLEM.parameters)
+
+
+def run(t_end, step, order, **options):
+    return solve_gear(PROBLEM.system, (0.0, t_end), PROBLEM.q0, PROBLEM.v0, step, order, **options)
+
+
+def worst_errors(result):
+    q, v = truth().states(result.t)
+    return worst(result.q, q), worst(result.v, v)
+
+
+def slopes(order, steps, **options):
+    """Observed orders of q and v at 0.6 s."""
+    q, v = truth().states([0.6])
+    ends = [run(0.6, step, order, **options) for step in steps]
+    errors = np.array([[worst(r.q[:, -1], q[:, 0]), worst(r.v[:, -1], v[:, 0])] for r in ends])
+    return np.log(errors[0] / errors[-1]) / np.log(steps[0] / steps[-1])
+
+
+@pytest.mark.parametrize("order", range(1, HIGHEST + 1))
+def test_formulas_are_exact_for_polynomials_of_their_order(order):
+    b, alpha, weights = np.split(_formulas()[order - 1], [1, 1 + HIGHEST])
+    nodes = -np.arange(1.0, HIGHEST + 1.0)
+    for power in range(order + 1):
+        at_0, rate_at_0 = float(power == 0), float(power == 1)
+        assert b[0] * rate_at_0 + alpha @ nodes**power == pytest.approx(at_0, abs=1e-12)
+        if power < order:
+            assert weights @ nodes**power == pytest.approx(at_0, abs=1e-12)
+    assert not alpha[order:].any() and not weights[order:].any()
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_order_with_an_accurate_start(order):
+    assert np.abs(slopes(order, (4e-3, 2e-3), start="accurate") - order).max() < 0.3
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+def test_the_ramp_limits_the_order_to_two(order):
+    assert np.abs(slopes(order, (4e-3, 2e-3)) - 2.0).max() < 0.1
+
+
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("order", range(1, HIGHEST + 1))
+def test_positions_keep_the_constraints_and_velocities_nearly(order, start):
+    coarse, fine = (run(2.0, step, order, start=start) for step in (0.01, 0.005))
+    assert violations(PROBLEM.system, coarse)[0] < 1e-12 and violations(PROBLEM.system, fine)[0] < 1e-12
+    before, after = (violations(PROBLEM.system, result)[1] for result in (coarse, fine))
+    assert 1e-6 < after < before / 1.5  # asked for by nothing, an error of the formula
+    assert force_residual(PROBLEM.system, fine) < 1e-8
+
+
+def test_step_sizes_of_the_paper():
+    """0.02 is visibly wrong within 2 s, 0.01 is not, and is wrong in 100 s."""
+    assert worst_errors(run(2.0, 0.02, 2))[0] > 0.03
+    assert worst_errors(run(2.0, 0.01, 2))[0] < 0.02
+    assert worst_errors(run(100.0, 0.01, 2))[0] > 1.0
+
+
+@pytest.mark.parametrize(("order", "least", "most"), [(1, -12.0, -10.0), (2, -0.3, -0.1), (3, 0.1, 0.3)])
+def test_low_orders_damp_and_the_third_feeds(order, least, most):
+    result = run(2.0, 0.01, order)
+    energy = PROBLEM.energy(result.t, result.q, result.v)
+    assert least < energy[-1] - energy[0] < most
+
+
+def test_accelerations_and_multipliers():
+    result = run(1.0, 2e-3, 4, start="accurate")
+    q, v = truth().states(result.t)
+    a, lam = accelerations(PROBLEM.system, result.t, q, v)
+    assert worst(result.a, a) < 1e-3 and worst(result.lam, lam) < 1e-3
+    first = run(0.1, 0.01, 1)
+    assert worst(np.diff(first.v) / 0.01, first.a[:, 1:]) < 1e-10  # the derivative that the formula takes
+
+
+def test_ramp_begins_with_half_of_the_centripetal_acceleration():
+    """On a unit circle without gravity lam = v^2 = 4, at any step."""
+    system = pendulum(force=lambda t, q, v: np.zeros(2))
+    for step in (1e-2, 1e-3):
+        ramp, accurate = (
+            solve_gear(system, (0.0, 20 * step), [0.0, -1.0], [2.0, 0.0], step, 3, start=start).lam[0]
+            for start in ("ramp", "accurate")
+        )
+        assert ramp[0] == pytest.approx(4.0) and ramp[1] == pytest.approx(2.0, rel=1e-3)
+        assert worst(ramp[-5:], 4.0) < 0.01 and worst(accurate, 4.0) < 0.01
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_time_dependent_constraints(order):
+    system = moving_pivot(gamma=False)
+    q, v = moving_pivot_state(0.0)
+    errors = []
+    for step in (0.01, 0.005):
+        result = solve_gear(system, (0.0, 1.0), q, v, step, order, start="accurate")
+        errors.append(worst(result.q, moving_pivot_state(result.t)[0]))
+    assert errors[0] < 3e-3 and abs(np.log2(errors[0] / errors[1]) - order) < 0.3
+
+
+def test_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities():
+    result = solve_gear(oblique_pendulum(), (0.0, 2.0), *oblique_start(), 0.005, 4, start="accurate")
+    x, u, lam = oblique_point(result.t)
+    ours = oblique_to_point(result)
+    assert worst(ours[0], x) < 1e-6 and worst(ours[1], u) < 1e-5 and worst(result.lam[0], lam) < 1e-4
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_stores_every_step_or_those_asked_for(start):
+    full = run(0.5, 0.01, 3, start=start)
+    assert full.t.size == 51 and full.h.size == full.stats.n_accepted == 50 and full.t[-1] == pytest.approx(0.5)
+    assert full.q.shape == full.v.shape == full.a.shape == (9, 51) and full.lam.shape == (8, 51)
+    assert np.array_equal(full.q[:, 0], PROBLEM.q0) and np.isfinite(full.a).all() and np.isfinite(full.lam).all()
+    some = run(0.5, 0.01, 3, start=start, t_eval=[0.01, 0.2, 0.5])
+    assert np.array_equal(some.q, full.q[:, [1, 20, 50]]) and np.array_equal(some.lam, full.lam[:, [1, 20, 50]])
+    assert np.allclose(some.t, [0.01, 0.2, 0.5], rtol=0.0, atol=1e-12) and some.h.size == 50
+
+
+def test_a_run_shorter_than_its_start():
+    for n in (1, 2, 3):
+        assert run(n * 0.01, 0.01, 6, start="accurate").t.size == n + 1
+
+
+def test_newton_iterations_are_few():
+    stats = run(2.0, 0.01, 2).stats
+    assert stats.n_outer < 4 * stats.n_accepted and stats.n_factorizations < 1.1 * stats.n_accepted
+
+
+def test_too_large_a_step_comes_back_as_a_row():
+    result = run(10.0, 0.1, 3)
+    assert result.status is Status.SOLVER_FAILED and not result.success
+    assert "order 3 failed in the step to t = 1:" in result.message and "smaller step" in result.message
+    assert result.t[-1] == pytest.approx(0.9) and result.stats.n_accepted == result.h.size == result.t.size - 1 == 9
+
+
+def test_values_that_are_not_finite_come_back_as_a_row():
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t < 0.695 else np.nan]))
+    result = solve_gear(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01)
+    assert result.status is Status.SOLVER_FAILED and "not finite" in result.message and "t = 0.7" in result.message
+    assert result.t[-1] == pytest.approx(0.69) and np.isfinite(result.q).all()
+
+
+def test_failure_of_the_accurate_start_comes_back_as_a_row():
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t < 0.015 else np.nan]))
+    result = solve_gear(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01, 4, start="accurate")
+    assert result.status is Status.SOLVER_FAILED and "The accurate start failed. DOP853" in result.message
+    assert np.array_equal(result.t, [0.0, 0.01])
+
+
+def test_exception_of_a_callback_comes_through():
+    def force(t, q, v):
+        if t > 0.5:
+            raise ValueError("no force today")
+        return np.array([0.0, -9.81])
+
+    with pytest.raises(ValueError, match="no force today"):
+        solve_gear(pendulum(force=force), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "message"),
+    [
+        ({"step": 0.0}, ValueError, "step must be positive"),
+        ({"step": "0.1"}, TypeError, "step must be a number"),
+        ({"step": 0.3}, ValueError, "step must go a whole number of times into t_span, whose length is 1.0; given 0.3"),
+        ({"step": 3.0}, ValueError, "step must go a whole number of times"),
+        ({"order": 0}, ValueError, "order must be at least 1"),
+        ({"order": 7}, ValueError, "order must be at most 6"),
+        ({"order": 2.0}, TypeError, "order must be an int"),
+        ({"start": "push"}, ValueError, "start must be one of ramp, accurate; given 'push'"),
+        ({"newton_tol": -1.0}, ValueError, "newton_tol must be positive"),
+        ({"t_eval": [0.015]}, ValueError, "t_eval must hold multiples of step"),
+        ({"t_span": (1.0, 0.0)}, ValueError, "t_span must be"),
+        ({"q0": PROBLEM.q0 + 0.01}, ValueError, "q0 is not consistent"),
+        ({"v0": np.zeros(3)}, ValueError, "v0 must have shape"),
+        ({"system": PROBLEM}, TypeError, "system must be a ConstrainedSystem"),
+    ],
+)
+def test_wrong_arguments_are_named(changed, error, message):
+    given = {"system": PROBLEM.system, "t_span": (0.0, 1.0), "q0": PROBLEM.q0, "v0": PROBLEM.v0, "step": 0.01}
+    with pytest.raises(error, match=message):
+        solve_gear(**{**given, **changed})
