@@ -29,7 +29,7 @@ class MinimalFourBar:
 
     Such a motion is periodic: it swings between two positions of rest, and back the same way. Half a period is
     integrated (DOP853, rtol 1e-13) and all other times are folded into it, so the error grows only by the number of
-    periods times the error of the period (about 1e-15 s).
+    periods times the error of the period (about 1e-15 s): after 100 s about 1e-12.
 
     Parameters
     ----------

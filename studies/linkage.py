@@ -32,20 +32,24 @@ def draw(axes: plt.Axes, problem: Problem) -> None:
         x, y = _joints(problem, result.q[:, k])
         shade = plt.cm.viridis(0.9 * k / (INSTANTS - 1))
         axes.plot(x, y, "-o", color=shade, lw=2.4 if k == 0 else 1.3, ms=3.5)
+        if k == 0:
+            for i in range(3):
+                middle = (0.5 * (x[i] + x[i + 1]), 0.5 * (y[i] + y[i + 1]))
+                axes.annotate(f"bar {i + 1}", middle, (4, 5), textcoords="offset points", fontsize=8)
     axes.plot([0.0, problem.parameters["L"]], [0.0, 0.0], "^", color="black", ms=9, zorder=5)
     axes.annotate("O", (0.0, 0.0), (-12, 6), textcoords="offset points")
     axes.annotate("A", (problem.parameters["L"], 0.0), (6, 6), textcoords="offset points")
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"{problem.name}, half a period: {half:.3f} s")
-    axes.legend(loc="lower left")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"{problem.name}: half a period, {half:.3f} s")
+    axes.legend(loc="lower left", fontsize=8)
 
 
 def main(words: list[str] | None = None, command: str | None = None) -> None:
     """Draw `linkage.png`."""
     call = parse("linkage", __doc__, words, command)
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4.0), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     for one, problem in zip(axes, PROBLEMS, strict=True):
         draw(one, problem)
-    figure.suptitle("Released from rest (dark), drawn at equal intervals of time", fontsize=9)
+    figure.suptitle("Released from rest (dark, thick); drawn at equal intervals of time, later is lighter", fontsize=9)
     figure.savefig(call.out / "linkage.png")
     print(f"wrote {call.out / 'linkage.png'}")
 
