@@ -252,7 +252,7 @@ def test_redundant_constraints_name_their_rows(default_four_bar):
 
 
 def test_a_constraint_without_gradient_names_its_row():
-    system = pendulum(constraint=lambda t, q: np.zeros(1), jacobian=lambda t, q: np.zeros((1, 2)))
+    system = pendulum(constraint=lambda t, q: np.zeros(1), jacobian=lambda t, q: np.zeros((1, 2)), gamma=False)
     refuses(ValueError, r"rank 0 < n_c = 1.*row\(s\) \[0\]", system)
 
 

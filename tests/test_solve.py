@@ -434,3 +434,48 @@ def test_a_fixed_step_tries_a_new_partition_before_it_gives_up():
     result = solve_dae(system, (0.0, 2.0), [-1.0, 0.0], [0.0, 0.0], "Gauss8", step_size=0.1)
     assert result.success and result.stats.n_partitions > 1
     assert np.all(result.h == pytest.approx(0.1))
+
+
+@pytest.mark.parametrize("method", sorted(PRESETS))
+@pytest.mark.parametrize("fixed", [False, True])
+def test_multipliers_and_accelerations_solve_the_equations_of_motion(default_four_bar, method, fixed):
+    problem = default_four_bar
+    options = {"step_size": 0.01} if fixed else {"rtol": 1e-6, "atol": 1e-6}
+    result = run(problem, 0.3, method=method, **options)
+    for k in range(result.t.size):
+        t, q, v, a, lam = result.t[k], *(part[:, k] for part in (result.q, result.v, result.a, result.lam))
+        residual = problem.system.mass(t, q) @ a + problem.system.jacobian(t, q).T @ lam - problem.system.force(t, q, v)
+        assert np.abs(residual).max() < 1e-10
+        assert np.abs(problem.system.jacobian(t, q) @ a - problem.system.gamma(t, q, v)).max() < 1e-10
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-9, -1e-9])
+@pytest.mark.parametrize("t0", [0.0, 1e4, -3.0])
+def test_a_fixed_step_lands_on_output_times_near_its_grid(offset, t0):
+    h = 1.0 / 30.0
+    times = t0 + np.array([10, 20, 30]) * h + offset
+    result = solve_dae(pendulum(), (t0, t0 + 2.0), *START, "Gauss8", step_size=h, t_eval=times)
+    assert result.success and result.stats.n_accepted == 60
+    assert result.h.sum() == pytest.approx(2.0, abs=1e-9)
+    exact = pendulum_state(times - t0)[0]
+    assert np.abs(result.q - exact).max() < 1e-6
+
+
+@pytest.mark.parametrize(("beta", "gamma"), [(1.0 / 6.0, 0.5), (0.1667, 0.5), (0.25, 0.6)])
+def test_newmark_without_an_error_estimate_wants_a_fixed_step(beta, gamma):
+    with pytest.raises(ValueError, match=r"Newmark with beta.*no error estimate.*step_size"):
+        swing(method=Newmark(beta, gamma))
+    assert swing(method=Newmark(beta, gamma), step_size=0.01, end=0.1).success
+
+
+def test_the_extrapolated_state_is_better_with_either_outer_loop(default_four_bar):
+    problem = default_four_bar
+    q, _ = trajectory(problem.parameters, [2.0])
+    for outer in ("fixed-point", "paper"):
+        errors = [
+            np.abs(
+                run(problem, 2.0, method=RungeKutta(gauss(2), outer, error), rtol=1e-6, atol=1e-6).q[:, -1] - q[:, 0]
+            ).max()
+            for error in ("richardson-paper", "richardson")
+        ]
+        assert errors[1] < 0.1 * errors[0]

@@ -1,5 +1,6 @@
 """The six callbacks of a mechanism: the decorator for compiled ones, and the door for plain Python functions."""
 
+import hashlib
 import inspect
 import itertools
 from collections.abc import Callable
@@ -51,6 +52,8 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     TypeError
         If the function has other arguments, or numba cannot compile it.
     """
+    if callable(kind):
+        raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {kind!r}")
     arguments, signature = KINDS[kind]
@@ -65,6 +68,8 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
         try:
             try:
                 dispatcher = njit(cache=True, error_model="numpy")(function)
+                keeper: Any = dispatcher._cache._cache_file  # type: ignore[attr-defined]
+                keeper._source_stamp = (keeper._source_stamp, _globals_digest(function))
             except RuntimeError:  # numba has nowhere to keep what is typed at a prompt
                 dispatcher = njit(error_model="numpy")(function)
             dispatcher.compile(signature)
@@ -76,11 +81,26 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     return decorate
 
 
+def _globals_digest(function: Callable[..., Any]) -> str:
+    """What a function takes from its module, for the stamp of its machine code: numba freezes it and forgets it."""
+    digest = hashlib.sha256()
+    for name in sorted(function.__code__.co_names):
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher):
+            value = (value.py_func.__code__.co_code, value.py_func.__code__.co_consts)
+        if isinstance(value, np.ndarray):
+            digest.update(name.encode() + value.tobytes())
+        elif isinstance(value, (bool, int, float, str, tuple)):
+            digest.update(f"{name}={value!r}".encode())
+    return digest.hexdigest()
+
+
 def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
     name = getattr(function, "__name__", "?")
     return (
         f"{kind}: numba cannot compile the function {name!r}. It must use numbers, numpy arrays and functions that "
-        f"numba knows, and give the array that {kind} asks for. Numba says:\n{error}"
+        f"numba knows (helpers need numba.njit), with arrays of one type (1.0 beside 0.5, not 1) and of the shape that "
+        f"{kind} asks for. Numba says:\n{type(error).__name__}: {error}"
     )
 
 
@@ -181,6 +201,19 @@ def no_gamma(t, q, v, p, Qd):
     """Stands where gamma is differenced; never called."""
 
 
+def check_arguments(kind: str, function: Callable[..., Any]) -> None:
+    """Raise if a function that returns its array names its arguments t, q, v, but in another order."""
+    wanted = ("t", "q", "v") if "v" in KINDS[kind][0] else ("t", "q")
+    try:
+        given = tuple(inspect.signature(function).parameters)
+    except (TypeError, ValueError):  # built-in functions have none to look at
+        return
+    if sorted(given) == sorted(wanted) and given != wanted:
+        raise TypeError(
+            f"{kind} is called as {kind}({', '.join(wanted)}); the function given takes ({', '.join(given)})"
+        )
+
+
 def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
     """Compile a function that returns its array, and wrap it to the in-place signature of its kind."""
     arguments, signature = KINDS[kind]
@@ -202,5 +235,5 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
     in_place = with_v if "v" in arguments else without_v
     try:
         return njit(signature, error_model="numpy")(in_place)
-    except NumbaError as error:
+    except Exception as error:  # numba lets some of its own assertions through
         raise TypeError(_why_not(kind, function, error)) from error

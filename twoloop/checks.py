@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
+
 
 def check_size(name: str, value: Any, least: int) -> int:
     """Return `value` as an int of at least `least`, or say what is wrong with it."""
@@ -20,6 +22,8 @@ def check_size(name: str, value: Any, least: int) -> int:
 def check_real(name: str, value: ArrayLike) -> Array:
     """Return `value` as a new float array, or say that it is not one."""
     try:
+        if np.iscomplexobj(value):
+            raise TypeError("complex numbers")
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be an array of real numbers; given {value!r}") from error
@@ -39,7 +43,7 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     """Return start and end, or say what is wrong with them."""
     span = check_vector("t_span", t_span, 2)
     t0, t1 = float(span[0]), float(span[1])
-    if not t1 > t0:
+    if not t1 - t0 > NEAR * np.spacing(max(abs(t0), abs(t1))):
         raise ValueError(f"t_span must be (start, end) with end > start; given ({t0!r}, {t1!r})")
     return t0, t1
 
@@ -67,14 +71,21 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
         raise ValueError(
             f"t_eval must lie within t_span = ({t0:g}, {t1:g}); given times from {times.min():g} to {times.max():g}"
         )
-    if (np.diff(times) <= 0.0).any():
-        where = int(np.flatnonzero(np.diff(times) <= 0.0)[0])
+    spacing = NEAR * np.spacing(max(abs(t0), abs(t1)))
+    close = np.diff(times) <= spacing
+    if close.any():
+        where = int(np.flatnonzero(close)[0])
         raise ValueError(
-            f"t_eval must be strictly increasing; entry {where + 1} ({times[where + 1]:g}) follows {times[where]:g}"
+            f"t_eval must be strictly increasing; entry {where + 1} ({float(times[where + 1])!r}) follows "
+            f"{float(times[where])!r}"
         )
+    for end in (t0, t1):
+        beside = (times != end) & (np.abs(times - end) <= spacing)
+        if beside.any():
+            raise ValueError(f"t_eval must not come within rounding of the end {end!r} of t_span; give that end itself")
     if step_size is not None:
         ratio = (times - t0) / step_size
-        off = np.abs(ratio - np.round(ratio)) > 1e-6
+        off = np.abs(ratio - np.round(ratio)) > max(1e-6, spacing / step_size)
         off &= times != t1
         if off.any():
             raise ValueError(

@@ -4,11 +4,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
-from twoloop.checks import check_vector
+from twoloop.checks import check_number, check_vector
+from twoloop.derivatives import check_derivatives
+from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+MAX_ITERATIONS = 50
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # largest violation that an initial state may have, relative to max(1, |q|) or max(1, |v|)
 
@@ -34,11 +37,21 @@ def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: Array
     ValueError
         If a shape is wrong, a value is not finite, or no consistent position is found near the guess.
     """
+    t = check_number("t", t)
     q = check_vector("q", q, system.n_q)
     v = check_vector("v", v, system.n_q)
+    system.check_returned(t, q, v)
+    blame = not_finite(system, t, q, v)
+    if blame != _NOTHING_FOUND:
+        raise ValueError(f"q and v cannot be projected: {blame} at t = {t:g}")
     correction = np.inf
-    for _ in range(50):
-        step = np.linalg.lstsq(system.jacobian(t, q), -system.constraint(t, q), rcond=1e-10)[0]
+    iterations = 0
+    while iterations < MAX_ITERATIONS:
+        iterations += 1
+        matrix, violations = system.jacobian(t, q), system.constraint(t, q)
+        if not (np.isfinite(matrix).all() and np.isfinite(violations).all()):
+            break
+        step = np.linalg.lstsq(matrix, -violations, rcond=1e-10)[0]
         q = q + step
         before, correction = correction, float(np.abs(step).max())
         if not np.isfinite(correction) or correction < 1e-15 * max(1.0, np.abs(q).max()):
@@ -48,8 +61,8 @@ def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: Array
     violation = float(np.abs(system.constraint(t, q)).max())
     if not violation < 1e-10 * max(1.0, float(np.abs(q).max())):
         raise ValueError(
-            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after 50 iterations "
-            f"max|C| is {violation:.3g}. Give a guess that is nearer to an assembled position"
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
+            f"iterations max|C| is {violation:.3g}. Give a guess that is nearer to an assembled position"
         )
     v = v - np.linalg.lstsq(system.jacobian(t, q), system.velocity_constraint(t, q, v), rcond=1e-10)[0]
     return q, v
@@ -74,6 +87,9 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> N
             f"mass of {system.name!r} must be symmetric; at t = {t0:g} max|M - M^T| is "
             f"{np.abs(matrix - matrix.T).max():.3g}"
         )
+    _refuse_inconsistent(system, "q0", t0, system.constraint(t0, q0), np.abs(q0).max())
+    check_derivatives(system, t0, q0)
+    _refuse_inconsistent(system, "v0", t0, system.velocity_constraint(t0, q0, v0), np.abs(v0).max())
     redundant = redundant_rows(jacobian)
     if redundant:
         raise ValueError(
@@ -81,18 +97,17 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> N
             f"at t = {t0:g}: row(s) {redundant} depend on the others. Leave these constraints out (redundant "
             "constraints are not handled yet), or start from another position"
         )
-    for name, violation, scale in (
-        ("q0", system.constraint(t0, q0), np.abs(q0).max()),
-        ("v0", system.velocity_constraint(t0, q0, v0), np.abs(v0).max()),
-    ):
-        row = int(np.abs(violation).argmax())
-        if abs(violation[row]) > CONSISTENT * max(1.0, scale):
-            equation = "C(t, q)" if name == "q0" else "C_q v + C_t"
-            raise ValueError(
-                f"{name} is not consistent with the constraints of {system.name!r}: max|{equation}| is "
-                f"{abs(violation[row]):.3g} (row {row}) at t = {t0:g}, at most {CONSISTENT:g} is accepted. Project it "
-                "with twoloop.consistent_state(system, t, q, v)"
-            )
+
+
+def _refuse_inconsistent(system: ConstrainedSystem, name: str, t0: float, violation: Array, scale: float) -> None:
+    row = int(np.abs(violation).argmax())
+    if abs(violation[row]) > CONSISTENT * max(1.0, scale):
+        equation = "C(t, q)" if name == "q0" else "C_q v + C_t"
+        raise ValueError(
+            f"{name} is not consistent with the constraints of {system.name!r}: max|{equation}| is "
+            f"{abs(violation[row]):.3g} (row {row}) at t = {t0:g}, at most {CONSISTENT:g} is accepted. Project it "
+            "with twoloop.consistent_state(system, t, q, v)"
+        )
 
 
 def redundant_rows(jacobian: Array) -> list[int]:
@@ -120,8 +135,9 @@ def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str:
         "constraint": lambda: system.constraint(t, q),
         "jacobian": lambda: system.jacobian(t, q),
         "constraint_rate": lambda: system.constraint_rate(t, q),
-        "gamma": lambda: system.gamma(t, q, v),
     }
+    if system.functions.flags[GAMMA_GIVEN] == 1:
+        values["gamma"] = lambda: system.gamma(t, q, v)
     guilty = [kind for kind, value in values.items() if not np.isfinite(value()).all()]
     if not guilty:
         return _NOTHING_FOUND

@@ -11,10 +11,11 @@ from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]
 
-# Newton in the inner loop converges quadratically and is tested on its last correction: this leaves rounding only
+# Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
 NEWMARK_OUTER_SHARE = 1e-3  # of err_out; Newmark sweeps converge so fast that this costs next to nothing
 
 
@@ -90,6 +91,8 @@ class RungeKutta:
     def __post_init__(self) -> None:
         if not isinstance(self.tableau, Tableau):
             raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {self.tableau!r}")
+        if np.diff(np.sort(self.tableau.c)).min(initial=1.0) < 1e-10:
+            raise ValueError(f"tableau must have distinct nodes; those of {self.tableau.name} are {self.tableau.c}")
         if self.outer not in ("fixed-point", "paper"):
             raise ValueError(f"outer must be 'fixed-point' or 'paper'; given {self.outer!r}")
         if self.error not in ("richardson", "richardson-paper"):
@@ -99,7 +102,7 @@ class RungeKutta:
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        return f"{self.tableau.name}, {self.outer}"
+        return f"{self.tableau.name}, {self.outer}, {self.error}"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -141,7 +144,8 @@ class Newmark:
     Parameters
     ----------
     beta, gamma : float
-        Parameters of (12), in which beta = 1/4 is the average-acceleration method.
+        Parameters of (12), in which beta = 1/4 is the average-acceleration method. Other gamma than 1/2, and beta
+        near 1/6, for which the error estimate vanishes, go with fixed steps only.
     error_tol : float, optional
         err_out of the paper: a step is accepted when |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this. None:
         the same estimate as a root mean square weighted by atol + rtol |q|.
@@ -179,6 +183,12 @@ class Newmark:
         """Make the method ready for a run of n_q coordinates."""
         from twoloop.kernels import newmark as kernels
 
+        if not fixed and (abs(self.beta - 1.0 / 6.0) < NO_ESTIMATE or self.gamma != 0.5):
+            raise ValueError(
+                f"Newmark with beta = {self.beta:g}, gamma = {self.gamma:g} has no error estimate: |beta - 1/6| h^2 "
+                f"|da| needs gamma = 1/2 and |beta - 1/6| >= {NO_ESTIMATE:g}. Give step_size for fixed steps, or take "
+                "beta = 1/4, gamma = 1/2"
+            )
         if self.outer_tol is not None:
             outer_tol = self.outer_tol
         elif fixed:
@@ -207,22 +217,27 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     """The paper's procedure with Sun's 3-stage Radau IIB; run it with rtol = atol = 1e-5 to follow Sect. 4.1.
 
     As printed: coordinate partitioning by LU; eqs. (14), (15) for the dependents at every stage; explicit Euler
-    prediction for all stages; the outer loop ends by (32), is given up by (33); the error is (26), (27), the
-    difference of one step and two half steps undivided; the next step by (31), (34) with fac = 0.9, facmax = 5,
-    facmin = 0.5 and h_max = 1 s at the beginning of each step; after (33) h_max = h and the step is halved.
+    prediction; the outer loop ends by (32), is given up by (33); the error is (26), (27), the difference of one step
+    and two half steps undivided; the next step by (31), (34) with fac = 0.9, facmax = 5, facmin = 0.5 and h_max = 1 s
+    at the beginning of each step; after (33) h_max = h and the step is halved.
 
     Where this differs from the printed text, and why:
 
-    - (32): the printed denominator max(Delta(y_i), 1) compares a difference with itself; max(|y_i|, 1) is used.
+    - (32): the printed denominator max(Delta(y_i), 1) compares a difference with itself; max(|y_i|, 1) is used. Sect.
+      3.1 bases the criterion on y_i and y_d, Sect. 3.3 on y_i only; the latter is followed.
     - (26): "Rotol" is read as Rtol. (27): n is 2 n_q, because z holds positions and velocities.
     - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
-    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta sweep iterates the K_i, and so does this.
+    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta sweep iterates the K_i, and so does this. Its step 2
+      predicts K_i = f(t_n + c_i h, y_{n+1}); here one K, at (t_{n+1}, y_{n+1}), predicts all.
     - Left open by the text and chosen: the K_i are calculated one after another with the latest of the others, as the
       loop is printed; the accepted state is that of the two half steps; Newton starts from the last iterate of the
       same stage; err_in bounds the largest correction; 200 sweeps at the most; the first step size, by solve_dae;
       c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
+    - A step also ends as after (33) when the inner loop does not converge: 25 iterations, a correction of more than
+      half the one before, or a singular C_qd.
     - "Once in a time step or several time steps": the partition is looked at after every step, and chosen anew when
-      max|C_qd^-1 C_qi| has grown to three times what it was, or when C_qd became singular within a step.
+      max|C_qd^-1 C_qi| has grown to three times what it was, or when a step failed in the inner loop.
+    - Steps are shortened to end at output times and at the end of the run.
 
     Parameters
     ----------
@@ -243,7 +258,8 @@ def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float 
       larger. Both can be chosen; the printed one is the default.
     - The paper refers to Hussein and Shabana for error control and convergence. err_out is taken as the tolerance
       of the local error |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 (Zienkiewicz and Xie 1991), with the step factor
-      0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: only so does the cost grow as in Table 3.
+      0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: only so does the cost grow as in Table 3. After a
+      step that did not converge h is halved, and h_max is 0.7 h for ten steps.
     - The outer loop stops when y_i would change by less than err_out / 1000, relative to max(|y_i|, 1); it is given
       up when the differences grow.
     - Newton starts from the Taylor polynomial of the dependents, not from the last position.

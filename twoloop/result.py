@@ -40,7 +40,7 @@ class Statistics:
     n_partitions : int or None
         Coordinate partitionings, the first included.
     n_factorizations : int or None
-        Matrix factorisations of C_qd, of C_q M^-1 C_q^T, and those of the partitionings.
+        Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, and of the partitionings.
     cpu_time : float
         Process time of the integration, s; compilation and checks of the input not included.
     """

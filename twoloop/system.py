@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.callbacks import (
     KINDS,
     PythonFunctions,
+    check_arguments,
     compile_returning,
     no_gamma,
     no_rate,
@@ -83,7 +84,11 @@ class ConstrainedSystem:
         if self.n_c > self.n_q:
             raise ValueError(f"n_c must not exceed n_q = {self.n_q}; given {self.n_c}")
         self.name = name
-        self.parameters = np.array(parameters, dtype=np.float64).reshape(-1)
+        self.parameters = check_real("parameters", parameters)
+        if self.parameters.ndim != 1 or not np.isfinite(self.parameters).all():
+            raise ValueError(f"parameters must be a vector of finite numbers; given {parameters!r}")
+        if not isinstance(constant_mass, (bool, np.bool_)):
+            raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
         self.constant_mass = bool(constant_mass)
         callbacks = {
             "mass": mass,
@@ -107,6 +112,7 @@ class ConstrainedSystem:
         self.functions = Functions(**callbacks, p=self.parameters, flags=flags)
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
+        self.checked = False  # by check_derivatives
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
@@ -141,7 +147,9 @@ class ConstrainedSystem:
         constraint_rate : callable, optional
             constraint_rate(t, q) -> (n_c,), the partial derivative C_t. None: no dependence on time.
         gamma : callable, optional
-            gamma(t, q, v) -> (n_c,), the right side of C_q a = Q_d. None: by differences of C_q and C_t.
+            gamma(t, q, v) -> (n_c,), the right side of C_q a = Q_d. None: by differences of C_q and C_t along the
+            motion, over 2e-4 of the largest coordinate and at most 2e-4 s (before t too): good to about 1e-11 unless
+            coordinates of very different scale, or a driving motion of kilohertz, ask for the formula.
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
@@ -174,6 +182,8 @@ class ConstrainedSystem:
             if not callable(function) and not (function is None and kind in ("constraint_rate", "gamma")):
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
         functions = {kind: function for kind, function in given.items() if function is not None}
+        for kind, function in functions.items():
+            check_arguments(kind, function)
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "constant_mass": constant_mass, "name": name}
         if compile:
             compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
@@ -185,6 +195,11 @@ class ConstrainedSystem:
         system = cls(**sizes, **wrappers, parameters=[python.handle])
         system._python = python  # the registry holds it weakly
         return system
+
+    @property
+    def called_in_python(self) -> bool:
+        """Whether the callbacks are plain Python functions."""
+        return self._python is not None
 
     def mass(self, t: float, q: Array) -> Array:
         """M(t, q), (n_q, n_q)."""
@@ -207,7 +222,15 @@ class ConstrainedSystem:
         return self._call(self.functions.constraint_rate, (self.n_c,), t, q)
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """Q_d(t, q, v), (n_c,); zeros for a system that was given none."""
+        """Q_d(t, q, v), (n_c,).
+
+        Raises
+        ------
+        ValueError
+            If the system was given none: the integrator then differences C_q and C_t.
+        """
+        if self.functions.flags[GAMMA_GIVEN] == 0:
+            raise ValueError(f"{self.name!r} was given no gamma")
         return self._call(self.functions.gamma, (self.n_c,), t, q, v)
 
     def check_returned(self, t: float, q: Array, v: Array) -> None:
@@ -218,7 +241,12 @@ class ConstrainedSystem:
         for kind, function in self._returning.items():
             arguments = (t, q, v) if "v" in KINDS[kind][0] else (t, q)
             shapes = {"mass": (self.n_q, self.n_q), "force": (self.n_q,), "jacobian": (self.n_c, self.n_q)}
-            store(kind, self.name, t, function(*arguments), np.zeros(shapes.get(kind, (self.n_c,))))
+            copies = [np.array(argument) for argument in arguments[1:]]
+            store(kind, self.name, t, function(t, *copies), np.zeros(shapes.get(kind, (self.n_c,))))
+            if any((copy != argument).any() for copy, argument in zip(copies, arguments[1:], strict=True)):
+                raise ValueError(
+                    f"{kind} of {self.name!r} must not change the arrays that it is given; copy them first"
+                )
 
     def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
         """C_q v + C_t, (n_c,): zero for consistent velocities (eq. (4))."""
@@ -226,7 +254,7 @@ class ConstrainedSystem:
 
     def _call(self, function: Dispatcher, shape: tuple[int, ...], t: float, *arrays: Array) -> Array:
         out = np.zeros(shape)
-        inputs = [np.ascontiguousarray(array, dtype=np.float64) for array in arrays]
+        inputs = [np.array(array, dtype=np.float64, order="C") for array in arrays]
         function(float(t), *inputs, self.functions.p, out)
         return out
 

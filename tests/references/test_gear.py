@@ -1,13 +1,14 @@
 """Fixed-step BDF on the index-3 form: order, damping, constraints, the start, failures."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from references.accelerations import accelerations
 from references.four_bar_minimal import MinimalFourBar
-from references.gear import HIGHEST, STARTS, _formulas, solve_gear
-from references.index1 import accelerations
+from references.gear import HIGHEST, STARTS, _formulas, _integrate, solve_gear
 from tests.problems import (
     force_residual,
     moving_pivot,
@@ -20,6 +21,7 @@ from tests.problems import (
     violations,
     worst,
 )
+from twoloop.kernels import linalg
 from twoloop.mechanisms import four_bar
 from twoloop.result import Status
 
@@ -147,6 +149,11 @@ def test_stores_every_step_or_those_asked_for(start):
 def test_a_run_shorter_than_its_start():
     for n in (1, 2, 3):
         assert run(n * 0.01, 0.01, 6, start="accurate").t.size == n + 1
+
+
+def test_machine_code_on_disk_is_stamped_with_the_factorisations_that_it_holds():
+    source = Path(linalg.__file__).stat()
+    assert (source.st_mtime, source.st_size) in _integrate._cache._cache_file._source_stamp
 
 
 def test_newton_iterations_are_few():

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from references.four_bar_minimal import MinimalFourBar
-from references.index1 import METHODS, ONE_STEP, STABILISATIONS, accelerations, solve_index1
+from references.index1 import METHODS, ONE_STEP, STABILISATIONS, solve_index1
 from tests.problems import (
     force_residual,
     moving_pivot,
@@ -138,18 +138,6 @@ def test_full_mass_matrix_that_varies(stabilisation):
     x, u, lam = oblique_point(result.t)
     ours = oblique_to_point(result)
     assert worst(ours[0], x) < 1e-7 and worst(ours[1], u) < 1e-6 and worst(result.lam[0], lam) < 1e-5
-
-
-def test_accelerations_helper():
-    system = PROBLEMS["default"].system
-    q, v = truth("default").states([0.3, 1.7])
-    a, lam = accelerations(system, [0.3, 1.7], q, v)
-    assert a.shape == (9, 2) and lam.shape == (8, 2)
-    for k in range(2):
-        jacobian = system.jacobian(0.0, q[:, k])
-        residual = system.mass(0.0, q[:, k]) @ a[:, k] + jacobian.T @ lam[:, k] - system.force(0.0, q[:, k], v[:, k])
-        assert worst(residual, 0.0) < 1e-12
-        assert worst(jacobian @ a[:, k], system.gamma(0.0, q[:, k], v[:, k])) < 1e-12
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -31,6 +31,8 @@ from twoloop.kernels.partition import partition, partition_is_worn
 # what advance() returns
 ALL_OUTPUT_DONE, BUFFER_FULL, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
 
+NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
+
 # places in `control`, constant during a run
 (
     SAFETY,
@@ -123,13 +125,21 @@ def advance(
         target = outputs[int(clock[NEXT_OUTPUT])]
         h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
         left = target - t
-        lands = h >= left * (1.0 - 1e-10)
+        near = NEAR * np.spacing(max(abs(t), abs(target)))
         size = h
+        if fixed:
+            # times are counted, not added up; an output time within a millionth of a step of the grid is on it
+            end = clock[T_START] + (clock[N_FIXED] + 1.0) * h
+            lands = end >= target - max(1e-6 * h, near)
+            if abs(t + h - end) > near:
+                size = end - t  # back to the grid after such an output time
+        else:
+            lands = h >= left * (1.0 - 1e-10)
+            if not lands and h > 0.5 * left:
+                size = 0.5 * left  # two equal steps rather than a long and a tiny one
         if lands:
             size = left
-        elif not fixed and h > 0.5 * left:
-            size = 0.5 * left  # two equal steps rather than a long and a tiny one
-        if size <= 4.0 * np.spacing(max(abs(t), abs(target))):
+        if size <= near:
             return STEP_TOO_SMALL
         code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and not np.isfinite(error):
@@ -164,11 +174,11 @@ def advance(
             clock[H_NEXT] = proposal
             continue
         w.counters[N_ACCEPTED] += 1
+        clock[FAILURE_CODE] = DONE
         clock[N_FIXED] += 1.0
         if lands:
             clock[T] = target
         else:
-            # no accumulated rounding in the times of a fixed-step run
             clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
         copy(new_state, state)
         out_h[filled[1]] = size

@@ -83,7 +83,7 @@ class Work(NamedTuple):
     pivots: Any  # (n_c) row exchanges of the LU factors
     order: Any  # (n_q) scratch: column order of the full pivoting
     counters: Any  # (N_COUNTERS) see below
-    sensitivity: Any  # (1) max|Cqd^-1 Cqi| when the partition was chosen; 0: not known yet
+    sensitivity: Any  # (1) max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
 
 
 _INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters")

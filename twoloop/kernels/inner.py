@@ -24,7 +24,9 @@ from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_so
 from twoloop.kernels.partition import RANK_TOLERANCE
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
-DIFFERENCE = 2e-4  # displacement over which Q_d is differenced, see gamma_by_differences
+CONTRACTION = 0.5  # each correction must be at most this times the one before
+ROUNDING = 1e-13  # relative to the largest coordinate: corrections of this size no longer shrink
+DIFFERENCE = 2e-4  # over which Q_d is differenced: of the largest coordinate a second, and seconds
 
 
 @compiled
@@ -55,6 +57,7 @@ def factor_dependent(f, w, t, q):
 @inlined
 def _positions(f, w, t, q, tolerance):
     """Eq. (15): Newton on the dependent positions of q, update first, then test the correction."""
+    before = np.inf
     for _ in range(MAX_INNER):
         code = factor_dependent(f, w, t, q)
         if code != DONE:
@@ -71,6 +74,14 @@ def _positions(f, w, t, q, tolerance):
                 return NOT_FINITE
         if correction <= tolerance:
             return DONE
+        if correction > CONTRACTION * before:
+            # at large coordinates rounding may stand above the tolerance; else this is no longer Newton's region,
+            # and to go on could end on another assembly of the mechanism
+            largest = 0.0
+            for j in range(q.size):
+                largest = max(largest, abs(q[j]))
+            return DONE if correction <= ROUNDING * largest else INNER_DIVERGED
+        before = correction
     return INNER_DIVERGED
 
 
@@ -110,11 +121,16 @@ def _velocity_constraint(f, w, t, q, v, g):
 
 @inlined
 def gamma_by_differences(f, w, t, q, v):
-    """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, central differences of order 4."""
-    speed = 1.0
+    """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, central differences of order 4.
+
+    The displacement is at most DIFFERENCE times the largest coordinate, and at most DIFFERENCE seconds.
+    """
+    size = 0.0
+    speed = 0.0
     for j in range(v.size):
+        size = max(size, abs(q[j]))
         speed = max(speed, abs(v[j]))
-    step = DIFFERENCE / speed
+    step = DIFFERENCE * size / speed if speed > size else DIFFERENCE
     w.Qd[:] = 0.0
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * step

@@ -36,7 +36,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     beta, gamma = options[BETA], options[GAMMA]
-    a_new = memory
+    a_new = memory[1 : 1 + n]  # memory[0] is advance()'s
     for m in range(n):
         a1[m] = a[m]
         q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: where Newton starts

@@ -243,6 +243,19 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
     return top if largest else np.sqrt(total / (2 * q.size))
 
 
+@compiled
+def _conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
+    """The error of the two half steps and, with EXTRAPOLATION, their extrapolation with the whole step."""
+    share = options[EXTRAPOLATION]
+    error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
+    if not (share > 0.0 and error <= 1.0):
+        return DONE, error
+    for m in range(q.size):
+        q1[m] += share * (q1[m] - q_full[m])
+        v1[m] += share * (v1[m] - v_full[m])
+    return restore(f, w, t, q1, v1, options[INNER_TOL]), error
+
+
 @kernel(STEP)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by sweeps on the accelerations; where the error is estimated, a step of h and two of h/2.
@@ -292,15 +305,9 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = sweep_accelerations(f, w, options, t + 0.5 * h, 0.5 * h, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
         if code != DONE:
             return code, np.inf
-        share = options[EXTRAPOLATION]
-        error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
-        if share > 0.0 and error <= 1.0:
-            for m in range(n):
-                q1[m] += share * (q1[m] - q_full[m])
-                v1[m] += share * (v1[m] - v_full[m])
-            code = restore(f, w, t + h, q1, v1, options[INNER_TOL])
-            if code != DONE:
-                return code, np.inf
+        code, error = _conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        if code != DONE:
+            return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
@@ -338,7 +345,9 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return code, np.inf
-        error = _richardson_error(tolerances, options[EXTRAPOLATION] > 0.0, q, v, q_full, v_full, q1, v1)
+        code, error = _conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        if code != DONE:
+            return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     return code, error
 

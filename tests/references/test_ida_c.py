@@ -1,0 +1,278 @@
+"""IDA without Python: the same method as through scikit-sundae, accuracy, failures, memory, other wheels."""
+
+import ctypes
+import gc
+import resource
+from functools import cache
+
+import numpy as np
+import pytest
+
+from references import ida_c
+from references.four_bar_minimal import trajectory
+from references.ida import solve_ida
+from references.ida_c import OUTPUTS, solve_ida_c
+from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
+from twoloop.mechanisms import four_bar
+from twoloop.result import Status
+
+PROBLEM = four_bar()
+# largest error of q at 1001 instants over 10 s: three times the largest of 15 runs that differ in rounding
+BOUNDS = {1e-5: 5.4e-2, 1e-7: 1.3e-3, 1e-9: 2.4e-5, 1e-11: 3e-7}
+SCALES = {"q": 1.0, "v": 10.0, "a": 250.0, "lam": 250.0}  # errors against those of q, about
+GOOD, NAN, RAISES = range(3)  # what the force of the pendulum below does after t = 1: its parameter
+
+
+def run(t_end, tolerance, **options):
+    return solve_ida_c(PROBLEM.system, (0.0, t_end), PROBLEM.q0, PROBLEM.v0, tolerance, tolerance, **options)
+
+
+# --- a pendulum of 1 m whose pivot moves as 0.3 sin 4t along x: M is full and varies, Q depends on v, C on t
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = 1.0 + 0.1 * q[1] ** 2
+    M[0, 1] = M[1, 0] = 0.2
+    M[1, 1] = 1.0
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    Q[0] = -0.1 * v[0] * abs(v[0])
+    Q[1] = -9.81
+    if t > 1.0 and p[0] == 1.0:
+        Q[1] = np.nan
+    if t > 1.0 and p[0] == 2.0:
+        raise ValueError("the motor burnt out")
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    C[0] = 0.5 * ((q[0] - 0.3 * np.sin(4.0 * t)) ** 2 + q[1] ** 2 - 1.0)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    Cq[0, 0] = q[0] - 0.3 * np.sin(4.0 * t)
+    Cq[0, 1] = q[1]
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):
+    Ct[0] = -1.2 * np.cos(4.0 * t) * (q[0] - 0.3 * np.sin(4.0 * t))
+
+
+@cache
+def pendulum(kind=GOOD):
+    system = ConstrainedSystem(
+        n_q=2,
+        n_c=1,
+        mass=mass,
+        force=force,
+        constraint=constraint,
+        jacobian=jacobian,
+        constraint_rate=constraint_rate,
+        parameters=[kind],
+        name="moving pivot",
+    )
+    return system, *consistent_state(system, 0.0, [0.6, -0.8], [0.0, 0.0])
+
+
+# --- accuracy
+
+
+@pytest.mark.parametrize("tolerance", BOUNDS)
+def test_agrees_with_the_truth(tolerance):
+    result = run(10.0, tolerance)
+    q, _ = trajectory(PROBLEM.parameters, result.t)
+    assert result.status is Status.REACHED_END and "reached the end" in result.message
+    assert np.array_equal(result.t, np.linspace(0.0, 10.0, OUTPUTS))
+    assert np.abs(result.q - q).max() < BOUNDS[tolerance]
+
+
+@pytest.mark.parametrize("tolerance", BOUNDS)
+def test_is_what_ida_does_through_python(tolerance):
+    times = np.linspace(0.0, 10.0, 101)
+    arguments = PROBLEM.system, (0.0, 10.0), PROBLEM.q0, PROBLEM.v0, "stabilised", tolerance, tolerance
+    python, result = solve_ida(*arguments, t_eval=times), run(10.0, tolerance, t_eval=times)
+    for name, scale in SCALES.items():
+        mine, theirs = getattr(result, name), getattr(python, name)
+        assert mine.shape == theirs.shape and np.abs(mine - theirs).max() < scale * BOUNDS[tolerance], name
+    assert result.stats.n_evaluations == pytest.approx(python.stats.n_evaluations, rel=0.2)
+    assert result.stats.n_factorizations == pytest.approx(python.stats.n_factorizations, rel=0.3)
+
+
+def test_moving_pivot_without_gamma_and_with_a_mass_that_varies():
+    system, q0, v0 = pendulum()
+    ours = solve_dae(system, (0.0, 3.0), q0, v0, rtol=1e-10, atol=1e-10)
+    loose, tight = (solve_ida_c(system, (0.0, 3.0), q0, v0, tol, tol, t_eval=[1.0, 3.0]) for tol in (1e-6, 1e-10))
+    errors = [np.abs(each.q[:, -1] - ours.q[:, -1]).max() for each in (loose, tight)]
+    assert errors[1] < 1e-6 and errors[0] > 10.0 * errors[1], errors
+    for mine, theirs in ((ours.v, tight.v), (ours.a, tight.a), (ours.lam, tight.lam)):
+        assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("system", [PROBLEM.system, pendulum()[0]], ids=["four-bar", "moving pivot"])
+def test_jacobian_is_that_of_the_residual(system):
+    n, m, f = system.n_q, system.n_c, system.functions
+    rng = np.random.default_rng(5)
+    t, cj, y, yp = 0.3, 7.0, rng.normal(size=2 * (n + m)), rng.normal(size=2 * (n + m))
+    residual = ida_c._residual(*f[:5], n, m, system.constant_mass)
+    matrix = ida_c._iteration_matrix(residual, f.mass, f.force, f.jacobian, n, m, system.constant_mass)
+    space = system.parameters, system.mass(t, y[:n]), np.zeros((m, n))
+
+    def residual_at(y, yp):
+        residual(t, y, yp, *space, res := np.zeros(y.size))
+        return res
+
+    computed = np.zeros((y.size, y.size))
+    matrix(t, cj, y, yp, residual_at(y, yp), *space, np.zeros(y.size), np.zeros(y.size), computed)
+    for j, e in enumerate(1e-5 * np.eye(y.size)):
+        column = (residual_at(y + e, yp + cj * e) - residual_at(y - e, yp - cj * e)) / 2e-5
+        assert np.abs(computed[j] - column).max() < 1e-5
+
+
+# --- output and statistics
+
+
+@pytest.mark.parametrize("times", [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0], [0.5, np.nextafter(1.0, 0.0), 1.0]])
+def test_t_eval_gives_exactly_these_times(times):
+    result = run(1.0, 1e-8, t_eval=times)
+    q, v = trajectory(PROBLEM.parameters, times)
+    assert result.t.tolist() == times and result.success and "t = 1." in result.message
+    assert result.q.shape == result.v.shape == result.a.shape == (9, len(times)) and result.lam.shape[0] == 8
+    assert np.abs(result.q - q).max() < 1e-5 and np.abs(result.v - v).max() < 1e-4
+
+
+def test_counts_follow_the_tolerance_and_not_the_output():
+    few, many, tight = run(2.0, 1e-7, t_eval=[2.0]).stats, run(2.0, 1e-7).stats, run(2.0, 1e-9).stats
+    assert few.n_accepted == many.n_accepted and few.n_evaluations == many.n_evaluations
+    assert few.n_accepted < few.n_evaluations < 2.5 * few.n_accepted  # without the Jacobian's differences
+    assert 0 < few.n_factorizations < 0.2 * few.n_accepted
+    assert tight.n_accepted > 1.5 * few.n_accepted
+    assert few.n_rejected_error > 0 and few.n_rejected_convergence == 0 and few.n_outer > 0 and few.cpu_time > 0.0
+
+
+# --- failures
+
+
+@pytest.mark.parametrize(("kind", "flag"), [(NAN, "IDA_CONV_FAIL (-4)"), (RAISES, "IDA_RES_FAIL (-8)")])
+def test_a_force_that_fails_comes_back_as_a_row(kind, flag, capfd):
+    system, q0, v0 = pendulum(kind)
+    result = solve_ida_c(system, (0.0, 2.0), q0, v0, 1e-6, 1e-6, t_eval=[0.5, 0.9, 1.5, 2.0])
+    good = solve_ida_c(*pendulum()[:1], (0.0, 2.0), q0, v0, 1e-6, 1e-6, t_eval=[0.5, 0.9])
+    assert result.status is Status.SOLVER_FAILED and not result.success
+    assert f"with {flag}" in result.message
+    assert 0.9 < float(result.message.split("t = ")[1].split()[0]) <= 1.0
+    assert result.t.tolist() == [0.5, 0.9] and np.array_equal(result.q, good.q)
+    assert result.stats.n_accepted > 0
+    assert capfd.readouterr() == ("", "")
+
+
+def test_too_many_steps_end_the_run(monkeypatch):
+    monkeypatch.setattr(ida_c, "MOST_STEPS", 20)
+    result = run(10.0, 1e-8, t_eval=[1e-6, 10.0])
+    assert result.status is Status.SOLVER_FAILED and "IDA_TOO_MUCH_WORK (-1)" in result.message
+    assert result.t.tolist() == [1e-6]
+
+
+def test_python_functions_are_refused_and_compiled_ones_are_not():
+    functions = {
+        "mass": np.eye(2),
+        "force": lambda t, q, v: np.array([0.0, -9.81]),
+        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+        "jacobian": lambda t, q: q.reshape((1, 2)),
+    }
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions)
+    with pytest.raises(ValueError, match=r"system must have compiled callbacks.*compile=True.*solve_ida"):
+        solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, compile=True, **functions)
+    result = solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
+    assert result.success
+    assert np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4
+
+
+def test_wrong_arguments_are_named():
+    system, q0, v0 = PROBLEM.system, PROBLEM.q0, PROBLEM.v0
+    with pytest.raises(TypeError, match="system must be a ConstrainedSystem"):
+        solve_ida_c(PROBLEM, (0.0, 1.0), q0, v0)
+    with pytest.raises(ValueError, match="t_span must be"):
+        solve_ida_c(system, (1.0, 0.0), q0, v0)
+    with pytest.raises(ValueError, match="rtol must be positive"):
+        solve_ida_c(system, (0.0, 1.0), q0, v0, rtol=0.0)
+    with pytest.raises(TypeError, match="atol must be a number"):
+        solve_ida_c(system, (0.0, 1.0), q0, v0, atol="small")
+    with pytest.raises(ValueError, match="q0 is not consistent"):
+        solve_ida_c(system, (0.0, 1.0), q0 + 0.1, v0)
+    with pytest.raises(ValueError, match="v0 must have shape"):
+        solve_ida_c(system, (0.0, 1.0), q0, v0[:3])
+    with pytest.raises(ValueError, match="t_eval must lie within"):
+        solve_ida_c(system, (0.0, 1.0), q0, v0, t_eval=[2.0])
+
+
+# --- the wheel
+
+
+@pytest.fixture
+def fresh():
+    """The library is looked for again in the test, and after it."""
+    ida_c.library.cache_clear()
+    yield
+    ida_c.library.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "found"),
+    [
+        ("files", lambda package: None, "there are 0 files"),
+        ("_version", lambda sundials: (8, 1, 0), "SUNDIALS has the version 8.1.0"),
+        ("_FUNCTIONS", {"core": {"SUNContext_Make": (None,)}}, "undefined symbol: SUNContext_Make"),
+    ],
+)
+@pytest.mark.usefixtures("fresh")
+def test_another_wheel_is_named(monkeypatch, name, value, found):
+    monkeypatch.setattr(ida_c, name, value)
+    with pytest.raises(RuntimeError, match=f"{found}.*written for scikit-sundae 1.2.0"):
+        run(1.0, 1e-6)
+
+
+@pytest.mark.usefixtures("fresh")
+def test_another_size_of_integers_is_named(monkeypatch):
+    from sksundae import _cy_common
+
+    monkeypatch.setattr(_cy_common, "config", _cy_common.config | {"SUNDIALS_INT_TYPE": "int64_t"})
+    with pytest.raises(RuntimeError, match=r"sunindextype and sunrealtype are int64_t and double.*written for"):
+        run(1.0, 1e-6)
+
+
+class _Mallinfo(ctypes.Structure):
+    """struct mallinfo2 of glibc, on which the wheel is built."""
+
+    _fields_ = tuple((name, ctypes.c_size_t) for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks".split())
+    _fields_ += tuple((name, ctypes.c_size_t) for name in "uordblks fordblks keepcost".split())
+
+
+def allocated():
+    """Bytes that malloc has given out."""
+    mallinfo = ctypes.CDLL(None).mallinfo2
+    mallinfo.restype = _Mallinfo
+    gc.collect()
+    now = mallinfo()
+    return now.uordblks + now.hblkhd
+
+
+def test_runs_leave_nothing_behind():
+    failing, q0, v0 = pendulum(NAN)
+
+    def runs(count):
+        for _ in range(count):
+            assert run(0.05, 1e-6, t_eval=[0.05]).success
+            assert not solve_ida_c(failing, (0.0, 2.0), q0, v0, 1e-4, 1e-4, t_eval=[2.0]).success
+
+    runs(10)
+    before, resident = allocated(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    runs(50)
+    print((allocated() - before) / 50)
+    assert allocated() - before < 50 * 20  # a flag's name is 32 bytes, a context some hundred
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - resident < 300  # kB

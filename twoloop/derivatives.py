@@ -1,0 +1,121 @@
+"""Is what a system says about itself true? C_q, C_t and Q_d against differences of C, a constant M against another M.
+
+A wrong sign in one of them often runs to the end and looks like a motion. Each system is looked at once.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.callbacks import KINDS
+from twoloop.kernels.common import GAMMA_GIVEN
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+DISPLACEMENTS = (1e-4, 1e-6, 1e-8)  # of the largest coordinate, and s; one of them has to agree
+AGREEMENT = 1e-3  # relative to the largest entry of the row
+ROUNDING = 1e-12  # of a difference, relative to |C_q| times the largest coordinate over the displacement
+
+
+def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare the callbacks of a system with one another near (t, q), at velocities that stand for any.
+
+    Raises
+    ------
+    ValueError
+        Naming the callback, the entry, the value given and the one differenced.
+    """
+    if system.checked:
+        return
+    _check_bounds(system, t, q)
+    size = float(np.abs(q).max()) or 1.0
+    generic = np.random.default_rng(1)
+    v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    jacobian = system.jacobian(t, q)
+    level = ROUNDING * max(float(np.abs(jacobian).max()), 1e-300) * size
+
+    def in_q(e: float) -> Array:
+        columns = []
+        for j in range(system.n_q):
+            shift = np.zeros(system.n_q)
+            shift[j] = e * size
+            columns.append((system.constraint(t, q + shift) - system.constraint(t, q - shift)) / (2.0 * e * size))
+        return np.column_stack(columns)
+
+    # times only forward: nobody promised that the callbacks work before the start
+    def in_t(e: float) -> Array:
+        return _forward([system.constraint(t + k * e, q) for k in range(3)], e)
+
+    def along(e: float) -> Array:
+        return -_forward([system.velocity_constraint(t + k * e, q + k * e * v, v) for k in range(3)], e)
+
+    _compare(system, "jacobian", t, jacobian, in_q, level / size)
+    _compare(system, "constraint_rate", t, system.constraint_rate(t, q), in_t, level)
+    if system.functions.flags[GAMMA_GIVEN] == 1:
+        _compare(system, "gamma", t, system.gamma(t, q, v), along, level)
+    if system.constant_mass:
+        there = system.mass(t + 1.0, q + 0.1 * v)
+        if np.isfinite(there).all() and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
+            raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+    system.checked = True
+
+
+def _forward(values: list[Array], e: float) -> Array:
+    return (-3.0 * values[0] + 4.0 * values[1] - values[2]) / (2.0 * e)
+
+
+def _compare(
+    system: ConstrainedSystem, kind: str, t: float, given: Array, difference: Callable[[float], Array], level: float
+) -> None:
+    least = np.inf
+    for e in DISPLACEMENTS:
+        try:
+            differenced = difference(e)
+        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
+            continue
+        if not np.isfinite(differenced).all():
+            continue
+        both = np.maximum(np.abs(given), np.abs(differenced))
+        row = both.max(axis=-1, keepdims=True) if given.ndim == 2 else both
+        excess = np.abs(given - differenced) / (AGREEMENT * row + level / e)
+        if excess.max() <= 1.0:
+            return
+        if excess.max() < least:
+            least = float(excess.max())
+            where = tuple(int(k) for k in np.unravel_index(int(excess.argmax()), excess.shape))
+            values = float(given[where]), float(differenced[where])
+    if np.isinf(least):
+        return
+    entry = where if len(where) > 1 else where[0]
+    what = {
+        "jacobian": "the derivative of constraint with respect to q",
+        "constraint_rate": "the derivative of constraint with respect to t",
+        "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right side of C_q a = gamma",
+    }[kind]
+    raise ValueError(
+        f"{kind} of {system.name!r} is not {what}: entry {entry} is {values[0]:.6g}, by differences it is "
+        f"{values[1]:.6g} (t = {t:g}, near the start, velocities chosen at random). Mend its formula"
+        + (", or leave gamma out to have it differenced" if kind == "gamma" else "")
+        + (", or give constraint_rate: the constraints depend on time" if kind == "constraint_rate" else "")
+    )
+
+
+def _check_bounds(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Run compiled callbacks once in Python, where an index out of bounds is an error and not another's memory."""
+    if system.called_in_python:
+        return
+    shapes = {"mass": (system.n_q, system.n_q), "force": (system.n_q,), "jacobian": (system.n_c, system.n_q)}
+    for kind, (arguments, _) in KINDS.items():
+        state = (q.copy(), np.zeros(system.n_q)) if "v" in arguments else (q.copy(),)
+        out = np.zeros(shapes.get(kind, (system.n_c,)))
+        try:
+            getattr(system.functions, kind).py_func(t, *state, system.parameters.copy(), out)
+        except IndexError as error:
+            raise ValueError(
+                f"{kind} of {system.name!r} goes out of bounds: {error}. q and v have n_q = {system.n_q} entries, p "
+                f"has {system.parameters.size}, {arguments[-1]} has shape {out.shape}"
+            ) from error
+        except Exception:  # what only works compiled cannot be looked at in this way
+            continue
