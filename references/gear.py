@@ -8,16 +8,20 @@ meant. Numbers from here say what such formulas do; they are not numbers of ADAM
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
 from numpy.typing import ArrayLike, NDArray
 
-from references.index1 import accelerations, solve_index1
+from references.accelerations import accelerations
+from references.index1 import solve_index1
 from twoloop.checks import check_positive, check_size, check_span, check_times, check_vector
 from twoloop.consistency import check_start
+from twoloop.kernels import common, linalg
 from twoloop.kernels.common import FUNCTIONS, INTEGERS, MATRIX, Functions
 from twoloop.kernels.linalg import lu_factor, lu_solve
 from twoloop.result import Result, Statistics, Status
@@ -322,7 +326,18 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
     return NOT_CONVERGED
 
 
-@njit(_INTEGRATE, cache=True, error_model="numpy")
+def _compile_now(function: Callable[..., Any]) -> Any:
+    """Compile for `_INTEGRATE` and keep the machine code on disk until one of its sources changes."""
+    dispatcher: Any = njit(cache=True, error_model="numpy")(function)
+    # numba itself watches only the file the function stands in; see twoloop.kernels.common.kernel
+    sources = [Path(name).stat() for name in (__file__, common.__file__, linalg.__file__)]
+    dispatcher._cache._cache_file._source_stamp = [(source.st_mtime, source.st_size) for source in sources]
+    dispatcher.compile(_INTEGRATE)
+    dispatcher.disable_compile()
+    return dispatcher
+
+
+@_compile_now
 def _integrate(  # type: ignore[no-untyped-def]
     mass,
     force,

@@ -17,9 +17,9 @@ from numba import njit, types
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
+from references.accelerations import compiled_gamma
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
-from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
 
@@ -33,7 +33,6 @@ FORMS = {
 NOT_TESTED = 1e12  # the absolute tolerance that takes an unknown out of IDA's error test
 SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
-GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
 
 _READ = types.Array(types.float64, 1, "C", readonly=True)  # IDA hands y and y' over as read-only arrays
 _VECTOR = types.float64[::1]
@@ -116,7 +115,7 @@ def solve_ida(
 def _solver(system: ConstrainedSystem, form: str, rtol: float, atol: float, length: float) -> Any:
     """IDA with its callbacks and options."""
     f = system.functions
-    residual, jacobian = _compiled(form, *f[:6], bool(f.flags[GAMMA_GIVEN]))
+    residual, jacobian = _compiled(form, *f[:5], compiled_gamma(system))
     sizes_and_p = (system.n_q, system.n_c, f.p)
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
@@ -147,25 +146,15 @@ def _n_multipliers(system: ConstrainedSystem, form: str) -> int:
 def _start(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Unknowns and their derivatives at the start; accelerations and multipliers from one linear system."""
     n, m = system.n_q, system.n_c
-    jacobian = system.jacobian(t0, q)
+    jacobian, gamma = system.jacobian(t0, q), np.zeros(m)
+    compiled_gamma(system)(t0, q, v, system.functions.p, gamma)
     kkt = np.block([[system.mass(t0, q), jacobian.T], [jacobian, np.zeros((m, m))]])
-    gamma = system.gamma(t0, q, v) if system.functions.flags[GAMMA_GIVEN] else _gamma(system, t0, q, v)
     solution = np.linalg.solve(kkt, np.concatenate([system.force(t0, q, v), gamma]))
     a, lam = solution[:n], solution[n:]
     zeros = np.zeros(m)
     if form == "index1":
         return np.concatenate([q, v, lam]), np.concatenate([v, a, zeros])
     return np.concatenate([q, v, zeros, zeros]), np.concatenate([v, a, lam, zeros])
-
-
-def _gamma(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array:
-    """Q_d = -d/de [C_q v + C_t](t + e, q + e v), by central differences of order 4."""
-    e = GAMMA_DIFFERENCE / max(1.0, float(np.abs(v).max()))
-
-    def rate(k: int) -> Array:
-        return system.velocity_constraint(t + k * e, q + k * e * v, v)
-
-    return -(rate(-2) - 8.0 * rate(-1) + 8.0 * rate(1) - rate(2)) / (12.0 * e)
 
 
 def _stops(t0: float, t1: float, times: Array) -> Array:
@@ -214,8 +203,7 @@ def _compiled(
     constraint: Dispatcher,
     jacobian: Dispatcher,
     constraint_rate: Dispatcher,
-    gamma: Dispatcher,
-    gamma_given: bool,
+    gamma: Callable[..., None],
 ) -> tuple[Callable[..., None], Callable[..., None]]:
     """Residual (t, y, y', res, n, m, p) and Jacobian (t, y, y', cj, JJ, n, m, p) of a form.
 
@@ -223,38 +211,10 @@ def _compiled(
     first-class argument costs tens of microseconds a call.
     """
     if form == "index1":
-        right_side = gamma if gamma_given else _gamma_by_differences(jacobian, constraint_rate)
-        residual = _index1_residual(mass, force, jacobian, right_side)
+        residual = _index1_residual(mass, force, jacobian, gamma)
     else:
         residual = _stabilised_residual(mass, force, constraint, jacobian, constraint_rate)
     return residual, _iteration_matrix(residual, mass, jacobian, form == "index1")
-
-
-def _gamma_by_differences(jacobian: Dispatcher, constraint_rate: Dispatcher) -> Callable[..., None]:
-    """Compile what `_gamma` does."""
-
-    @njit(error_model="numpy")
-    def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
-        speed = 1.0
-        for i in range(v.size):
-            speed = max(speed, abs(v[i]))
-        e = GAMMA_DIFFERENCE / speed
-        Cq, Ct, moved = np.zeros((Qd.size, q.size)), np.zeros(Qd.size), np.zeros(q.size)
-        for j in range(4):
-            shift = (-2.0, -1.0, 1.0, 2.0)[j] * e
-            weight = (-1.0, 8.0, -8.0, 1.0)[j] / (12.0 * e)
-            for i in range(q.size):
-                moved[i] = q[i] + shift * v[i]
-            Cq[:, :] = 0.0
-            Ct[:] = 0.0
-            jacobian(t + shift, moved, p, Cq)
-            constraint_rate(t + shift, moved, p, Ct)
-            for k in range(Qd.size):
-                Qd[k] += weight * Ct[k]
-                for i in range(v.size):
-                    Qd[k] += weight * Cq[k, i] * v[i]
-
-    return gamma  # type: ignore[no-any-return]
 
 
 def _index1_residual(

@@ -1,13 +1,11 @@
 """SciPy's solvers on the index-1 ODE y = [q, v] of any ConstrainedSystem: plain, Baumgarte's, or with projection.
 
-The accelerations come from eq. (6), M a + C_q^T lam = Q and C_q a = Q_d, by the Schur complement C_q M^-1 C_q^T. The
-right side is compiled from the callbacks, one call of it from Python an evaluation; nothing here uses the integrator
-of twoloop, but its small dense factorisations are shared.
+The accelerations are those of `references.accelerations`; the right side is compiled, one call of it from Python an
+evaluation. Nothing here uses the integrator of twoloop, but its small dense factorisations are shared.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -17,10 +15,11 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
+from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
+from references.accelerations import accelerations as accelerations  # importable from here too
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
-from twoloop.kernels.common import GAMMA_GIVEN
-from twoloop.kernels.linalg import ldl_factor, ldl_solve
+from twoloop.kernels.linalg import ldl_solve
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
 
@@ -35,14 +34,9 @@ STABILISATIONS = {
 }
 ALPHA = 10.0  # 1/s, see solve_index1
 
-GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
 PROJECTED = 1e-10  # correction of q, relative to max(1, |q|), at which a projection ends: what is left is its square
 MAX_PROJECTIONS = 10  # Newton iterations of a projection
 SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
-
-CONSTANT, DIAGONAL = 1, 2  # bits of what is known of the mass matrix
-
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
 def solve_index1(
@@ -119,7 +113,7 @@ def solve_index1(
     check_start(system, t0, q0, v0)
 
     strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0
-    equations = _Equations(system, t0, q0, strength)
+    equations = _RightSide(system, t0, q0, strength)
     y0 = np.concatenate([q0, v0])
     equations.warm(t0, y0, stabilisation == "projection")
     run = _Run(equations, times, stabilisation == "projection")
@@ -148,48 +142,21 @@ def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None
             )
 
 
-def accelerations(system: ConstrainedSystem, t: ArrayLike, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-    """Accelerations and multipliers of eq. (6) at given states.
-
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    t : array_like (n_t,)
-        Times, s.
-    q, v : array_like (n_q, n_t)
-        Coordinates and velocities, one column an instant.
-
-    Returns
-    -------
-    a : ndarray (n_q, n_t)
-    lam : ndarray (n_c, n_t)
-        Of M a + C_q^T lam = Q and C_q a = Q_d; NaN where the matrix is singular.
-    """
-    t = np.array(t, dtype=np.float64)
-    states = np.concatenate([np.array(q, dtype=np.float64), np.array(v, dtype=np.float64)])
-    return _Equations(system, float(t[0]), states[: system.n_q, 0], 0.0).at_points(t, states)
-
-
-class _Equations:
-    """The compiled equations of one system, with what they take besides t and y."""
+class _RightSide(Equations):
+    """The ODE of one system as SciPy calls it, and the projection onto its constraints."""
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, alpha: float):
+        super().__init__(system, t0, q0)
         f = system.functions
-        self.compiled = _compiled(*f[:6], bool(f.flags[GAMMA_GIVEN]))
-        self.system, self.alpha = system, alpha
+        self.alpha = alpha
+        self.derivative = _derivative(self.accelerate)
+        self.projection = _projection(f.mass, f.constraint, f.jacobian, f.constraint_rate)
         self.counters = np.zeros(1, dtype=np.int64)
         self.raised = False  # a callback raised an exception
-        mass = system.mass(t0, q0)
-        self.known = CONSTANT if system.constant_mass else 0
-        if self.known and np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0:
-            self.known |= DIAGONAL
-        self.factors = np.ascontiguousarray(mass)
-        if not self.compiled.factor(self.factors):
-            raise ValueError(f"mass of {system.name!r} must be positive definite; at t = {t0!r} it is not")
 
     def right_side(self) -> Callable[[float, Array], Array]:
         """y' = f(t, y) as SciPy calls it."""
-        derivative, n_c, alpha = self.compiled.derivative, self.system.n_c, self.alpha
+        derivative, n_c, alpha = self.derivative, self.system.n_c, self.alpha
         p, factors, known, counters = self.system.functions.p, self.factors, self.known, self.counters
 
         def fun(t, y):  # type: ignore[no-untyped-def]
@@ -203,14 +170,7 @@ class _Equations:
 
     def project(self, t: float, y: Array) -> bool:
         """Move y onto the constraints; False if that does not converge."""
-        return bool(self.compiled.project(t, y, self.system.n_c, self.system.functions.p, self.factors, self.known))
-
-    def at_points(self, t: Array, states: Array) -> tuple[Array, Array]:
-        """Accelerations and multipliers at states (2 n_q, n_t)."""
-        n_c, p = self.system.n_c, self.system.functions.p
-        rows = np.ascontiguousarray(states.T)
-        a, lam = self.compiled.at_points(t, rows, n_c, self.alpha, p, self.factors, self.known)
-        return a.T, lam.T
+        return bool(self.projection(t, y, self.system.n_c, self.system.functions.p, self.factors, self.known))
 
     def warm(self, t: float, y: Array, projection: bool) -> None:
         """Compile what the run calls, so that its time does not hold that."""
@@ -223,7 +183,7 @@ class _Equations:
 class _Run:
     """The loop over a solver's steps, and what it stores."""
 
-    def __init__(self, equations: _Equations, times: Array | None, projection: bool):
+    def __init__(self, equations: _RightSide, times: Array | None, projection: bool):
         self.equations, self.times, self.projection = equations, times, projection
         self.ends: list[float] = []  # of the accepted steps
         self.t: list[float] = []
@@ -303,12 +263,12 @@ class _Run:
         self.y.append(y)
 
 
-def _result(method: str, equations: _Equations, run: _Run, t1: float, cpu: float) -> Result:
+def _result(method: str, equations: _RightSide, run: _Run, t1: float, cpu: float) -> Result:
     n = equations.system.n_q
     evaluations = int(equations.counters[0])
     t = np.array(run.t)
     states = np.array(run.y).reshape(-1, 2 * n).T
-    a, lam = equations.at_points(t, states)
+    a, lam = equations.at_points(t, states, equations.alpha)
     message = f"{method} reached the end, t = {t1:g}."
     if run.failure:
         message = (
@@ -334,181 +294,11 @@ def _result(method: str, equations: _Equations, run: _Run, t1: float, cpu: float
     )
 
 
-@dataclass(frozen=True)
-class _Compiled:
-    factor: Callable[..., Any]
-    derivative: Callable[..., Any]
-    project: Callable[..., Any]
-    at_points: Callable[..., Any]
-
-
 @lru_cache(maxsize=64)
-def _compiled(
-    mass: Dispatcher,
-    force: Dispatcher,
-    constraint: Dispatcher,
-    jacobian: Dispatcher,
-    constraint_rate: Dispatcher,
-    gamma: Dispatcher,
-    gamma_given: bool,
-) -> _Compiled:
-    """Closures over the callbacks: SciPy calls from Python, where first-class functions would be slow arguments."""
-    right_side = gamma if gamma_given else _gamma_by_differences(jacobian, constraint_rate)
-    accelerate = _accelerations(mass, force, constraint, jacobian, constraint_rate, right_side)
-    return _Compiled(
-        factor=_factor,
-        derivative=_derivative(accelerate),
-        project=_projection(mass, constraint, jacobian, constraint_rate),
-        at_points=_at_points(accelerate),
-    )
-
-
-@njit(**_OPTIONS)
-def _factor(A):  # type: ignore[no-untyped-def]
-    return ldl_factor(A)
-
-
-@njit(**_OPTIONS)
-def _times_inverse(L, known, x):  # type: ignore[no-untyped-def]
-    """x becomes M^-1 x."""
-    if known & DIAGONAL:
-        for j in range(x.size):
-            x[j] *= L[j, j]
-    else:
-        ldl_solve(L, x)
-
-
-@njit(**_OPTIONS)
-def _schur_factors(L, known, Cq):  # type: ignore[no-untyped-def]
-    """Factors of S = C_q M^-1 C_q^T, and whether S is positive definite."""
-    m, n = Cq.shape
-    S, W, x = np.zeros((m, m)), np.empty((n, m)), np.empty(n)
-    for j in range(n):
-        for i in range(m):
-            W[j, i] = Cq[i, j]
-    for i in range(m):
-        for j in range(n):
-            x[j] = Cq[i, j]
-        _times_inverse(L, known, x)
-        for j in range(n):
-            if x[j] != 0.0:
-                for k in range(i, m):
-                    S[i, k] += x[j] * W[j, k]
-    return S, ldl_factor(S)
-
-
-@njit(**_OPTIONS)
-def _eliminate(L, known, Cq, a, lam):  # type: ignore[no-untyped-def]
-    """Eqs. (7) and (8): a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers."""
-    m, n = Cq.shape
-    S, definite = _schur_factors(L, known, Cq)
-    if not definite:
-        return False
-    x = a.copy()
-    _times_inverse(L, known, x)
-    for i in range(m):
-        total = -lam[i]
-        for j in range(n):
-            total += Cq[i, j] * x[j]
-        lam[i] = total
-    ldl_solve(S, lam)
-    for i in range(m):
-        for j in range(n):
-            a[j] -= Cq[i, j] * lam[i]
-    _times_inverse(L, known, a)
-    return True
-
-
-@njit(**_OPTIONS)
-def _least_change(L, known, Cq, C, x):  # type: ignore[no-untyped-def]
-    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular."""
-    m, n = Cq.shape
-    S, definite = _schur_factors(L, known, Cq)
-    if not definite:
-        return np.inf
-    ldl_solve(S, C)
-    change = np.zeros(n)
-    for i in range(m):
-        for j in range(n):
-            change[j] += Cq[i, j] * C[i]
-    _times_inverse(L, known, change)
-    largest = 0.0
-    for j in range(n):
-        x[j] -= change[j]
-        largest = max(largest, abs(change[j]))
-        if not np.isfinite(change[j]):
-            return np.inf
-    return largest
-
-
-def _gamma_by_differences(jacobian: Dispatcher, constraint_rate: Dispatcher) -> Callable[..., None]:
-    """Q_d = -d/de [C_q v + C_t](t + e, q + e v), by central differences of order 4."""
-
-    @njit(**_OPTIONS)
-    def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
-        speed = 1.0
-        for i in range(v.size):
-            speed = max(speed, abs(v[i]))
-        e = GAMMA_DIFFERENCE / speed
-        Cq, Ct, moved = np.zeros((Qd.size, q.size)), np.zeros(Qd.size), np.zeros(q.size)
-        for j in range(4):
-            shift = (-2.0, -1.0, 1.0, 2.0)[j] * e
-            weight = (-1.0, 8.0, -8.0, 1.0)[j] / (12.0 * e)
-            for i in range(q.size):
-                moved[i] = q[i] + shift * v[i]
-            Cq[:, :] = 0.0
-            Ct[:] = 0.0
-            jacobian(t + shift, moved, p, Cq)
-            constraint_rate(t + shift, moved, p, Ct)
-            for k in range(Qd.size):
-                Qd[k] += weight * Ct[k]
-                for i in range(v.size):
-                    Qd[k] += weight * Cq[k, i] * v[i]
-
-    return gamma  # type: ignore[no-any-return]
-
-
-def _accelerations(
-    mass: Dispatcher,
-    force: Dispatcher,
-    constraint: Dispatcher,
-    jacobian: Dispatcher,
-    constraint_rate: Dispatcher,
-    gamma: Callable[..., None],
-) -> Callable[..., Any]:
-    """(t, q, v, alpha, p, factors, known, a, lam) -> success: eqs. (6)-(8), with Baumgarte's terms when alpha > 0."""
-
-    @njit(**_OPTIONS)
-    def accelerate(t, q, v, alpha, p, factors, known, a, lam):  # type: ignore[no-untyped-def]
-        n, m = q.size, lam.size
-        L, Cq = factors, np.zeros((m, n))
-        if not known & CONSTANT:
-            L = np.zeros((n, n))
-            mass(t, q, p, L)
-            if not _factor(L):
-                return False
-        jacobian(t, q, p, Cq)
-        lam[:] = 0.0
-        gamma(t, q, v, p, lam)
-        if alpha > 0.0:
-            C, Ct = np.zeros(m), np.zeros(m)
-            constraint(t, q, p, C)
-            constraint_rate(t, q, p, Ct)
-            for i in range(m):
-                for j in range(n):
-                    Ct[i] += Cq[i, j] * v[j]
-                lam[i] -= 2.0 * alpha * Ct[i] + alpha * alpha * C[i]
-        a[:] = 0.0
-        force(t, q, v, p, a)
-        return _eliminate(L, known, Cq, a, lam)
-
-    return accelerate  # type: ignore[no-any-return]
-
-
 def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
     """(t, y, n_c, alpha, p, factors, known, counters) -> y'."""
 
-    @njit(**_OPTIONS)
+    @njit(**OPTIONS)
     def derivative(t, y, m, alpha, p, factors, known, counters):  # type: ignore[no-untyped-def]
         n = y.size // 2
         rate = np.empty(2 * n)
@@ -523,29 +313,13 @@ def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
     return derivative  # type: ignore[no-any-return]
 
 
-def _at_points(accelerate: Callable[..., Any]) -> Callable[..., Any]:
-    """(t, states as rows, n_c, alpha, p, factors, known) -> a, lam as rows."""
-
-    @njit(**_OPTIONS)
-    def at_points(t, states, m, alpha, p, factors, known):  # type: ignore[no-untyped-def]
-        n = states.shape[1] // 2
-        a, lam = np.empty((t.size, n)), np.empty((t.size, m))
-        for k in range(t.size):
-            q, v = states[k, :n].copy(), states[k, n:].copy()
-            if not accelerate(t[k], q, v, alpha, p, factors, known, a[k], lam[k]):
-                a[k, :] = np.nan
-                lam[k, :] = np.nan
-        return a, lam
-
-    return at_points  # type: ignore[no-any-return]
-
-
+@lru_cache(maxsize=64)
 def _projection(
     mass: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
 ) -> Callable[..., Any]:
     """(t, y, n_c, p, factors, known) -> success; y is projected in place, positions by Newton, then velocities."""
 
-    @njit(**_OPTIONS)
+    @njit(**OPTIONS)
     def project(t, y, m, p, factors, known):  # type: ignore[no-untyped-def]
         n = y.size // 2
         q, v = y[:n].copy(), y[n:].copy()
@@ -553,7 +327,7 @@ def _projection(
         if not known & CONSTANT:
             L = np.zeros((n, n))
             mass(t, q, p, L)
-            if not _factor(L):
+            if not factor(L):
                 return False
         size = 1.0
         for j in range(n):
@@ -585,3 +359,25 @@ def _projection(
         return True
 
     return project  # type: ignore[no-any-return]
+
+
+@njit(**OPTIONS)
+def _least_change(L, known, Cq, C, x):  # type: ignore[no-untyped-def]
+    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular."""
+    m, n = Cq.shape
+    S, definite = schur_factors(L, known, Cq)
+    if not definite:
+        return np.inf
+    ldl_solve(S, C)
+    change = np.zeros(n)
+    for i in range(m):
+        for j in range(n):
+            change[j] += Cq[i, j] * C[i]
+    times_inverse(L, known, change)
+    largest = 0.0
+    for j in range(n):
+        x[j] -= change[j]
+        largest = max(largest, abs(change[j]))
+        if not np.isfinite(change[j]):
+            return np.inf
+    return largest
