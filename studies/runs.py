@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from references.four_bar_minimal import MinimalFourBar
-from twoloop import Result
+from twoloop import Result, Statistics, Status
 from twoloop.mechanisms import Problem
 
 Array = NDArray[np.float64]
@@ -134,6 +134,15 @@ def _sum(*values: int | None) -> int | None:
     return sum(known) if known else None
 
 
+def _run(job: Job, k: int) -> Result:
+    try:
+        return job.run(k)
+    except RuntimeError as error:  # a foreign solver that is not there is a row too
+        nothing, columns = np.empty(0), np.empty((job.problem.system.n_q, 0))
+        status, lam = Status.SOLVER_FAILED, np.empty((job.problem.system.n_c, 0))
+        return Result(nothing, columns, columns, columns, lam, nothing, status, str(error), Statistics())
+
+
 def collect(jobs: Iterable[Job], truths: dict[str, Truth], t_end: float) -> pd.DataFrame:
     """Run all jobs, round by round so that a slow minute of the machine falls on all alike, under a progress bar."""
     jobs = list(jobs)
@@ -147,7 +156,7 @@ def collect(jobs: Iterable[Job], truths: dict[str, Truth], t_end: float) -> pd.D
                     continue
                 settings = ", ".join(f"{key}={value:g}" for key, value in job.settings.items())
                 progress.update(task, description=f"{job.solver} ({settings})"[:50].ljust(50))
-                rows.append(_describe(job.run(k), job.problem, truths[job.problem.name], t_end))
+                rows.append(_describe(_run(job, k), job.problem, truths[job.problem.name], t_end))
                 progress.advance(task)
         progress.update(task, description="done".ljust(50))
     return pd.DataFrame([_median_row(job, rows) for job, rows in zip(jobs, described, strict=True)])

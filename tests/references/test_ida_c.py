@@ -136,7 +136,7 @@ def test_jacobian_is_that_of_the_residual(system):
 # --- output and statistics
 
 
-@pytest.mark.parametrize("times", [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0], [0.5, np.nextafter(1.0, 0.0), 1.0]])
+@pytest.mark.parametrize("times", [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0], [1e-13, 1.0 - 1e-13, 1.0]])
 def test_t_eval_gives_exactly_these_times(times):
     result = run(1.0, 1e-8, t_eval=times)
     q, v = trajectory(PROBLEM.parameters, times)
@@ -247,10 +247,9 @@ def test_another_size_of_integers_is_named(monkeypatch):
 
 
 class _Mallinfo(ctypes.Structure):
-    """struct mallinfo2 of glibc, on which the wheel is built."""
+    """struct mallinfo2 of glibc: ten sizes, of which 4 and 7 are bytes in use in mapped and in other blocks."""
 
-    _fields_ = tuple((name, ctypes.c_size_t) for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks".split())
-    _fields_ += tuple((name, ctypes.c_size_t) for name in "uordblks fordblks keepcost".split())
+    _fields_ = (("sizes", ctypes.c_size_t * 10),)
 
 
 def allocated():
@@ -258,10 +257,11 @@ def allocated():
     mallinfo = ctypes.CDLL(None).mallinfo2
     mallinfo.restype = _Mallinfo
     gc.collect()
-    now = mallinfo()
-    return now.uordblks + now.hblkhd
+    sizes = mallinfo().sizes
+    return sizes[4] + sizes[7]
 
 
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc")
 def test_runs_leave_nothing_behind():
     failing, q0, v0 = pendulum(NAN)
 
@@ -270,9 +270,8 @@ def test_runs_leave_nothing_behind():
             assert run(0.05, 1e-6, t_eval=[0.05]).success
             assert not solve_ida_c(failing, (0.0, 2.0), q0, v0, 1e-4, 1e-4, t_eval=[2.0]).success
 
-    runs(10)
-    before, resident = allocated(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     runs(50)
-    print((allocated() - before) / 50)
-    assert allocated() - before < 50 * 20  # a flag's name is 32 bytes, a context some hundred
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - resident < 300  # kB
+    before, highest = allocated(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    runs(50)
+    assert allocated() - before < 50 * 20  # the name of a flag takes 32 bytes, a context 330
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - highest < 300  # kB
