@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, files
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +20,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
+from references.sundials import LONG, POINTER, REAL, library
 from twoloop.callbacks import python_force
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
@@ -30,7 +30,6 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LABEL = "SUNDIALS IDA, stabilised (GGL): the library of scikit-sundae, driven without Python"
-WRITTEN_FOR = "scikit-sundae 1.2.0 for Linux, with SUNDIALS 7.9.0 (any 7.x), sunindextype int and sunrealtype double"
 
 OUTPUTS = 1001  # instants of the default t_eval
 SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
@@ -42,50 +41,6 @@ SUN_COMM_NULL = 0
 RAISED = -1  # what a callback returns that IDA shall not call again
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
-_POINTER, _INT, _LONG, _REAL, _INDEX = ctypes.c_void_p, ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_int32
-_REALS = ctypes.POINTER(_REAL)
-_COUNTER = (_INT, _POINTER, _POINTER)
-
-# library: function: (what it returns, what it takes ...)
-_FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
-    "core": {
-        "SUNDIALSGetVersionNumber": (_INT, *[_POINTER] * 3, _POINTER, _INT),
-        "SUNContext_Create": (_INT, _INT, _POINTER),
-        "SUNContext_ClearErrHandlers": (_INT, _POINTER),
-        "SUNContext_Free": (_INT, _POINTER),
-        "N_VGetArrayPointer": (_REALS, _POINTER),
-        "N_VDestroy": (None, _POINTER),
-        "SUNMatDestroy": (None, _POINTER),
-        "SUNLinSolFree": (_INT, _POINTER),
-    },
-    "nvecserial": {"N_VMake_Serial": (_POINTER, _INDEX, _POINTER, _POINTER)},
-    "sunmatrixdense": {
-        "SUNDenseMatrix": (_POINTER, _INDEX, _INDEX, _POINTER),
-        "SUNDenseMatrix_Data": (_REALS, _POINTER),
-    },
-    "sunlinsoldense": {"SUNLinSol_Dense": (_POINTER, _POINTER, _POINTER, _POINTER)},
-    "ida": {
-        "IDACreate": (_POINTER, _POINTER),
-        "IDAFree": (None, _POINTER),
-        "IDAInit": (_INT, _POINTER, _POINTER, _REAL, _POINTER, _POINTER),
-        "IDASStolerances": (_INT, _POINTER, _REAL, _REAL),
-        "IDASetUserData": (_INT, _POINTER, _POINTER),
-        "IDASetLinearSolver": (_INT, _POINTER, _POINTER, _POINTER),
-        "IDASetJacFn": (_INT, _POINTER, _POINTER),
-        "IDASetMaxNumSteps": (_INT, _POINTER, _LONG),
-        "IDASetMinStep": (_INT, _POINTER, _REAL),
-        "IDASetMaxStep": (_INT, _POINTER, _REAL),
-        "IDASetStopTime": (_INT, _POINTER, _REAL),
-        "IDASolve": (_INT, _POINTER, _REAL, _POINTER, _POINTER, _POINTER, _INT),
-        "IDAGetReturnFlagName": (_POINTER, _LONG),
-        "IDAGetNumSteps": _COUNTER,
-        "IDAGetNumErrTestFails": _COUNTER,
-        "IDAGetNumStepSolveFails": _COUNTER,
-        "IDAGetNumNonlinSolvIters": _COUNTER,
-        "IDAGetNumResEvals": _COUNTER,
-        "IDAGetNumJacEvals": _COUNTER,
-    },
-}
 
 
 def solve_ida_c(
@@ -161,61 +116,6 @@ def solve_ida_c(
     return _result(system, times[: len(rows)], rows, failure, reached, statistics)
 
 
-@lru_cache(maxsize=1)
-def library() -> SimpleNamespace:
-    """The functions of SUNDIALS that are used here, from the files of scikit-sundae.
-
-    Raises
-    ------
-    RuntimeError
-        If scikit-sundae is missing or differs in a way that matters from `WRITTEN_FOR`.
-    """
-    try:
-        from sksundae._cy_common import config
-
-        sizes = config["SUNDIALS_INT_TYPE"], config["SUNDIALS_FLOAT_TYPE"]
-        paths = [str(path.locate()) for path in files("scikit-sundae") or ()]
-    except (ImportError, KeyError, PackageNotFoundError) as error:
-        raise _another_wheel(f"{type(error).__name__}: {error}") from error
-    if sizes != ("int", "double"):
-        raise _another_wheel(f"sunindextype and sunrealtype are {' and '.join(sizes)}")
-    functions: dict[str, Any] = {}
-    for name, wanted in _FUNCTIONS.items():
-        found = [path for path in paths if f"scikit_sundae.libs/libsundials_{name}-" in path]
-        if len(found) != 1:
-            raise _another_wheel(f"there are {len(found)} files scikit_sundae.libs/libsundials_{name}-*, not 1")
-        try:
-            functions |= _declared(ctypes.CDLL(found[0]), wanted)
-        except (OSError, AttributeError) as error:
-            raise _another_wheel(str(error)) from error
-    sundials = SimpleNamespace(**functions)
-    if (version := _version(sundials))[0] != 7:
-        raise _another_wheel(f"SUNDIALS has the version {'.'.join(map(str, version))}")
-    return sundials
-
-
-def _another_wheel(found: str) -> RuntimeError:
-    return RuntimeError(
-        f"the SUNDIALS of the installed scikit-sundae cannot be driven: {found}. references/ida_c.py was written for "
-        f"{WRITTEN_FOR}. references.ida.solve_ida does the same through Python"
-    )
-
-
-def _declared(dll: ctypes.CDLL, wanted: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
-    functions: dict[str, Any] = {}
-    for name, (returned, *taken) in wanted.items():
-        functions[name] = function = getattr(dll, name)
-        function.restype, function.argtypes = returned, taken
-    return functions
-
-
-def _version(sundials: SimpleNamespace) -> tuple[int, int, int]:
-    numbers, label = (_INT * 3)(), ctypes.create_string_buffer(64)
-    places = [ctypes.byref(numbers, i * ctypes.sizeof(_INT)) for i in range(3)]
-    sundials.SUNDIALSGetVersionNumber(*places, label, len(label))
-    return numbers[0], numbers[1], numbers[2]
-
-
 def _start(system: ConstrainedSystem, t0: float, q: Array, v: Array) -> Array:
     """[y y'] at the start."""
     a, lam = (column[:, 0] for column in accelerations(system, [t0], q[:, None], v[:, None]))
@@ -237,7 +137,7 @@ def _integrator(
         context = _context(sundials, stack)
 
         def made(name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
-            pointer = _POINTER(getattr(sundials, name)(*arguments, context))
+            pointer = POINTER(getattr(sundials, name)(*arguments, context))
             if not pointer:
                 raise MemoryError(f"{name} of SUNDIALS failed")
             stack.callback(free, pointer)
@@ -264,7 +164,7 @@ def _integrator(
 
 def _context(sundials: SimpleNamespace, stack: ExitStack) -> Any:
     """What all objects of SUNDIALS belong to; without the error handlers, which print."""
-    context = _POINTER()
+    context = POINTER()
     _check("SUNContext_Create", sundials.SUNContext_Create(SUN_COMM_NULL, ctypes.byref(context)))
     stack.callback(sundials.SUNContext_Free, ctypes.byref(context))
     _check("SUNContext_ClearErrHandlers", sundials.SUNContext_ClearErrHandlers(context))
@@ -281,7 +181,7 @@ def _integrate(
 ) -> tuple[Array, int, float]:
     """Rows [y y'] at the times before a failure, IDA's last flag, and the time that IDA reached."""
     memory, y, yp = solver
-    reached, flag = _REAL(t0), 0
+    reached, flag = REAL(t0), 0
     place = ctypes.byref(reached)
     rows, stored = np.empty((times.size, state.size)), 0
     for stop in [*times.tolist(), t1]:
@@ -297,7 +197,7 @@ def _integrate(
 
 def _statistics(sundials: SimpleNamespace, memory: Any, cpu: float) -> Statistics:
     def counted(what: str) -> int:
-        number = _LONG()
+        number = LONG()
         _check(f"IDAGet{what}", getattr(sundials, f"IDAGet{what}")(memory, ctypes.byref(number)))
         return number.value
 
@@ -317,7 +217,7 @@ def _flag_name(sundials: SimpleNamespace, flag: int) -> str:
     text = sundials.IDAGetReturnFlagName(flag)
     name = ctypes.string_at(text).decode()
     free = ctypes.CDLL(None).free
-    free.argtypes, free.restype = [_POINTER], None
+    free.argtypes, free.restype = [POINTER], None
     free(text)
     return name
 

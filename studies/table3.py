@@ -1,4 +1,4 @@
-"""Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside IDA and Exudyn."""
+"""Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside other solvers."""
 
 import itertools
 import statistics

@@ -234,7 +234,7 @@ def headline(rows: pd.DataFrame, line: str) -> str:
     return "\n\n".join(
         [
             f"CPU time in seconds for {rows['t_end'].iloc[0]:g} s of the linkage's motion (assumed geometry, see above) "
-            "with a largest position error over the run of",
+            "with a largest position error over the run of (two-loop procedures first, then other people's solvers)",
             markdown_table(list(WORK_PRECISION), work_precision(first)),
             f"– : not reached with the settings of the study. Written by {line}.",
         ]
@@ -276,6 +276,9 @@ def _summary(rows: pd.DataFrame, first: pd.DataFrame) -> str:
         ranked = sorted((value, solver) for solver, value in times.items() if not np.isnan(value))
         text = ", ".join(f"{solver} {value:.2f} s" for value, solver in ranked)
         lines.append(f"For an error of {target:.0e} over the run, cheapest first: {text}.")
+    best = first.dropna(subset="error_q").groupby("solver", sort=False)["error_q"].min()
+    reached = ", ".join(f"{solver} {number(value)}" for solver, value in best.items())
+    lines.append(f"Smallest error over the run that each reached with the settings here: {reached}.")
     two_loop = rows[rows["solver"].isin(TWO_LOOP)]
     tight = two_loop[two_loop["err_in"].isna() | (two_loop["err_in"] == 1e-9)]
     early, late = tight["violation_early"].max(), tight["violation_late"].max()
