@@ -46,6 +46,17 @@ def test_table3_quick_and_redraw(tmp_path):
     table3.main([*words, "--redraw"])
     assert (tmp_path / "table3.md").read_text() == text
     assert (tmp_path / "table3.png").stat().st_size > 10_000
+    # a solver that fails in every run, and one of our own cells, are rows like others
+    failed = rows["solver"].str.startswith("Exudyn") | (rows.index == 0)
+    rows.loc[failed, ["error_q", "error_v", "error_end", "energy", "violation_q", "n_steps"]] = math.nan
+    rows.loc[failed, ["lost", "astray"]] = True
+    rows.loc[failed, "status"] = "SOLVER_FAILED"
+    save_rows(tmp_path / "table3.csv", rows, "changed by a test")
+    table3.main([*words, "--redraw"])
+    text = (tmp_path / "table3.md").read_text()
+    ours = rows["solver"].str.startswith(("Paper", "Sun", "Gauss")).sum()
+    assert f"Runs that failed: 1 of {ours} two-loop runs, {int(failed.sum()) - 1} of the others." in text
+    assert "solver failed ★" in text
 
 
 def test_linkage(tmp_path):

@@ -4,10 +4,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from references.exudyn_four_bar import solve_exudyn
-from studies.runs import ASTRAY, LOST, Job, Truth, cheapest, collect
+from studies.runs import ASTRAY, LOST, Job, Truth, collect, time_for
 from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -68,11 +69,30 @@ def test_a_failed_run_is_a_row(problem, truths):
     assert foreign["status"] == "SOLVER_FAILED" and foreign["lost"] and foreign["message"]
 
 
-def test_cheapest_asks_for_the_error_not_the_tolerance(problem, truths):
-    jobs = [job(problem, rtol=tol, atol=tol) for tol in (1e-3, 1e-11)]
-    rows = collect(jobs, truths, T_END)
-    assert cheapest(rows, 1e-9) == rows["cpu_s"].iloc[1]
-    assert np.isnan(cheapest(rows, 1e-30))
+def rows_of(**columns):
+    return pd.DataFrame(columns, dtype=float)
+
+
+def test_time_for_an_error_lies_on_the_line_between_two_runs():
+    rows = rows_of(error_q=[1e-2, 1e-4, 1e-6], cpu_s=[1.0, 10.0, 100.0])
+    assert time_for(rows, 1e-3) == pytest.approx(10.0**0.5)
+    assert time_for(rows, 1e-6) == pytest.approx(100.0)
+    assert time_for(rows, 1.0) == 1.0  # better than asked: the cheapest run, nothing extrapolated
+    assert np.isnan(time_for(rows, 1e-7))
+
+
+def test_time_for_an_error_takes_the_cheapest_that_is_good_and_leaves_failures_out():
+    rows = rows_of(error_q=[1e-2, 1e-4, 1e-6, np.nan], cpu_s=[1.0, 10.0, 2.0, 0.1])
+    assert time_for(rows, 1e-4) == 2.0
+    assert np.isnan(time_for(rows_of(error_q=[np.nan], cpu_s=[1.0]), 1.0))
+
+
+def test_a_solver_that_is_not_there_is_a_row(problem, truths):
+    def run(k):
+        raise RuntimeError("no such library")
+
+    missing = collect([Job("test", "foreign", problem, run, {"tol": 1e-8}, 1)], truths, T_END).iloc[0]
+    assert missing["status"] == "SOLVER_FAILED" and missing["message"] == "no such library" and missing["lost"]
 
 
 def test_repeats_give_the_same_counts(problem, truths):
@@ -84,6 +104,6 @@ def test_repeats_give_the_same_counts(problem, truths):
 def test_truth_describes_the_motion(truths, problem):
     truth = truths[problem.name]
     assert truth.minimal.period == pytest.approx(problem.reference.period, abs=1e-12)
-    assert truth.n_collinear == 2
+    assert truth.in_line == {"θ1": 2, "θ2": 0, "θ3": 2}
     at_rest = problem.energy(0.0, problem.q0, problem.v0)
     assert 0.0 < truth.kinetic < at_rest + 9.81 * 4.5 * 1.5  # no more than all bars hanging straight down
