@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
-from references.accelerations import accelerations as accelerations  # importable from here too
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.kernels.linalg import ldl_solve

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
-from twoloop import ConstrainedSystem
+from twoloop import ConstrainedSystem, solve_dae
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -286,3 +286,18 @@ def force_residual(system, result):
         residual = system.mass(t, q) @ a + system.jacobian(t, q).T @ lam - system.force(t, q, v)
         largest = max(largest, np.abs(residual).max())
     return float(largest)
+
+
+# --- runs that end: one that crawls is to fail, not to hang
+
+START = ([-1.0, 0.0], [0.0, 0.0])
+
+
+def swing(end=2.0, system=None, **options):
+    options.setdefault("max_steps", 200_000)
+    return solve_dae(system or pendulum(), (0.0, end), *START, **options)
+
+
+def run(problem, end=10.0, **options):
+    options.setdefault("max_steps", 200_000)
+    return solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, **options)

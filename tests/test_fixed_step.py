@@ -1,0 +1,89 @@
+"""Fixed steps: equal, counted from the start, never changed in silence."""
+
+import numpy as np
+import pytest
+
+from tests.problems import START, pendulum, pendulum_state, run, swing, worst
+from twoloop import Newmark, RungeKutta, Status, solve_dae
+from twoloop.mechanisms import four_bar
+from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
+
+
+def test_fixed_steps_are_all_equal_and_times_exact_multiples():
+    result = solve_dae(pendulum(), (0.25, 2.25), *START, step_size=0.01)
+    assert (result.h[:-1] == 0.01).all()
+    assert result.h[-1] == pytest.approx(0.01, abs=1e-12)
+    assert result.h.size == 200
+    assert worst(result.t[:-1], 0.25 + 0.01 * np.arange(200)) <= np.spacing(2.25)  # no accumulated rounding
+    assert result.t[-1] == 2.25
+
+
+def test_the_last_fixed_step_is_shortened():
+    result = swing(1.05, step_size=0.02, method="Gauss6")
+    np.testing.assert_allclose(result.h, [0.02] * 52 + [0.01], atol=1e-12)
+    assert result.t[-1] == 1.05
+    assert worst(result.q[:, -1], pendulum_state(1.05)[0]) < 1e-6
+
+
+def test_fixed_steps_store_at_multiples_and_at_the_end():
+    result = swing(1.05, step_size=0.02, t_eval=[0.0, 0.3, 1.0, 1.05])
+    assert (result.t == [0.0, 0.3, 1.0, 1.05]).all()
+    assert len(result.h) == 53
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Newmark", "PaperIRK"])
+def test_a_fixed_step_that_cannot_converge_says_so_and_does_not_change(default_four_bar, method):
+    result = run(default_four_bar, step_size=2.0, method=method)
+    assert result.status == Status.NOT_CONVERGED
+    assert not result.success
+    assert "step_size = 2" in result.message
+    assert "smaller step_size" in result.message
+    assert (result.h == 2.0).all()
+    assert result.stats.n_rejected_convergence <= 2  # once more with a new partition
+
+
+def test_a_fixed_step_estimates_nothing(default_four_bar):
+    coarse = run(default_four_bar, step_size=0.01, rtol=1e-3, atol=1e-3)
+    fine = run(default_four_bar, step_size=0.01, rtol=1e-12, atol=1e-12)
+    assert (coarse.q == fine.q).all()
+    assert coarse.stats.n_rejected_error == 0
+
+
+def test_symmetric_gauss_with_fixed_steps_does_not_drift_while_the_partition_stays():
+    problem = four_bar(lengths=(1.0, 1.2, 0.5), ground=1.0, theta3=np.pi, branch=1)
+
+    def drift(tableau):
+        result = run(problem, 100.0, method=RungeKutta(tableau), step_size=0.01)
+        assert result.stats.n_partitions == 1
+        energy = problem.energy(result.t, result.q, result.v)
+        return abs(energy[-500:].mean() - energy[500:1000].mean())
+
+    assert drift(gauss(3)) < 1e-11
+    assert drift(sun_radau_iib(3)) > 1e-10  # symplectic as a tableau, but not symmetric
+    assert drift(radau_iia(3)) > 1e-6
+
+
+def test_a_fixed_step_tries_a_new_partition_before_it_gives_up():
+    system = pendulum()
+    result = solve_dae(system, (0.0, 2.0), [-1.0, 0.0], [0.0, 0.0], "Gauss8", step_size=0.1)
+    assert result.success and result.stats.n_partitions > 1
+    assert np.all(result.h == pytest.approx(0.1))
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-9, -1e-9])
+@pytest.mark.parametrize("t0", [0.0, 1e4, -3.0])
+def test_a_fixed_step_lands_on_output_times_near_its_grid(offset, t0):
+    h = 1.0 / 30.0
+    times = t0 + np.array([10, 20, 30]) * h + offset
+    result = solve_dae(pendulum(), (t0, t0 + 2.0), *START, "Gauss8", step_size=h, t_eval=times)
+    assert result.success and result.stats.n_accepted == 60
+    assert result.h.sum() == pytest.approx(2.0, abs=1e-9)
+    exact = pendulum_state(times - t0)[0]
+    assert np.abs(result.q - exact).max() < 1e-6
+
+
+@pytest.mark.parametrize(("beta", "gamma"), [(1.0 / 6.0, 0.5), (0.1667, 0.5), (0.25, 0.6)])
+def test_newmark_without_an_error_estimate_wants_a_fixed_step(beta, gamma):
+    with pytest.raises(ValueError, match=r"Newmark with beta.*no error estimate.*step_size"):
+        swing(method=Newmark(beta, gamma))
+    assert swing(method=Newmark(beta, gamma), step_size=0.01, end=0.1).success
