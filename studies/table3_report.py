@@ -141,7 +141,7 @@ SHOWN = {  # the lines of the figure: ours solid, others dashed
     "IDA, stabilised": ("tab:olive", "<--"),
     IDA_C: ("tab:green", ">--"),
     "Exudyn, TrapezoidalIndex2": ("tab:cyan", "D--"),
-    "LSODA, index 1": ("tab:gray", "x--"),
+    "LSODA, index 1": ("tab:gray", "p--"),  # a marker that can be white
     "DOP853, projected": ("black", "P--"),
 }
 
