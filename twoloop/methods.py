@@ -75,6 +75,18 @@ class RungeKutta:
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position changes by more than this, relative to
         max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
+    variables : {"velocities", "momenta"}
+        What is integrated. "velocities": (q_i, v_i), as in the paper; these are not canonical, so that a symplectic
+        tableau does not make a symplectic map. "momenta": (q_i, p_i = T^T M v), where v = T v_i + u are the velocities
+        that the constraints allow; where the force comes from a potential, a symplectic tableau (Gauss, Sun, Lobatto
+        IIIE) with a fixed step then is symplectic as long as the partition stays. A mass matrix M(t, q) is
+        differenced along the motion. Costs about a tenth more.
+    partition : {"lasting", "symmetric"}
+        "lasting": a partition stays until it is worn. "symmetric": each step has the partition that full pivoting
+        finds in the middle of the step, the same forwards and backwards, so that fixed steps with a symmetric tableau
+        (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. For long times at fixed steps
+        `RungeKutta(gauss(3), variables="momenta", partition="symmetric")` keeps the energy of a conservative mechanism
+        without drift; an error estimate, step-size control above all, spoils both properties.
 
     Raises
     ------
@@ -87,6 +99,8 @@ class RungeKutta:
     error: Literal["richardson", "richardson-paper"] = "richardson"
     inner_tol: float | None = None
     outer_tol: float | None = None
+    variables: Literal["velocities", "momenta"] = "velocities"
+    partition: Literal["lasting", "symmetric"] = "lasting"
 
     def __post_init__(self) -> None:
         if not isinstance(self.tableau, Tableau):
@@ -95,6 +109,15 @@ class RungeKutta:
             raise ValueError(f"tableau must have distinct nodes; those of {self.tableau.name} are {self.tableau.c}")
         if self.outer not in ("fixed-point", "paper"):
             raise ValueError(f"outer must be 'fixed-point' or 'paper'; given {self.outer!r}")
+        if self.variables not in ("velocities", "momenta"):
+            raise ValueError(f"variables must be 'velocities' or 'momenta'; given {self.variables!r}")
+        if self.partition not in ("lasting", "symmetric"):
+            raise ValueError(f"partition must be 'lasting' or 'symmetric'; given {self.partition!r}")
+        if self.outer == "paper" and (self.variables, self.partition) != ("velocities", "lasting"):
+            raise ValueError(
+                "outer='paper' is the paper's procedure: it goes with variables='velocities' and partition='lasting' "
+                f"only; given {self.variables!r} and {self.partition!r}"
+            )
         if self.error not in ("richardson", "richardson-paper"):
             raise ValueError(f"error must be 'richardson' or 'richardson-paper'; given {self.error!r}")
         _check_tolerances(self, "inner_tol", "outer_tol")
@@ -102,7 +125,8 @@ class RungeKutta:
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        return f"{self.tableau.name}, {self.outer}, {self.error}"
+        changed = [self.variables] * (self.variables != "velocities") + [self.partition] * (self.partition != "lasting")
+        return ", ".join([self.tableau.name, self.outer, self.error, *changed])
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -119,9 +143,14 @@ class RungeKutta:
             INNER_TOL if self.inner_tol is None else self.inner_tol,
             outer_tol,
             1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
+            self.partition == "symmetric",
         )
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         step = kernels.STEPS[self.outer]
+        if self.variables == "momenta":
+            from twoloop.kernels import momenta
+
+            memory, step = np.zeros(momenta.memory_size(tableau.stages, n_q)), momenta.momenta_step
         exponent = 1.0 / (tableau.order + 1)
         if self.outer == "paper":
             return Plan(

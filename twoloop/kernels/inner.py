@@ -143,6 +143,16 @@ def gamma_by_differences(f, w, t, q, v):
 
 
 @inlined
+def acceleration_constraint(f, w, t, q, v):
+    """The right side Q_d of C_q a = Q_d, into w.Qd."""
+    if f.flags[GAMMA_GIVEN] == 1:
+        w.Qd[:] = 0.0
+        f.gamma(t, q, v, f.p, w.Qd)
+    else:
+        gamma_by_differences(f, w, t, q, v)
+
+
+@inlined
 def factor_mass(f, w, t, q):
     """M(t, q) and its factors; of a constant diagonal M the inverse diagonal."""
     w.M[:, :] = 0.0
@@ -199,11 +209,7 @@ def _accelerations(f, w, t, q, v, a, lam):
         code = factor_mass(f, w, t, q)
         if code != DONE:
             return code
-    if f.flags[GAMMA_GIVEN] == 1:
-        w.Qd[:] = 0.0
-        f.gamma(t, q, v, f.p, w.Qd)
-    else:
-        gamma_by_differences(f, w, t, q, v)
+    acceleration_constraint(f, w, t, q, v)
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
     _schur_complement(f, w)
@@ -238,6 +244,12 @@ def evaluate(f, w, t, q, v, tolerance, a, lam):
     if code == DONE:
         code = _accelerations(f, w, t, q, v, a, lam)
     return code
+
+
+@compiled
+def dependent_positions(f, w, t, q, tolerance):
+    """Dependents of q from its independents."""
+    return _positions(f, w, t, q, tolerance)
 
 
 @compiled

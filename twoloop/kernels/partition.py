@@ -4,6 +4,7 @@ from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, SINGULA
 from twoloop.kernels.linalg import lu_solve
 
 RANK_TOLERANCE = 1e-11  # a pivot below this fraction of the largest one counts as zero
+CHANGED = -1  # returned beside DONE: there is another partition now
 WORSE = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
 
 
@@ -56,6 +57,15 @@ def _insert_sorted(source, target):
         target[i] = source[k]
 
 
+@inlined
+def _take_order(w):
+    n_c = w.C.size
+    # ascending, so that the same set is always the same partition
+    _insert_sorted(w.order[:n_c], w.dependent)
+    _insert_sorted(w.order[n_c:], w.independent)
+    w.sensitivity[0] = 0.0
+
+
 @compiled
 def partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q); SINGULAR where C_q has not full rank."""
@@ -63,15 +73,41 @@ def partition(f, w, t, q):
     f.jacobian(t, q, f.p, w.Cqx)
     n_c = w.C.size
     rank = full_pivoting(w.Cqx, w.order)
-    w.counters[N_PARTITIONS] += 1
     w.counters[N_FACTORIZATIONS] += 1
+    w.counters[N_PARTITIONS] += 1
     if rank < n_c:
         return SINGULAR
-    # ascending, so that the same set is always the same partition
-    _insert_sorted(w.order[:n_c], w.dependent)
-    _insert_sorted(w.order[n_c:], w.independent)
-    w.sensitivity[0] = 0.0
+    _take_order(w)
     return DONE
+
+
+@compiled
+def partition_of_midpoint(f, w, t_mid, state, new_state):
+    """Take the partition that full pivoting finds in the middle of a step; DONE (= 0) where it is the present one.
+
+    Both directions of a step have the same middle, so that the choice, and with it the map of a symmetric tableau,
+    is symmetric in time: where the partition changes, no direction is preferred, as it is by waiting until it is worn.
+    """
+    n = w.Q.size
+    for j in range(n):
+        w.x[j] = 0.5 * (state[j] + new_state[j])
+    w.Cqx[:, :] = 0.0
+    f.jacobian(t_mid, w.x, f.p, w.Cqx)
+    n_c = w.C.size
+    w.counters[N_FACTORIZATIONS] += 1
+    if full_pivoting(w.Cqx, w.order) < n_c:
+        return SINGULAR
+    same = True
+    for m in w.independent:
+        found = False
+        for k in range(n_c, n):
+            found = found or w.order[k] == m
+        same = same and found
+    if same:
+        return DONE
+    w.counters[N_PARTITIONS] += 1
+    _take_order(w)
+    return CHANGED
 
 
 @compiled

@@ -23,6 +23,7 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.inner import accelerations, evaluate, restore
 from twoloop.kernels.linalg import copy
+from twoloop.kernels.partition import CHANGED, partition_of_midpoint
 
 MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
@@ -32,7 +33,7 @@ ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinkin
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
-STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, N_SCALARS = range(5)
+STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, SYMMETRIC, N_SCALARS = range(6)
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
@@ -40,11 +41,17 @@ Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, N_VECTORS = range(8)
 
 
 def options_array(
-    A: ArrayLike, b: ArrayLike, c: ArrayLike, inner_tol: float, outer_tol: float, extrapolation: float
+    A: ArrayLike,
+    b: ArrayLike,
+    c: ArrayLike,
+    inner_tol: float,
+    outer_tol: float,
+    extrapolation: float,
+    symmetric: bool = False,
 ) -> NDArray[np.float64]:
     """The parameter block that the steps of this file read."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
-    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation])
+    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, float(symmetric)])
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
 
 
@@ -54,7 +61,7 @@ def memory_size(s: int, n_q: int) -> int:
 
 
 @inlined
-def _tableau(options):
+def tableau_of(options):
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -76,7 +83,7 @@ def _vector(memory, s, n, which):
 
 
 @compiled
-def _interpolate(c, theta, A_stage, weights, a):
+def interpolate(c, theta, A_stage, weights, a):
     """The polynomial through (c_j, A_stage_j) at theta."""
     s = c.size
     for j in range(s):
@@ -100,7 +107,7 @@ def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1
     undamped systems the sweep's rate is the square of the first-order one. On return A_stage has converged and
     (q1, v1) is the end of the step, on the constraints.
     """
-    s, A, A2, b, bA, c = _tableau(options)
+    s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
     tolerance = options[INNER_TOL]
     for j in range(s):
@@ -169,7 +176,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on the
     constraints.
     """
-    s, A, _, b, _, c = _tableau(options)
+    s, A, _, b, _, c = tableau_of(options)
     n = q.size
     tolerance = options[INNER_TOL]
     for m in range(n):
@@ -244,7 +251,7 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 
 @compiled
-def _conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
+def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
     """The error of the two half steps and, with EXTRAPOLATION, their extrapolation with the whole step."""
     share = options[EXTRAPOLATION]
     error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
@@ -256,15 +263,15 @@ def _conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
     return restore(f, w, t, q1, v1, options[INNER_TOL]), error
 
 
-@kernel(STEP)
-def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
+@compiled
+def _attempt(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by sweeps on the accelerations; where the error is estimated, a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
     step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
     last accepted step, those of the half steps from the whole step's.
     """
-    s, _, _, _, _, c = _tableau(options)
+    s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -285,7 +292,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
     for j in range(s):
         if ratio <= FARTHEST:
-            _interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
+            interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
     code = sweep_accelerations(f, w, options, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
@@ -296,16 +303,16 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(q1, q_full)
         copy(v1, v_full)
         for j in range(s):
-            _interpolate(c, 0.5 * c[j], trial, weights, half[j])
+            interpolate(c, 0.5 * c[j], trial, weights, half[j])
         code = sweep_accelerations(f, w, options, t, 0.5 * h, q, v, half, Q_stage, V_stage, q_mid, v_mid)
         if code != DONE:
             return code, np.inf
         for j in range(s):
-            _interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
+            interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
         code = sweep_accelerations(f, w, options, t + 0.5 * h, 0.5 * h, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
         if code != DONE:
             return code, np.inf
-        code, error = _conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
         if code != DONE:
             return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
@@ -315,9 +322,21 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 
 @kernel(STEP)
+def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt; with SYMMETRIC once more under the partition of its midpoint, if that is another one."""
+    code, error = _attempt(f, w, options, memory, t, h, tolerances, state, new_state)
+    if code == DONE and options[SYMMETRIC] == 1.0:
+        code = partition_of_midpoint(f, w, t + 0.5 * h, state, new_state)
+        if code == CHANGED:
+            memory[LAST_ACCEPTED] = 0.0  # the stages just found are of a step that is not taken
+            return _attempt(f, w, options, memory, t, h, tolerances, state, new_state)
+    return code, error
+
+
+@kernel(STEP)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt in the manner of the paper (Sects. 3.1-3.3): a step of h, two of h/2, their difference the error."""
-    s, _, _, _, _, _ = _tableau(options)
+    s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -345,7 +364,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return code, np.inf
-        code, error = _conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
         if code != DONE:
             return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
