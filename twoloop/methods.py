@@ -95,7 +95,7 @@ class RungeKutta:
     """
 
     tableau: Tableau
-    outer: Literal["fixed-point", "paper"] = "fixed-point"
+    outer: Literal["fixed-point", "newton", "paper"] = "fixed-point"
     error: Literal["richardson", "richardson-paper"] = "richardson"
     inner_tol: float | None = None
     outer_tol: float | None = None
@@ -107,8 +107,8 @@ class RungeKutta:
             raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {self.tableau!r}")
         if np.diff(np.sort(self.tableau.c)).min(initial=1.0) < 1e-10:
             raise ValueError(f"tableau must have distinct nodes; those of {self.tableau.name} are {self.tableau.c}")
-        if self.outer not in ("fixed-point", "paper"):
-            raise ValueError(f"outer must be 'fixed-point' or 'paper'; given {self.outer!r}")
+        if self.outer not in ("fixed-point", "newton", "paper"):
+            raise ValueError(f"outer must be 'fixed-point', 'newton' or 'paper'; given {self.outer!r}")
         if self.variables not in ("velocities", "momenta"):
             raise ValueError(f"variables must be 'velocities' or 'momenta'; given {self.variables!r}")
         if self.partition not in ("lasting", "symmetric"):
@@ -145,6 +145,13 @@ class RungeKutta:
             1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
             self.partition == "symmetric",
         )
+        if self.outer == "newton":
+            from twoloop.kernels import newton
+
+            extra = newton.newton_options(tableau.A, tableau.b, tableau.c)
+            n_eigen = int(extra[newton.N_REAL] + extra[newton.N_PAIRS])
+            memory = np.zeros(newton.memory_size(n_eigen, tableau.stages, n_q))
+            return Plan(newton.newton_step, np.concatenate([options, extra]), memory, 1.0 / (tableau.stages + 1))
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         step = kernels.STEPS[self.outer]
         if self.variables == "momenta":

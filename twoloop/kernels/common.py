@@ -103,8 +103,9 @@ WORK = types.NamedTuple(
     N_EVALUATIONS,
     N_PARTITIONS,
     N_FACTORIZATIONS,
+    N_JACOBIANS,
     N_COUNTERS,
-) = range(9)
+) = range(10)
 
 # what a kernel returns: DONE, or why it could not
 DONE, OUTER_DIVERGED, INNER_DIVERGED, SINGULAR, NOT_FINITE, MASS_NOT_DEFINITE = range(6)
