@@ -1,0 +1,243 @@
+"""The planar shear-deformable beam element in absolute nodal coordinates, and a chain of equal ones.
+
+Omar & Shabana (2001), J. Sound Vib. 243(3), 565-576. Coordinates of a node: [r_x r_y, (dr/dx)_x (dr/dx)_y,
+(dr/dy)_x (dr/dy)_y], position and the slopes along the two material axes; e (12,) of an element: node A, then B. In an
+element of length l, with xi = x/l and the thickness coordinate y, r = sum S_i e_i with
+
+    S_1 = 1 - 3 xi^2 + 2 xi^3    S_2 = l (xi - 2 xi^2 + xi^3)    S_3 = (1 - xi) y
+    S_4 = 3 xi^2 - 2 xi^3        S_5 = l (xi^3 - xi^2)           S_6 = xi y
+
+so that dr/dx = s + y k and dr/dy = d: the slope s of the centre line is quadratic in xi, the director d linear, and
+its rate k = (d_B - d_A)/l constant. Green-Lagrange strains with the plane-strain law [lambda + 2 mu, lambda, mu] over
+the whole volume; the integral over y is done in closed form and the one along xi at 5 Gauss points, both exact, so
+that the numbers are those of the usual 5 x 3 points.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+
+from twoloop.callbacks import callback
+from twoloop.kernels.common import MATRIX, VECTOR, compiled
+from twoloop.mechanisms.problem import Array
+
+# places in p; stiffnesses and mass are those of a unit of length, N and kg/m
+LENGTH, STIFFNESS, LAME, SHEAR, SECOND, FOURTH, MASS, WEIGHT, N_ELEMENT_PARAMETERS = range(9)
+
+
+def _gauss_points() -> Array:
+    """A row for each of 5 Gauss points on [0, 1]: weight, and what multiplies (r_B - r_A)/l, s_A, s_B and d_B."""
+    x, w = np.polynomial.legendre.leggauss(5)
+    xi = 0.5 * (1.0 + x)
+    return np.column_stack([0.5 * w, 6.0 * xi * (1.0 - xi), (1.0 - xi) * (1.0 - 3.0 * xi), xi * (3.0 * xi - 2.0), xi])
+
+
+POINTS = _gauss_points()
+
+
+@compiled
+def _resultants(sx, sy, kx, ky, dx, dy, p):
+    """Derivatives of the energy of a unit of length, where r_x = s + y k and r_y = d.
+
+    eps_11 = axial + y s.k + y^2 kk, eps_22 = thick, 2 eps_12 = s.d + y k.d; their parts have the resultants n0, n1,
+    n2, m0, g0, g1.
+    """
+    j2, j4 = p[SECOND], p[FOURTH]  # means of y^2 and y^4 over the thickness
+    axial = 0.5 * (sx * sx + sy * sy - 1.0)
+    kk = 0.5 * (kx * kx + ky * ky)
+    thick = 0.5 * (dx * dx + dy * dy - 1.0)
+    mean = axial + j2 * kk
+    n0 = p[STIFFNESS] * mean + p[LAME] * thick
+    n1 = p[STIFFNESS] * j2 * (sx * kx + sy * ky)
+    n2 = p[STIFFNESS] * (j2 * axial + j4 * kk) + p[LAME] * j2 * thick
+    m0 = p[STIFFNESS] * thick + p[LAME] * mean
+    g0 = p[SHEAR] * (sx * dx + sy * dy)
+    g1 = p[SHEAR] * j2 * (kx * dx + ky * dy)
+    return n0, n1, n2, m0, g0, g1
+
+
+@compiled
+def element_force(e, p, Q):
+    """Add the elastic force of one element with coordinates e (12,), -dU/de, to Q (12,)."""
+    l = p[LENGTH]
+    cx, cy = (e[6] - e[0]) / l, (e[7] - e[1]) / l
+    kx, ky = (e[10] - e[4]) / l, (e[11] - e[5]) / l
+    Fcx = Fcy = Fkx = Fky = 0.0
+    for g in range(5):
+        w = POINTS[g, 0] * l
+        s1, s2, s5, xi = POINTS[g, 1], POINTS[g, 2], POINTS[g, 3], POINTS[g, 4]
+        sx = s1 * cx + s2 * e[2] + s5 * e[8]
+        sy = s1 * cy + s2 * e[3] + s5 * e[9]
+        dx = (1.0 - xi) * e[4] + xi * e[10]
+        dy = (1.0 - xi) * e[5] + xi * e[11]
+        n0, n1, n2, m0, g0, g1 = _resultants(sx, sy, kx, ky, dx, dy, p)
+        Fsx = w * (n0 * sx + n1 * kx + g0 * dx)
+        Fsy = w * (n0 * sy + n1 * ky + g0 * dy)
+        Fdx = w * (m0 * dx + g0 * sx + g1 * kx)
+        Fdy = w * (m0 * dy + g0 * sy + g1 * ky)
+        Fkx += w * (n1 * sx + n2 * kx + g1 * dx)
+        Fky += w * (n1 * sy + n2 * ky + g1 * dy)
+        Fcx += s1 * Fsx
+        Fcy += s1 * Fsy
+        Q[2] -= s2 * Fsx
+        Q[3] -= s2 * Fsy
+        Q[8] -= s5 * Fsx
+        Q[9] -= s5 * Fsy
+        Q[4] -= (1.0 - xi) * Fdx
+        Q[5] -= (1.0 - xi) * Fdy
+        Q[10] -= xi * Fdx
+        Q[11] -= xi * Fdy
+    Q[0] += Fcx / l
+    Q[1] += Fcy / l
+    Q[6] -= Fcx / l
+    Q[7] -= Fcy / l
+    Q[4] += Fkx / l
+    Q[5] += Fky / l
+    Q[10] -= Fkx / l
+    Q[11] -= Fky / l
+
+
+@compiled
+def element_tangent(e, p, K):
+    """Add the derivative of the elastic force of one element with coordinates e (12,) to K (12, 12), symmetric."""
+    l = p[LENGTH]
+    stiffness, lame, shear = p[STIFFNESS], p[LAME], p[SHEAR]
+    j2, j4 = p[SECOND], p[FOURTH]
+    kx, ky = (e[10] - e[4]) / l, (e[11] - e[5]) / l
+    for g in range(5):
+        w = -POINTS[g, 0] * l
+        xi = POINTS[g, 4]
+        # what the vectors r_A, s_A, r_B, s_B contribute to s, and d_A, d_B to k and d
+        places = (0, 2, 6, 8)
+        in_s = (-POINTS[g, 1] / l, POINTS[g, 2], POINTS[g, 1] / l, POINTS[g, 3])
+        in_k = (-1.0 / l, 1.0 / l)
+        in_d = (1.0 - xi, xi)
+        sx = sy = 0.0
+        for i in range(4):
+            sx += in_s[i] * e[places[i]]
+            sy += in_s[i] * e[places[i] + 1]
+        dx = (1.0 - xi) * e[4] + xi * e[10]
+        dy = (1.0 - xi) * e[5] + xi * e[11]
+        n0, n1, n2, m0, g0, g1 = _resultants(sx, sy, kx, ky, dx, dy, p)
+        # second derivatives of the energy of a unit of length, xx, xy, yx, yy; those without yx are symmetric
+        ss_xx = w * (n0 + stiffness * (sx * sx + j2 * kx * kx) + shear * dx * dx)
+        ss_xy = w * (stiffness * (sx * sy + j2 * kx * ky) + shear * dx * dy)
+        ss_yy = w * (n0 + stiffness * (sy * sy + j2 * ky * ky) + shear * dy * dy)
+        sk_xx = w * (n1 + 2.0 * stiffness * j2 * sx * kx)
+        sk_xy = w * stiffness * j2 * (sx * ky + kx * sy)
+        sk_yy = w * (n1 + 2.0 * stiffness * j2 * sy * ky)
+        sd_xx = w * (g0 + (lame + shear) * sx * dx)
+        sd_xy = w * (lame * sx * dy + shear * dx * sy)
+        sd_yx = w * (lame * sy * dx + shear * dy * sx)
+        sd_yy = w * (g0 + (lame + shear) * sy * dy)
+        kk_xx = w * (n2 + stiffness * (j2 * sx * sx + j4 * kx * kx) + shear * j2 * dx * dx)
+        kk_xy = w * (stiffness * (j2 * sx * sy + j4 * kx * ky) + shear * j2 * dx * dy)
+        kk_yy = w * (n2 + stiffness * (j2 * sy * sy + j4 * ky * ky) + shear * j2 * dy * dy)
+        kd_xx = w * (g1 + (lame + shear) * j2 * kx * dx)
+        kd_xy = w * j2 * (lame * kx * dy + shear * dx * ky)
+        kd_yx = w * j2 * (lame * ky * dx + shear * dy * kx)
+        kd_yy = w * (g1 + (lame + shear) * j2 * ky * dy)
+        dd_xx = w * (m0 + stiffness * dx * dx + shear * (sx * sx + j2 * kx * kx))
+        dd_xy = w * (stiffness * dx * dy + shear * (sx * sy + j2 * kx * ky))
+        dd_yy = w * (m0 + stiffness * dy * dy + shear * (sy * sy + j2 * ky * ky))
+        for i in range(4):
+            I = places[i]
+            for j in range(4):
+                J = places[j]
+                K[I, J] += in_s[i] * in_s[j] * ss_xx
+                K[I, J + 1] += in_s[i] * in_s[j] * ss_xy
+                K[I + 1, J] += in_s[i] * in_s[j] * ss_xy
+                K[I + 1, J + 1] += in_s[i] * in_s[j] * ss_yy
+            for j in range(2):
+                J = 4 + 6 * j
+                xx = in_s[i] * (in_k[j] * sk_xx + in_d[j] * sd_xx)
+                xy = in_s[i] * (in_k[j] * sk_xy + in_d[j] * sd_xy)
+                yx = in_s[i] * (in_k[j] * sk_xy + in_d[j] * sd_yx)
+                yy = in_s[i] * (in_k[j] * sk_yy + in_d[j] * sd_yy)
+                K[I, J] += xx
+                K[J, I] += xx
+                K[I, J + 1] += xy
+                K[J + 1, I] += xy
+                K[I + 1, J] += yx
+                K[J, I + 1] += yx
+                K[I + 1, J + 1] += yy
+                K[J + 1, I + 1] += yy
+        for i in range(2):
+            I = 4 + 6 * i
+            for j in range(2):
+                J = 4 + 6 * j
+                both = in_k[i] * in_k[j]
+                dd = in_d[i] * in_d[j]
+                kd = in_k[i] * in_d[j]
+                dk = in_d[i] * in_k[j]
+                K[I, J] += both * kk_xx + dd * dd_xx + (kd + dk) * kd_xx
+                K[I, J + 1] += both * kk_xy + dd * dd_xy + kd * kd_xy + dk * kd_yx
+                K[I + 1, J] += both * kk_xy + dd * dd_xy + kd * kd_yx + dk * kd_xy
+                K[I + 1, J + 1] += both * kk_yy + dd * dd_yy + (kd + dk) * kd_yy
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    l = p[LENGTH]
+    m = p[MASS] * l
+    places = (0, 2, 6, 8)  # r_A, s_A, r_B, s_B
+    # cubic Hermite polynomials over one another, and the linear ones of d_A, d_B; the two kinds do not couple
+    hermite = (
+        (156.0, 22.0 * l, 54.0, -13.0 * l),
+        (22.0 * l, 4.0 * l * l, 13.0 * l, -3.0 * l * l),
+        (54.0, 13.0 * l, 156.0, -22.0 * l),
+        (-13.0 * l, -3.0 * l * l, -22.0 * l, 4.0 * l * l),
+    )
+    for first in range(0, q.size - 6, 6):
+        for k in range(2):
+            for i in range(4):
+                for j in range(4):
+                    M[first + places[i] + k, first + places[j] + k] += m * hermite[i][j] / 420.0
+            A, B = first + 4 + k, first + 10 + k
+            M[A, A] += m * p[SECOND] / 3.0
+            M[A, B] += m * p[SECOND] / 6.0
+            M[B, A] += m * p[SECOND] / 6.0
+            M[B, B] += m * p[SECOND] / 3.0
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    l = p[LENGTH]
+    weight = p[MASS] * l * p[WEIGHT]
+    for first in range(0, q.size - 6, 6):
+        Q[first + 1] -= weight / 2.0
+        Q[first + 3] -= weight * l / 12.0
+        Q[first + 7] -= weight / 2.0
+        Q[first + 9] += weight * l / 12.0
+        element_force(q[first : first + 12], p, Q[first : first + 12])
+
+
+@njit(types.void(types.float64, VECTOR, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy")
+def elastic_tangent(t, q, v, p, K):
+    """Add dQ/dq of `force` at q to K (n_q, n_q): symmetric, blocks of 6 beside the diagonal, zero from gravity."""
+    for first in range(0, q.size - 6, 6):
+        element_tangent(q[first : first + 12], p, K[first : first + 12, first : first + 12])
+
+
+def elastic_energy(q: Array, p: Array) -> Any:
+    """Elastic energy of a chain of equal elements, J, of q (n_q,) or (n_q, n_t)."""
+    nodes = q.reshape(-1, 3, 2, *q.shape[1:])
+    (rA, sA, dA), (rB, sB, dB) = np.moveaxis(nodes[:-1], 1, 0), np.moveaxis(nodes[1:], 1, 0)
+    l, j2, j4 = p[LENGTH], p[SECOND], p[FOURTH]
+
+    def dot(a: Array, b: Array) -> Array:
+        return (a * b).sum(axis=1)
+
+    k = (dB - dA) / l
+    kk = 0.5 * dot(k, k)
+    total = 0.0
+    for weight, s1, s2, s5, xi in POINTS:
+        s = s1 * (rB - rA) / l + s2 * sA + s5 * sB
+        d = (1.0 - xi) * dA + xi * dB
+        axial, thick = 0.5 * (dot(s, s) - 1.0), 0.5 * (dot(d, d) - 1.0)
+        squares = axial**2 + j2 * (dot(s, k) ** 2 + 2.0 * axial * kk) + j4 * kk**2 + thick**2
+        shear = dot(s, d) ** 2 + j2 * dot(k, d) ** 2
+        density = 0.5 * (p[STIFFNESS] * squares + p[SHEAR] * shear) + p[LAME] * thick * (axial + j2 * kk)
+        total = total + weight * l * density.sum(axis=0)
+    return total
