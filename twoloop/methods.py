@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 INNER_TOL = 1e-8
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
 NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
 NEWMARK_OUTER_SHARE = 1e-3  # of err_out; Newmark sweeps converge so fast that this costs next to nothing
 
@@ -136,6 +137,8 @@ class RungeKutta:
         outer_tol = self.outer_tol
         if outer_tol is None:
             outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * min(rtol, atol)
+            if fixed and self.outer == "newton":
+                outer_tol = NEWTON_TOL_FIXED
         options = kernels.options_array(
             tableau.A,
             tableau.b,

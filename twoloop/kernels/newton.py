@@ -35,7 +35,7 @@ from twoloop.kernels.inner import accelerations, evaluate, restore
 from twoloop.kernels.linalg import copy, lu_factor, lu_solve
 from twoloop.kernels.runge_kutta import FARTHEST, INNER_TOL, N_SCALARS, OUTER_TOL, interpolate, tableau_of
 
-MAX_ITERATIONS = 10
+MAX_ITERATIONS = 15
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
 STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
@@ -62,7 +62,7 @@ N_REAL, N_PAIRS, GAMMA0, N_EIGEN_SCALARS = range(4)
     N_MEMORY_SCALARS,
 ) = range(13)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, N_VECTORS = range(6)
+A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 
 
 def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
@@ -390,6 +390,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     previous, trial = _block(memory, s, n, PREVIOUS), _block(memory, s, n, TRIAL)
     weights = memory[memory.size - s :]
+    q_mid, v_mid, a_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID), _vector(memory, s, n, A_MID)
     if memory[LAST_ACCEPTED] == 1.0:
         memory[FRESH] = 0.0
         if memory[HAS_TRIAL] == 1.0:
@@ -405,7 +406,14 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[HAS_JACOBIAN] = 0.0
     while True:
         if memory[HAS_JACOBIAN] == 0.0:
-            code = _derivatives(f, w, options, memory, s, t, q, v, a)
+            # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's
+            for m in range(n):
+                q_mid[m] = q[m] + 0.5 * h * (v[m] + 0.25 * h * a[m])
+                v_mid[m] = v[m] + 0.5 * h * a[m]
+            code = evaluate(f, w, t + 0.5 * h, q_mid, v_mid, options[INNER_TOL], a_mid, w.lam)
+            if code != DONE:
+                return code, np.inf
+            code = _derivatives(f, w, options, memory, s, t + 0.5 * h, q_mid, v_mid, a_mid)
             if code != DONE:
                 return code, np.inf
             memory[HAS_JACOBIAN] = 1.0
