@@ -96,7 +96,7 @@ class RungeKutta:
     """
 
     tableau: Tableau
-    outer: Literal["fixed-point", "newton", "paper"] = "fixed-point"
+    outer: Literal["auto", "fixed-point", "newton", "paper"] = "fixed-point"
     error: Literal["richardson", "richardson-paper"] = "richardson"
     inner_tol: float | None = None
     outer_tol: float | None = None
@@ -108,8 +108,8 @@ class RungeKutta:
             raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {self.tableau!r}")
         if np.diff(np.sort(self.tableau.c)).min(initial=1.0) < 1e-10:
             raise ValueError(f"tableau must have distinct nodes; those of {self.tableau.name} are {self.tableau.c}")
-        if self.outer not in ("fixed-point", "newton", "paper"):
-            raise ValueError(f"outer must be 'fixed-point', 'newton' or 'paper'; given {self.outer!r}")
+        if self.outer not in ("auto", "fixed-point", "newton", "paper"):
+            raise ValueError(f"outer must be 'auto', 'fixed-point', 'newton' or 'paper'; given {self.outer!r}")
         if self.variables not in ("velocities", "momenta"):
             raise ValueError(f"variables must be 'velocities' or 'momenta'; given {self.variables!r}")
         if self.partition not in ("lasting", "symmetric"):
@@ -148,20 +148,25 @@ class RungeKutta:
             1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
             self.partition == "symmetric",
         )
-        if self.outer == "newton":
-            from twoloop.kernels import newton
+        exponent = 1.0 / (tableau.order + 1)
+        if self.outer in ("auto", "newton"):
+            from twoloop.kernels import automatic, newton
 
             extra = newton.newton_options(tableau.A, tableau.b, tableau.c)
-            n_eigen = int(extra[newton.N_REAL] + extra[newton.N_PAIRS])
-            memory = np.zeros(newton.memory_size(n_eigen, tableau.stages, n_q))
-            return Plan(newton.newton_step, np.concatenate([options, extra]), memory, 1.0 / (tableau.stages + 1))
+            options = np.concatenate([options, extra])
+            size = newton.memory_size(int(extra[newton.N_REAL] + extra[newton.N_PAIRS]), tableau.stages, n_q)
+            newton_exponent = 1.0 / (tableau.stages + 1)
+            if self.outer == "newton":
+                return Plan(newton.newton_step, options, np.zeros(size), newton_exponent)
+            sweeps = kernels.memory_size(tableau.stages, n_q)
+            memory = automatic.automatic_memory(sweeps, size, exponent, newton_exponent)
+            return Plan(automatic.automatic_step, options, memory, exponent=1.0)
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         step = kernels.STEPS[self.outer]
         if self.variables == "momenta":
             from twoloop.kernels import momenta
 
             memory, step = np.zeros(momenta.memory_size(tableau.stages, n_q)), momenta.momenta_step
-        exponent = 1.0 / (tableau.order + 1)
         if self.outer == "paper":
             return Plan(
                 step,

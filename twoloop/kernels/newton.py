@@ -68,7 +68,9 @@ A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
     """Length of `memory`: scalars, stage blocks, vectors, J_q, J_v, a filter matrix, complex ones with their pivots."""
     matrices = 3 + 2 * n_eigenvalues
-    return N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + matrices * n_q * n_q + (3 + n_eigenvalues) * n_q + s
+    return (
+        N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + matrices * n_q * n_q + (3 + n_eigenvalues) * n_q + s
+    )
 
 
 def newton_options(A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
