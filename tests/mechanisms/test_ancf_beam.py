@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
-from tests.problems import violations, worst
+from tests.problems import slope, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
@@ -18,7 +18,8 @@ from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, t
 LOCKING = 0.7 / (1.3 * 0.4)  # (lambda + 2 mu)/E = (1 - nu)/((1 + nu)(1 - 2 nu)) at nu = 0.3: 1.346
 EULER_BERNOULLI = 1.4836  # rad/s, the lowest bending frequency of the pinned-free beam with E = 2e6
 
-# tip heights at 0.2, 0.4, ... 2 s from an implementation in NumPy by the same equations, DOP853 with rtol 1e-8
+# tip heights, m, at 0.2, 0.4, ... 2 s: another implementation of these equations in NumPy, written before this one;
+# SciPy's DOP853 with rtol 1e-8, the motion of the base put in exactly
 TIMES = np.arange(1, 11) / 5.0
 TIP_HEIGHTS = {
     "flexible, node": [-0.2108, -0.9913, -0.8950, -0.1744, 0.3007, -0.1108, -0.7132, -0.9351, -0.0299, 0.3070],
@@ -45,11 +46,6 @@ def tangent(problem):
     K = np.zeros((problem.q0.size, problem.q0.size))
     elastic_tangent(0.0, problem.q0, problem.v0, problem.system.parameters, K)
     return K
-
-
-def slope(f, e=1e-3):
-    """df(s)/ds at s = 0, central differences of order 4."""
-    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
 
 
 def reduced_motion(problem, t_eval, rtol=1e-8):
@@ -141,7 +137,7 @@ def test_energy_balance_includes_the_work_of_the_base(case, request):
 
 @pytest.mark.parametrize(("case", "factor"), [("flexible", 1.0), ("stiff", 10.0)])
 def test_frequencies_of_the_straight_beam(case, factor, request):
-    # from the same implementation in NumPy as the tip heights
+    # values from the same implementation in NumPy as the tip heights
     problem = request.getfixturevalue(case)
     M = problem.system.mass(0.0, problem.q0)
     w = np.sqrt(np.abs(eigh(-tangent(problem)[2:, 2:], M[2:, 2:], eigvals_only=True)))
@@ -212,6 +208,14 @@ def test_tip_of_the_very_flexible_beam_that_starts_as_a_whole():
     check_tip_heights("flexible, beam", very_flexible_beam(start="beam"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "height"), [(8, 0.001), (16, -0.091)])
+def test_four_elements_are_too_few_for_the_very_flexible_beam(n, height):
+    q, _ = reduced_motion(very_flexible_beam(n), [1.0])
+    assert abs(tip_height(q)[0] - height) < 1e-3
+    assert abs(tip_height(q)[0] - TIP_HEIGHTS["flexible, node"][4]) > 0.29
+
+
 @pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK"])
 @pytest.mark.parametrize(("case", "end"), [("flexible", 0.05), ("stiff", 0.005)])
 def test_two_loop_procedures_agree_with_the_reduced_equations(case, end, method, request):
@@ -259,6 +263,7 @@ CASE = {"youngs_modulus": 2e6, "amplitude": 0.01, "angular_frequency": 1.0}
     [
         ({"n_elements": 0}, ValueError, "n_elements must be at least 1; given 0"),
         ({"n_elements": 4.0}, TypeError, "n_elements must be an int"),
+        ({"start": ["node"]}, ValueError, "start must be 'node'"),
         ({"start": "rest"}, ValueError, "start must be 'node'.*or 'beam'.*given 'rest'.*consistent"),
         ({"youngs_modulus": -1.0}, ValueError, "youngs_modulus must be positive.*-1"),
         ({"youngs_modulus": "steel"}, TypeError, "youngs_modulus must be a number.*steel"),
