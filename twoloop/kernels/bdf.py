@@ -161,7 +161,7 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
     copy(prediction, new_state[: 2 * n])  # dependents: where Newton starts
     copy(rate[n:], a1)
     before = np.inf
-    for _ in range(MAX_SWEEPS):
+    for sweep in range(MAX_SWEEPS):
         w.counters[N_OUTER] += 1
         for m in w.independent:
             v1[m] = prediction[n + m] + c * (a1[m] - rate[n + m])
@@ -175,7 +175,8 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
             change = max(change, difference / max(abs(v1[m]), 1.0))
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        if change <= options[OUTER_TOL] or (change >= before and change <= ROUNDING_FLOOR):
+        # the first sweep evaluates the prediction, never to be accepted: extrapolation alone is unstable
+        if sweep > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= ROUNDING_FLOOR)):
             return DONE
         if not change <= before:
             return OUTER_DIVERGED
