@@ -220,15 +220,16 @@ class BDF:
 
     Of y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'), where p extrapolates the last k + 1 points and
     c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
-    evaluation has the inner loop within it. About two evaluations a step suffice, so one evaluation is cheap progress,
-    but errors are larger at equal tolerance than those of `RungeKutta`. Compare at equal error.
+    evaluation has the inner loop within it. Two to three evaluations make a step. At equal tolerance errors are larger
+    than those of `RungeKutta`: compare at equal error.
 
     With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
     the estimated local error of q and v, dependents too, is within the tolerance. Fixed steps have the order
     max_order from the first on; 3-stage Gauss steps make the history that it needs.
 
-    What to expect of undamped motion: orders 1 and 2 lose energy, orders 3 and 4 may slowly gain it. The fixed point
-    limits h to about the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
+    What to expect of undamped motion: small oscillations lose energy with orders 1, 2 and 5 and gain it with 3 and 4,
+    at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
+    the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
 
     Parameters
     ----------
@@ -238,7 +239,7 @@ class BDF:
         Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position would change by more than this, relative to
-        max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
+        max(|value|, 1), but not before one correction. None: 0.01 min(rtol, atol); with fixed steps 1e-14.
 
     Raises
     ------

@@ -25,7 +25,6 @@ BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; wi
 NEIGHBOUR = 1.4  # ... and that of another order once more times this, lest the order flutter
 HOLD = 1.2  # a step that could grow by less keeps its size
 GROWTH = 2.0  # the most by which a step grows
-RESTART = 3.0  # rejections in a row after which the history is forgotten
 SHORT = 0.03  # a step of less than this share of the last, between close output times, stays out of the history
 
 # places in `options`: scalars, then the parameter block of the Gauss steps
@@ -37,13 +36,12 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
     ORDER,
     DEPTH,  # the highest difference there is
     AGE,  # accepted steps since the order changed or the error test failed
-    REJECTIONS,  # by the error test, in a row
     LEAD,  # how far the state is ahead of the history, s
     NEXT_ORDER,
     NEXT_DEPTH,
     NEXT_LEAD,
     N_MEMORY_SCALARS,
-) = range(11)
+) = range(10)
 NOTHING, HISTORY, AHEAD = range(3)
 # rows of coefficients: times since the points of the history, from its last point and from the end of the step; the
 # error constants of orders 0, 1, ...
@@ -87,11 +85,9 @@ def _take_over(memory, differences, trial):
     if left == NOTHING:
         return
     if memory[LAST_ACCEPTED] == 0.0:
-        memory[REJECTIONS] += 1.0
         memory[ORDER] = memory[NEXT_ORDER]
         memory[AGE] = 0.0
         return
-    memory[REJECTIONS] = 0.0
     memory[LEAD] = memory[NEXT_LEAD]
     if left == AHEAD:
         return
@@ -113,9 +109,6 @@ def _begin(memory, differences, state, h, order):
     _coefficients(memory, SPANS)[0] = h
     memory[ORDER] = order
     memory[DEPTH] = order
-    memory[AGE] = 0.0
-    memory[REJECTIONS] = 0.0
-    memory[LEAD] = 0.0
 
 
 @compiled
@@ -278,8 +271,9 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     y, y1 = state[: 2 * n], new_state[: 2 * n]
     differences, trial, prediction, rate, scratch = _blocks(memory, n)
     fixed = tolerances[ESTIMATE] == 0.0
+    after_accepted = memory[LAST_ACCEPTED] == 1.0  # a step that is short after a rejection is no landing
     _take_over(memory, differences, trial)
-    if memory[DEPTH] == 0.0 or memory[REJECTIONS] >= RESTART:
+    if memory[DEPTH] == 0.0:
         _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
     k = int(memory[ORDER])
     length = memory[LEAD] + h
@@ -298,7 +292,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[NEXT_ORDER] = min(k + 1, int(options[HIGHEST]))
     else:
         error = _judge(options, memory, tolerances, trial, y, y1, d)
-    if k > 0 and length < SHORT * _coefficients(memory, SPANS)[0]:
+    if after_accepted and length < SHORT * _coefficients(memory, SPANS)[0]:
         memory[TRIAL] = AHEAD
         memory[NEXT_LEAD] = length
     else:
