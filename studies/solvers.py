@@ -103,9 +103,9 @@ def _index1(
     return solve_index1(problem.system, span, problem.q0, problem.v0, method, tolerance, tolerance, **options)  # type: ignore[arg-type]
 
 
-def _exudyn(solver: str, problem: Problem, t_end: float, step: float, k: int) -> Result:
+def _exudyn(solver: str, options: Mapping[str, float], problem: Problem, t_end: float, step: float, k: int) -> Result:
     n_steps = round(t_end / step)
-    return solve_exudyn(problem, t_end, n_steps, solver, store_every=max(1, n_steps // STORED))
+    return solve_exudyn(problem, t_end, n_steps, solver, **options, store_every=max(1, n_steps // STORED))  # type: ignore[arg-type]
 
 
 def _gear(order: int, start: str, problem: Problem, t_end: float, step: float, k: int) -> Result:
@@ -133,7 +133,10 @@ def _all() -> Iterator[Solver]:
             run = partial(_index1, name, "baumgarte", alpha)
             yield Solver(f"{name}, Baumgarte {alpha:g}", "tol", run, {"alpha": alpha})
     for solver in exudyn_four_bar.SOLVERS:
-        yield Solver(f"Exudyn, {solver}", "h", partial(_exudyn, solver))
+        yield Solver(f"Exudyn, {solver}", "h", partial(_exudyn, solver, {}))
+    for radius in (1.0, 0.6):
+        run = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius})
+        yield Solver(f"Exudyn, GeneralizedAlpha {radius:g}", "h", run, {"spectral_radius": radius})
     for order in GEAR_ORDERS:
         yield Solver(f"GSTIFF stand-in, order {order}", "h", partial(_gear, order, "accurate"), {"order": order})
         yield Solver(f"GSTIFF stand-in, order {order}, ramp", "h", partial(_gear, order, "ramp"), {"order": order})

@@ -12,12 +12,13 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from references import exudyn_four_bar, ida
+from references import ida
 from studies.report import REPORTS, Call, load_rows, parse, put_in_readme, save_rows, stamp
 from studies.runs import Job, Truth, collect
 from studies.solvers import CATALOGUE, IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER, two_loop
 from studies.table3_report import (
     EXPLICIT,
+    EXUDYN,
     FAMILIES,
     PAPER_IRK,
     PAPER_NEWMARK,
@@ -67,7 +68,7 @@ def others(problem: Problem, t_end: float, quick: bool) -> Iterator[Job]:
     for solver in () if quick else EXPLICIT:
         for tolerance in (1e-5, 1e-7, 1e-9, 1e-11):
             yield job(solver, tolerance)
-    for solver in exudyn_four_bar.SOLVERS:
+    for solver in EXUDYN:
         for step in (1e-2, 2e-3) if quick else (1e-2, 4e-3, 2e-3, 1e-3, 4e-4, 1e-4):
             yield job(f"Exudyn, {solver}", step, 3 if step >= 1e-3 else 1)
 
