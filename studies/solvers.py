@@ -8,17 +8,18 @@ import numpy as np
 
 from references import exudyn_four_bar, ida
 from references.exudyn_four_bar import solve_exudyn
-from references.gear import solve_gear
+from references.gear import STARTS, solve_gear
 from references.ida import solve_ida
 from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
 from studies.runs import Job
-from twoloop import Result, RungeKutta, paper_newmark, solve_dae
+from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.methods import Method
 from twoloop.tableaux import sun_radau_iib
 
-ERR_IN = 1e-9  # the paper's tightest
+ERR_IN = 1e-9  # err_in and ...
+PAPER_TOL = 1e-5  # ... Atol = Rtol of the paper
 INSTANTS = 2001  # output times of solvers that interpolate
 STORED = 5000  # about as many steps of a fixed-step solver are stored
 NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is the row's
@@ -26,6 +27,7 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C = "IDA from C, stabilised"
+PRESETS = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark")  # of twoloop, with their own options
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 
 
@@ -72,8 +74,12 @@ def _paper_irk(problem: Problem, t_end: float, tolerance: float, k: int) -> Resu
     return two_loop(method, problem, t_end, tolerance, k)
 
 
+def _paper_irk_out(problem: Problem, t_end: float, err_out: float, k: int) -> Result:
+    return two_loop(paper_irk(ERR_IN, err_out), problem, t_end, PAPER_TOL, k)
+
+
 def _paper_newmark(beta: float, problem: Problem, t_end: float, err_out: float, k: int) -> Result:
-    return two_loop(paper_newmark(ERR_IN, err_out, beta), problem, t_end, 1e-5, k)
+    return two_loop(paper_newmark(ERR_IN, err_out, beta), problem, t_end, PAPER_TOL, k)
 
 
 def _ida(form: str, problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
@@ -115,11 +121,17 @@ def _gear(order: int, start: str, problem: Problem, t_end: float, step: float, k
     return solve_gear(problem.system, (0.0, t_end), problem.q0, problem.v0, step, order, start=start, t_eval=kept)
 
 
+def gear(order: int, start: str = "accurate") -> str:
+    """Name of the stand-in for ADAMS GSTIFF."""
+    return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
+
+
 def _all() -> Iterator[Solver]:
+    yield Solver(IRK, "err_out", _paper_irk_out, {"err_in": ERR_IN, "tol": PAPER_TOL}, two_loop=True)
     yield Solver(IRK_LINE, "tol", _paper_irk, two_loop=True)
     for name, beta in ((NEWMARK, 0.5), (QUARTER, 0.25)):
         yield Solver(name, "err_out", partial(_paper_newmark, beta), {"err_in": ERR_IN}, two_loop=True)
-    for preset in ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark"):
+    for preset in PRESETS:
         yield Solver(preset, "tol", partial(two_loop, preset), two_loop=True)
     for form in ida.FORMS:
         yield Solver(f"IDA, {form}", "tol", partial(_ida, form))
@@ -138,8 +150,26 @@ def _all() -> Iterator[Solver]:
         run = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius})
         yield Solver(f"Exudyn, GeneralizedAlpha {radius:g}", "h", run, {"spectral_radius": radius})
     for order in GEAR_ORDERS:
-        yield Solver(f"GSTIFF stand-in, order {order}", "h", partial(_gear, order, "accurate"), {"order": order})
-        yield Solver(f"GSTIFF stand-in, order {order}, ramp", "h", partial(_gear, order, "ramp"), {"order": order})
+        for start in STARTS:
+            yield Solver(gear(order, start), "h", partial(_gear, order, start), {"order": order})
 
 
 CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
+
+# one sensible setting of each, for studies that show a run of every solver: two-loop procedures first
+LINE_UP: dict[str, float] = {
+    IRK: 1e-9,
+    NEWMARK: 1e-9,
+    QUARTER: 1e-9,
+    **dict.fromkeys(PRESETS, 1e-8),
+    **{f"IDA, {form}": 1e-8 for form in ida.FORMS},
+    IDA_C: 1e-8,
+    "LSODA, index 1": 1e-8,
+    "DOP853, index 1": 1e-8,
+    "DOP853, projected": 1e-8,
+    "DOP853, Baumgarte 10": 1e-8,
+    **{f"Exudyn, {solver}": 1e-3 for solver in exudyn_four_bar.SOLVERS},
+    "Exudyn, GeneralizedAlpha 0.6": 1e-3,
+    "Exudyn, GeneralizedAlpha 1": 1e-3,
+    **{gear(order): 1e-3 for order in (2, 5)},
+}

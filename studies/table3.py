@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from references import ida
+from studies.index import put_in_index
 from studies.report import REPORTS, Call, load_rows, parse, put_in_readme, save_rows, stamp
 from studies.runs import Job, Truth, collect
 from studies.solvers import CATALOGUE, IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER, two_loop
@@ -135,6 +136,8 @@ def main(words: list[str] | None = None, command: str | None = None) -> None:
         save_rows(path, rows, line)
     report(rows, line, call)
     figure(rows, call)
+    text = f"[Report](table3.md), [rows](table3.csv)\n\n{headline(rows, line)}"
+    put_in_index(call, "table3", __doc__, text, line)
     if call.out == REPORTS:
         put_in_readme(headline(rows, line))
     show(rows)
