@@ -60,6 +60,10 @@ def grows(row: pd.Series, level: str) -> bool:
     return bool(row[f"growth_{level}"] > SLOPE and row[f"late_{level}"] > TIMES * row[f"early_{level}"])
 
 
+def _exponent(row: pd.Series, level: str) -> str:
+    return f"{round(row[f'growth_{level}'], 2) + 0.0:.2f}"  # no minus zero
+
+
 def _named(rows: pd.DataFrame, what: str) -> str:
     return ", ".join(f"{row['solver']} {number(row[what])}" for _, row in rows.iterrows()) or "none"
 
@@ -80,7 +84,7 @@ def summary(rows: pd.DataFrame) -> list[str]:
     lines = [
         f"PaperIRK at the paper's settings violates (35) by at most {number(irk['violation_35'])} and (36) by at most "
         f"{number(irk['violation_36'])} m in {t_end:g} s, and "
-        f"{'they grow' if grows(irk, 'q') else 'they do not grow'} (fit t^{irk['growth_q']:.2f}). The paper: very small, and the "
+        f"{'they grow' if grows(irk, 'q') else 'they do not grow'} (fit t^{_exponent(irk, 'q')}). The paper: very small, and the "
         "amplitude does not increase.",
         f"All {len(ours)} two-loop runs: positions by at most {number(ours['violation_q'].max())}, velocities "
         f"{number(ours['violation_v'].max())}, accelerations {number(ours['violation_a'].max())}; growing: "
@@ -193,9 +197,7 @@ def table(rows: pd.DataFrame) -> list[list[str]]:
             sizes[-1] += " ="
         closure = [number(row["violation_35"]), number(row["violation_36"])]
         exponents = [
-            "–"
-            if pd.isna(row[f"growth_{level}"])
-            else f"{row[f'growth_{level}']:.2f}{' ↑' if grows(row, level) else ''}"
+            "–" if pd.isna(row[f"growth_{level}"]) else f"{_exponent(row, level)}{' ↑' if grows(row, level) else ''}"
             for level in LEVELS
         ]
         ended = row["status"].lower().replace("_", " ")
