@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from references.four_bar_minimal import trajectory
 from tests.problems import worst
-from twoloop import solve_dae
+from twoloop import RungeKutta, solve_dae
 from twoloop.kernels import advance, common
 from twoloop.kernels.partition import full_pivoting
 from twoloop.mechanisms import four_bar
+from twoloop.tableaux import gauss, lobatto_iiie, sun_radau_iib
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -101,3 +102,24 @@ def test_no_single_angle_serves_the_default_linkage_for_a_period(default_four_ba
         assert (np.abs(v[angle]) / moving).min() < 5e-2
     problem = default_four_bar
     assert solve_dae(problem.system, (0.0, 2.25), problem.q0, problem.v0, max_steps=20_000).stats.n_partitions > 1
+
+
+@pytest.mark.parametrize("variables", ["velocities", "momenta"])
+@pytest.mark.parametrize(
+    ("tableau", "reversible"), [(gauss(3), True), (lobatto_iiie(4), True), (sun_radau_iib(3), False)]
+)
+def test_symmetric_tableau_and_partition_go_back_where_they_came_from(
+    collinear_four_bar, variables, tableau, reversible
+):
+    # across partition changes; 12 s there, velocities turned round, 12 s back
+    problem, h = collinear_four_bar, 0.02
+    span = (0.0, 12.0)
+    back = {}
+    for partition in ("symmetric", "lasting"):
+        method = RungeKutta(tableau, variables=variables, partition=partition)
+        there = solve_dae(problem.system, span, problem.q0, problem.v0, method, step_size=h)
+        assert there.success and there.stats.n_partitions > 5
+        home = solve_dae(problem.system, span, there.q[:, -1], -there.v[:, -1], method, step_size=h)
+        back[partition] = worst(home.q[:, -1], problem.q0)
+    assert (back["symmetric"] < 1e-9) == reversible
+    assert back["lasting"] > 1e-7

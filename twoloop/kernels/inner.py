@@ -26,7 +26,7 @@ from twoloop.kernels.partition import RANK_TOLERANCE
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
 ROUNDING = 1e-13  # relative to the largest coordinate: corrections of this size no longer shrink
-DIFFERENCE = 2e-4  # over which Q_d is differenced: of the largest coordinate a second, and seconds
+DIFFERENCE = 2e-4  # see difference_step
 
 
 @compiled
@@ -120,17 +120,20 @@ def _velocity_constraint(f, w, t, q, v, g):
 
 
 @inlined
-def gamma_by_differences(f, w, t, q, v):
-    """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, central differences of order 4.
-
-    The displacement is at most DIFFERENCE times the largest coordinate, and at most DIFFERENCE seconds.
-    """
+def difference_step(q, v):
+    """Seconds over which to difference along the motion: DIFFERENCE, or until q moves by DIFFERENCE max|q|."""
     size = 0.0
     speed = 0.0
     for j in range(v.size):
         size = max(size, abs(q[j]))
         speed = max(speed, abs(v[j]))
-    step = DIFFERENCE * size / speed if speed > size else DIFFERENCE
+    return DIFFERENCE * size / speed if speed > size else DIFFERENCE
+
+
+@inlined
+def gamma_by_differences(f, w, t, q, v):
+    """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, central differences of order 4."""
+    step = difference_step(q, v)
     w.Qd[:] = 0.0
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * step

@@ -28,10 +28,17 @@ from twoloop.kernels.common import (
     inlined,
     kernel,
 )
-from twoloop.kernels.inner import accelerations, acceleration_constraint, dependent_positions, factor_dependent
+from twoloop.kernels.inner import (
+    acceleration_constraint,
+    accelerations,
+    dependent_positions,
+    difference_step,
+    factor_dependent,
+)
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_solve
 from twoloop.kernels.partition import CHANGED, partition_of_midpoint
 from twoloop.kernels.runge_kutta import (
+    FARTHEST,
     GROWTH,
     INNER_TOL,
     MAX_SWEEPS,
@@ -43,9 +50,6 @@ from twoloop.kernels.runge_kutta import (
     interpolate,
     tableau_of,
 )
-
-FARTHEST = 3.0  # largest step ratio over which the old stage polynomials are extrapolated
-MASS_DIFFERENCE = 2e-4  # seconds, or so much of the largest coordinate: over which M is differenced along the motion
 
 # places in `memory`: advance() sets the first after every attempt; then stage blocks (s, n), vectors (n), matrices
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, PARTITION_NUMBER, N_MEMORY_SCALARS = range(7)
@@ -155,11 +159,7 @@ def _velocities(w, tangent, reduced, u, p, v):
 @compiled
 def _mass_rate(f, w, t, q, v, shifted, y):
     """y += M' v, M differenced along the motion (central, order 4); w.L is free where M is not constant."""
-    size, speed = 0.0, 0.0
-    for j in range(q.size):
-        size = max(size, abs(q[j]))
-        speed = max(speed, abs(v[j]))
-    step = MASS_DIFFERENCE * size / speed if speed > size else MASS_DIFFERENCE
+    step = difference_step(q, v)
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * step
         weight = (1.0, -8.0, 8.0, -1.0)[k] / (12.0 * step)

@@ -62,6 +62,7 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def tableau_of(options):
+    """Views of the parameter block: s, A, A A, b, b A, c."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))

@@ -1,0 +1,166 @@
+"""Canonical variables: a symplectic tableau is a symplectic map in (q_i, p_i) and is not in (q_i, v_i)."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.problems import (
+    double_pendulum,
+    double_pendulum_canonical,
+    double_pendulum_state,
+    moving_pivot,
+    moving_pivot_state,
+    oblique_pendulum,
+    oblique_point,
+    oblique_start,
+    oblique_state,
+    oblique_to_point,
+    violations,
+    worst,
+)
+from twoloop import RungeKutta, solve_dae
+from twoloop.kernels import advance, common, momenta
+from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+
+SYMPLECTIC = {"Sun": sun_radau_iib(3), "Gauss": gauss(3), "Lobatto": lobatto_iiie(4), "midpoint": gauss(1)}
+START = np.array([0.7, -0.4, 1.1, -0.6])  # angles and momenta of the double pendulum
+H = 0.1
+DISPLACEMENT = 2e-3
+
+
+def one_step(system, method, state, canonical, z, h=H):
+    """The map of one step in canonical coordinates z = (angles, momenta)."""
+    half = len(z) // 2
+    q, v = state(z[:half], z[half:])
+    result = solve_dae(system, (0.0, h), q, v, method=method, step_size=h)
+    assert result.success and len(result.h) == 1
+    return np.concatenate(canonical(result.q[:, -1], result.v[:, -1]))
+
+
+def symplectic_defect(step, z):
+    """max|J^T Omega J - Omega| of a map, J by central differences of order 4."""
+    n = len(z)
+    J = np.empty((n, n))
+    for k in range(n):
+        moved = [step(z + shift * DISPLACEMENT * np.eye(n)[k]) for shift in (-2, -1, 1, 2)]
+        J[:, k] = (moved[0] - 8.0 * moved[1] + 8.0 * moved[2] - moved[3]) / (12.0 * DISPLACEMENT)
+    half = n // 2
+    omega = np.block([[np.zeros((half, half)), np.eye(half)], [-np.eye(half), np.zeros((half, half))]])
+    return np.abs(J.T @ omega @ J - omega).max()
+
+
+pendulums = cache(double_pendulum)  # compiled once each
+
+
+def defect(method, gamma=True):
+    system = pendulums(gamma)
+    return symplectic_defect(
+        lambda z: one_step(system, method, double_pendulum_state, double_pendulum_canonical, z), START
+    )
+
+
+@pytest.mark.parametrize("name", SYMPLECTIC)
+def test_a_symplectic_tableau_is_symplectic_in_momenta_and_not_in_velocities(name):
+    assert defect(RungeKutta(SYMPLECTIC[name], variables="momenta")) < 1e-8
+    assert defect(RungeKutta(SYMPLECTIC[name])) > 1e-6
+
+
+def test_the_papers_own_loop_is_not_symplectic():
+    assert defect(RungeKutta(sun_radau_iib(3), outer="paper", outer_tol=1e-14)) > 1e-6
+
+
+def test_another_tableau_is_not_symplectic_in_momenta_either():
+    assert defect(RungeKutta(radau_iia(3), variables="momenta")) > 1e-6
+
+
+def test_symplectic_with_gamma_by_differences():
+    assert defect(RungeKutta(sun_radau_iib(3), variables="momenta"), gamma=False) < 1e-8
+
+
+def oblique_from_angle(angle, momentum):
+    across = np.array([np.cos(angle[0]), np.sin(angle[0])])
+    return oblique_state(np.array([0.5 + np.sin(angle[0]), -np.cos(angle[0])]), momentum[0] * across)
+
+
+def angle_of_oblique(q, v):
+    phi = q[1] + 0.3 * q[0]
+    radial, across = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
+    x = q[0] * radial - np.array([0.5, 0.0])
+    u = v[0] * radial + q[0] * (v[1] + 0.3 * v[0]) * across
+    return np.array([np.arctan2(x[0], -x[1])]), np.array([x[0] * u[1] - x[1] * u[0]])
+
+
+@pytest.mark.parametrize("gamma", [True, False])
+def test_symplectic_where_the_mass_matrix_depends_on_the_position(gamma):
+    system = oblique_pendulum(gamma, conservative=True)
+    defects = {
+        variables: symplectic_defect(
+            lambda z, m=method: one_step(system, m, oblique_from_angle, angle_of_oblique, z, 0.2), np.array([1.2, -0.5])
+        )
+        for variables in ("velocities", "momenta")
+        for method in [RungeKutta(sun_radau_iib(3), variables=variables)]
+    }
+    assert defects["momenta"] < 1e-8
+    assert defects["velocities"] > 1e-7
+
+
+def test_momentum_rates_are_the_derivative_of_the_momenta_along_the_motion():
+    # independent of the integrator: p = T^T M v along an accurate run, differenced
+    system = pendulums(True)
+    q, v = double_pendulum_state(START[:2], START[2:])
+    h = 1e-3
+    run = solve_dae(system, (0.0, 4 * h), q, v, "Gauss12", 1e-12, 1e-12, t_eval=h * np.arange(5))
+    work = common.make_work(4, 2)
+    state = np.concatenate([run.q[:, 2], run.v[:, 2], np.zeros(6)])
+    assert advance.start(*system.functions, work, 0.0, state) == common.DONE
+    i, d = work.independent, work.dependent
+
+    def momentum(k):
+        Cq = system.jacobian(0.0, run.q[:, k])
+        T = np.zeros((4, 2))
+        T[i] = np.eye(2)
+        T[d] = -np.linalg.solve(Cq[:, d], Cq[:, i])
+        return T.T @ run.v[:, k]
+
+    rate = (momentum(0) - 8.0 * momentum(1) + 8.0 * momentum(3) - momentum(4)) / (12.0 * h)
+    tangent, reduced, u = np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(4)
+    Mv, shifted, found = np.zeros(4), np.zeros(4), np.zeros(4)
+    q, v = run.q[:, 2].copy(), run.v[:, 2].copy()
+    f = system.functions
+    assert momenta._tangents(f, work, 0.0, q, tangent, reduced, u) == common.DONE
+    momenta._momentum_rates(f, work, 0.0, q, v, tangent, Mv, shifted, found)
+    assert worst(found[i], rate) < 1e-8
+
+
+def test_variable_steps_reach_the_tolerance():
+    start, times = (0.4, 0.0), np.linspace(0.25, 2.0, 8)
+    begin, truth = moving_pivot_state(0.0, start, 2.0), moving_pivot_state(times, start, 2.0)
+    system = moving_pivot(compile=True)
+    for error in ("richardson", "richardson-paper"):
+        for tol, largest in ((1e-6, 1e-5), (1e-9, 1e-8)):
+            method = RungeKutta(gauss(3), error=error, variables="momenta")
+            result = solve_dae(system, (0.0, 2.0), *begin, method, tol, tol, t_eval=times)
+            assert result.success, result.message
+            assert max(worst(result.q, truth[0]), worst(result.v, truth[1])) < largest
+
+
+@pytest.mark.parametrize("gamma", [True, False])
+def test_forces_without_a_potential_and_a_mass_that_depends_on_time_are_right_too(gamma):
+    system, times = oblique_pendulum(gamma), np.linspace(0.0, 5.0, 6)
+    result = solve_dae(
+        system, (0.0, 5.0), *oblique_start(), RungeKutta(gauss(3), variables="momenta"), 1e-10, 1e-10, t_eval=times
+    )
+    x, u = oblique_to_point(result)
+    truth = oblique_point(times)
+    assert worst(x, truth[0]) < 1e-8 and worst(u, truth[1]) < 1e-8
+    assert worst(result.lam[0], truth[2]) < 1e-6
+    assert max(violations(system, result)) < 1e-12
+
+
+def test_steps_that_are_too_long_end_with_a_message():
+    q, v = double_pendulum_state(START[:2], START[2:])
+    method = RungeKutta(gauss(3), variables="momenta")
+    result = solve_dae(pendulums(True), (0.0, 10.0), q, v, method, step_size=1.0)
+    assert not result.success
+    assert "step_size" in result.message
