@@ -233,10 +233,10 @@ def run(call: Call) -> tuple[pd.DataFrame, pd.DataFrame, str]:
     first, _ = truth_of(SWITCHING)
     for name in (SUN, PAPER_IRK, NEWMARK_QUARTER):
         solve_dae(first.system, (0.0, 0.01), first.q0, first.v0, METHODS[name])  # compile once, not in every process
+    line = stamp(call.command)  # before the runs: sources edited meanwhile are not theirs
     keyed = {repr(job): job for job in jobs(call.quick)}
     with KeptRows(call.out / "energy.partial.jsonl", {"quick": call.quick}) as kept:
         rows = kept.collect(keyed, measure)
-        line = stamp(call.command)
         seen = [pd.DataFrame(row.pop("windows")).assign(run=k) for k, row in enumerate(rows)]
         table, series = pd.DataFrame(rows), pd.concat(seen)
         table["verdict"] = [verdict(row) for _, row in table.iterrows()]
