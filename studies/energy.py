@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from studies.energy_report import (
+from studies.energy_drift import (
     GAUSS,
     GAUSS_12,
     LOBATTO,
@@ -31,11 +31,11 @@ from studies.energy_report import (
     Partition,
     Variables,
     Variant,
-    figures,
-    headline,
-    report,
+    drift,
     verdict,
+    windows,
 )
+from studies.energy_report import figures, headline, report
 from studies.kept_rows import KeptRows, Row
 from studies.report import Call, load_rows, parse, save_rows, stamp
 from studies.runs import Truth
@@ -99,13 +99,20 @@ TOLERANCES = {  # Rtol = Atol; for PaperNewmark it is err_out
     LOBATTO: 1e-5,
     RADAU: 1e-5,
 }
+LADDER = (0.015, 0.01)  # s, smaller steps that tell the order of a drift
+LADDERED: list[tuple[str, str, Variant]] = [
+    (ONE, SUN, BASIC),
+    (ONE, RADAU, BASIC),
+    (SWITCHING, SUN, EVEN),
+    (SWITCHING, SUN, MOMENTA_SYMMETRIC),
+    (SWITCHING, SUN, BASIC),
+    (SWITCHING, GAUSS, BASIC),
+]
 CONTROLLED: dict[str, dict[str, list[Variant]]] = {  # what is run with step-size control beside the basic variant
     ONE: {SUN: [MOMENTA_LASTING]},
     SWITCHING: {GAUSS: [EVEN]},
 }
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period between samples: no fraction of few parts, so no phase is left out
-WINDOWS = 100  # at most, in which the energy error is averaged
-BLOCKS = 10  # of windows; the scatter of their slopes is the uncertainty of the slope
 
 
 @dataclass(frozen=True)
@@ -123,7 +130,8 @@ class EnergyJob:
 
 def jobs(quick: bool) -> Iterator[EnergyJob]:
     """All runs, the long ones first so that no core waits at the end."""
-    for t_end in QUICK if quick else (LONG, SHORT):
+    long, short = QUICK if quick else (LONG, SHORT)
+    for t_end in (long, short):
         for geometry in GEOMETRIES:
             for solver, tol in TOLERANCES.items():
                 for variant in (BASIC, *CONTROLLED[geometry].get(solver, [])):
@@ -132,6 +140,9 @@ def jobs(quick: bool) -> Iterator[EnergyJob]:
                 h = H_ORDER_2 if solver in (MIDPOINT, NEWMARK_QUARTER, NEWMARK_HALF) else H
                 for variant in variants:
                     yield EnergyJob(geometry, t_end, solver, h, None, *variant)
+    for geometry, solver, variant in LADDERED:
+        for h in LADDER:
+            yield EnergyJob(geometry, short, solver, h, None, *variant)
 
 
 @cache
@@ -159,31 +170,6 @@ def instants(job: EnergyJob, period: float) -> Array | None:
         interval = job.h * float(strides[np.abs(strides * job.h / period % 1.0 - GOLDEN).argmin()])
     n_intervals = int(job.t_end / interval * (1.0 - 1e-12))
     return interval * np.arange(n_intervals + 1, dtype=np.float64)
-
-
-def windows(t: Array, error: Array, period: float, t_end: float) -> dict[str, Array]:
-    """Mean, range and largest magnitude of the energy error in windows of whole periods, WINDOWS or fewer."""
-    width = math.ceil(t_end / WINDOWS / period) * period
-    edges = width * np.arange(int(t[-1] / width) + 1)
-    parts = np.split(error, np.searchsorted(t, edges))[1:-1]
-    return {
-        "t": edges[:-1] + 0.5 * width,
-        "mean": np.array([part.mean() for part in parts]),
-        "range": np.array([np.ptp(part) for part in parts]),
-        "largest": np.array([np.abs(part).max() for part in parts]),
-    }
-
-
-def drift(t: Array, mean: Array) -> tuple[float, float]:
-    """Slope of the windows' means by least squares, and its standard error from the slopes of BLOCKS parts.
-
-    The scatter between blocks is right for a random walk, to which the residuals of one line would be blind, and
-    errs on the safe side for an oscillation.
-    """
-    slope = float(np.polyfit(t, mean, 1)[0])
-    parts = np.array_split(np.arange(t.size), BLOCKS)
-    slopes = [np.polyfit(t[part], mean[part], 1)[0] for part in parts]
-    return slope, float(np.std(slopes, ddof=1) / math.sqrt(BLOCKS))
 
 
 def measure(job: EnergyJob) -> Row:
@@ -237,7 +223,7 @@ def run(call: Call) -> tuple[pd.DataFrame, pd.DataFrame, str]:
     keyed = {repr(job): job for job in jobs(call.quick)}
     with KeptRows(call.out / "energy.partial.jsonl", {"quick": call.quick}) as kept:
         rows = kept.collect(keyed, measure)
-        seen = [pd.DataFrame(row.pop("windows")).assign(run=k) for k, row in enumerate(rows)]
+        seen = [pd.DataFrame(row.pop("windows")).drop(columns="range").assign(run=k) for k, row in enumerate(rows)]
         table, series = pd.DataFrame(rows), pd.concat(seen)
         table["verdict"] = [verdict(row) for _, row in table.iterrows()]
         save_rows(call.out / "energy.csv", table, line)

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from studies import energy
-from studies.energy import EnergyJob, drift, instants, measure, windows
-from studies.energy_report import (
+from studies.energy import EnergyJob, instants, measure
+from studies.energy_drift import (
     CREEPS,
     DRIFTS,
     GAUSS,
@@ -28,9 +28,11 @@ from studies.energy_report import (
     VELOCITIES_LASTING,
     VELOCITIES_SYMMETRIC,
     WANDERS,
+    drift,
     pick,
     times_less,
     verdict,
+    windows,
 )
 from studies.report import load_rows, save_rows
 
