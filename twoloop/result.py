@@ -41,6 +41,8 @@ class Statistics:
         Coordinate partitionings, the first included.
     n_factorizations : int or None
         Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, and of the partitionings.
+    n_jacobians : int or None
+        Times the derivatives of the right side were made for Newton's method in the outer loop.
     cpu_time : float
         Process time of the integration, s; compilation and checks of the input not included.
     """
@@ -53,6 +55,7 @@ class Statistics:
     n_evaluations: int | None = None
     n_partitions: int | None = None
     n_factorizations: int | None = None
+    n_jacobians: int | None = None
     cpu_time: float = 0.0
 
 

@@ -278,6 +278,7 @@ class _Run:
             n_evaluations=int(c[common.N_EVALUATIONS]),
             n_partitions=int(c[common.N_PARTITIONS]),
             n_factorizations=int(c[common.N_FACTORIZATIONS]),
+            n_jacobians=int(c[common.N_JACOBIANS]),
             cpu_time=cpu,
         )
 

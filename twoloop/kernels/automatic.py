@@ -1,8 +1,8 @@
 """The outer loop by fixed point where that is enough, by Newton's method where stiffness would make it crawl.
 
-The evaluations that a second of motion costs are measured over windows of accepted steps. A run starts with sweeps. When
-these converge slowly, Newton's method is tried for a window, and kept if it costs GAIN times fewer evaluations; after
-many windows of it sweeps are tried again. What is not kept is next tried after twice as many windows.
+The evaluations that a second of motion costs are measured over windows of accepted steps. A run starts with sweeps.
+When these converge slowly, Newton's method is tried for a window, and kept if it costs GAIN times fewer evaluations;
+after many windows of it sweeps are tried again. What is not kept is next tried after twice as many windows.
 """
 
 import numpy as np

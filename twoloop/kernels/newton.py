@@ -347,7 +347,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 @compiled
 def _estimate(w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
     """Largest component, over atol + rtol |value|, of the embedded error estimate, filtered for stiff components."""
-    s, A, A2, _, _, c = tableau_of(options)
+    s, A, _, _, _, _ = tableau_of(options)
     n = q.size
     m = w.independent.size
     place = _eigen(options, s)
