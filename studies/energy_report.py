@@ -318,10 +318,11 @@ def _notes(rows: pd.DataFrame) -> str:
             f"{rows[rows['geometry'] == name]['kinetic'].iloc[0]:.3g} J ({name})" for name in (ONE, SWITCHING)
         )
         + ".",
-        "**Energy error** is E(t) − E(0). Long runs store it at intervals of 0.382 of a period (with fixed steps, the "
-        "multiple of h nearest to that golden section), so that samples spread evenly over the phases and a sampling beat is "
-        "not taken for a drift. Runs with step-size control land on these instants, which shortens up to two steps in each "
-        "interval and is part of the run measured; fixed steps are not changed by it. Short runs store every step and land nowhere.",
+        "**Energy error** is E(t) − E(0). Long runs store it at intervals of 0.382 of a period, the golden section, or with "
+        "fixed steps of a quarter of that, rounded to a multiple of h, so that samples spread evenly over the phases and a "
+        "beat of samples and period is not taken for a drift. Runs with step-size control land on these instants, which "
+        "shortens up to two steps in each interval and is part of the run measured; fixed steps are not changed by it. Short "
+        "runs store every step and land nowhere else.",
         f"**Drift** is the slope of a least-squares line through the means of {int(windows[ONE])} ({ONE}) and "
         f"{int(windows[SWITCHING])} ({SWITCHING}) windows of whole periods. Its standard error comes from the slopes in ten "
         "equal parts of the run (their standard deviation over √10): right for a random walk, whose increments in the ten parts are "
