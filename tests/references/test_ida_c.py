@@ -12,6 +12,7 @@ from references import ida_c, sundials
 from references.four_bar_minimal import trajectory
 from references.ida import solve_ida
 from references.ida_c import OUTPUTS, solve_ida_c
+from references.ida_compiled import iteration_matrix_at, residual_at
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.result import Status
@@ -118,18 +119,18 @@ def test_jacobian_is_that_of_the_residual(system):
     n, m, f = system.n_q, system.n_c, system.functions
     rng = np.random.default_rng(5)
     t, cj, y, yp = 0.3, 7.0, rng.normal(size=2 * (n + m)), rng.normal(size=2 * (n + m))
-    residual = ida_c._residual(*f[:5], n, m, system.constant_mass)
-    matrix = ida_c._iteration_matrix(residual, f.mass, f.force, f.jacobian, n, m, system.constant_mass)
+    residual = residual_at(*f[:5], n, m, system.constant_mass)
+    matrix = iteration_matrix_at(*f[:5], n, m, system.constant_mass, None)
     space = system.parameters, system.mass(t, y[:n]), np.zeros((m, n))
 
-    def residual_at(y, yp):
+    def value(y, yp):
         residual(t, y, yp, *space, res := np.zeros(y.size))
         return res
 
     computed = np.zeros((y.size, y.size))
-    matrix(t, cj, y, yp, residual_at(y, yp), *space, np.zeros(y.size), np.zeros(y.size), computed)
+    matrix(t, cj, y, yp, *space, np.zeros((n, n)), *np.zeros((3, y.size)), computed)
     for j, e in enumerate(1e-5 * np.eye(y.size)):
-        column = (residual_at(y + e, yp + cj * e) - residual_at(y - e, yp - cj * e)) / 2e-5
+        column = (value(y + e, yp + cj * e) - value(y - e, yp - cj * e)) / 2e-5
         assert np.abs(computed[j] - column).max() < 1e-5
 
 
