@@ -1,0 +1,2 @@
+def headline(*a): return ""
+def report(*a): pass
