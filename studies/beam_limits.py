@@ -249,9 +249,7 @@ def modulus_rows(quick: bool) -> Iterator[Row]:
 
 
 def _run(problem: Problem, method: str | Method, tol: float, times: Array) -> Result:
-    return solve_dae(
-        problem.system, (0.0, float(times[-1])), problem.q0, problem.v0, method, tol, tol, t_eval=times
-    )
+    return solve_dae(problem.system, (0.0, float(times[-1])), problem.q0, problem.v0, method, tol, tol, t_eval=times)
 
 
 def sensitivity(quick: bool) -> dict[str, Array]:
