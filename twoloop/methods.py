@@ -149,11 +149,11 @@ class RungeKutta:
             self.partition == "symmetric",
         )
         if self.outer == "newton":
-            from twoloop.kernels import newton
+            from twoloop.kernels import newton, newton_memory
 
             extra = newton.newton_options(tableau.A, tableau.b, tableau.c)
-            n_eigen = int(extra[newton.N_REAL] + extra[newton.N_PAIRS])
-            memory = np.zeros(newton.memory_size(n_eigen, tableau.stages, n_q))
+            n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
+            memory = np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q))
             return Plan(newton.newton_step, np.concatenate([options, extra]), memory, 1.0 / (tableau.stages + 1))
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         step = kernels.STEPS[self.outer]
