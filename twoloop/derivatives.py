@@ -1,4 +1,4 @@
-"""Is what a system says about itself true? C_q, C_t and Q_d against differences of C, a constant M against another M.
+"""Is what a system says about itself true? C_q, C_t and Q_d against differences of C, a constant M, the bandwidth.
 
 A wrong sign in one of them often runs to the end and looks like a motion. Each system is looked at once.
 """
@@ -59,7 +59,45 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
         there = system.mass(t + 1.0, q + 0.1 * v)
         if np.isfinite(there).all() and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
             raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+    if system.bandwidth is not None:
+        _check_bandwidth(system, system.bandwidth, t, q + 1e-3 * v, v, 1e-3 * size)
     system.checked = True
+
+
+def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array, v: Array, shift: float) -> None:
+    """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
+
+    def refuse(what: str, i: int, j: int, value: float) -> None:
+        raise ValueError(
+            f"bandwidth of {system.name!r} is said to be {bandwidth}, but {what} has the entry ({i}, {j}) = "
+            f"{value:.6g}. Give at least {abs(i - j)} if that is the farthest, number the coordinates otherwise, or "
+            "leave bandwidth out"
+        )
+
+    far = np.abs(np.subtract.outer(np.arange(system.n_q), np.arange(system.n_q))) > bandwidth
+    matrix = np.where(far, system.mass(t, q), 0.0)
+    if matrix.any():
+        i, j = np.argwhere(matrix)[0]
+        refuse("M", i, j, matrix[i, j])
+    try:
+        base, rows = system.force(t, q, v), system.jacobian(t, q)
+        for j in range(system.n_q):
+            step = np.zeros(system.n_q)
+            step[j] = shift
+            changes = {
+                "the derivative of force by q": system.force(t, q + step, v) - base,
+                "the derivative of force by v": system.force(t, q, v + step) - base,
+            }
+            for k, change in enumerate(system.jacobian(t, q + step) - rows):
+                changes[f"the second derivative of constraint {k} by q"] = change
+            for what, change in changes.items():
+                level = ROUNDING * np.abs(base if "force" in what else rows).max()
+                beyond = np.where(far[:, j] & np.isfinite(change), np.abs(change), 0.0)
+                if beyond.max() > level:
+                    i = int(beyond.argmax())
+                    refuse(what, i, j, float(change[i]) / shift)
+    except ArithmeticError:  # outside what the callbacks are made for
+        return
 
 
 def _forward(values: list[Array], e: float) -> Array:
