@@ -143,13 +143,17 @@ def test_order_on_nonlinear_constraints(monkeypatch):
 
 
 def test_chosen_by_size():
-    def chosen(problem):
-        plan = NEWTON.plan(problem.system.n_q, 1e-6, 1e-6, True)
-        run = solve_module._Run(problem.system, plan, 0.0, problem.q0, problem.v0, 1e-6, 1e-6, 1e-3)
+    def chosen(system, q0, v0):
+        run = solve_module._Run(system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, 1e-6, 1e-3)
         return int(run.functions.flags[common.BANDWIDTH])
 
-    assert chosen(very_flexible_beam(4)) == -1
-    assert chosen(very_flexible_beam(16)) == 11
+    for n_elements, bandwidth in ((4, -1), (16, 11)):
+        problem = very_flexible_beam(n_elements)
+        assert chosen(problem.system, problem.q0, problem.v0) == bandwidth
+    assert chosen(*chain(12)) == 3
+    assert chosen(*chain(12, lumped=True)) == -1
+    assert chosen(*chain(24, lumped=True)) == 3
+    assert chosen(*chain(24, bandwidth=None)) == -1
 
 
 def test_beam_gives_the_same_run_as_dense(monkeypatch):

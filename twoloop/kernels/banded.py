@@ -10,12 +10,15 @@ from twoloop.kernels.common import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFI
 from twoloop.kernels.lapack import DPBTRF, DPBTRS, NO_TRANSPOSE, UPPER, call
 from twoloop.kernels.linalg import lu_factor, lu_solve
 
-BANDED_FROM = 1.0  # coordinates for each diagonal of the LU (3 b + 1 and two for each constraint)
+# From so many coordinates on banded algebra is the faster one; measured on chains of bandwidth 1 to 20, whatever it is
+BANDED_FROM = 16
+BANDED_FROM_DIAGONAL = 48  # of M, with which dense algebra costs little
 
 
-def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Whether banded linear algebra is faster than dense; also means that it fits into the memory of the dense."""
-    return n_q >= BANDED_FROM * (3 * bandwidth + 1 + 2 * n_c)
+def banded_pays(n_q: int, n_c: int, bandwidth: int, diagonal: bool) -> bool:
+    """Whether banded linear algebra is faster than dense, and fits into the memory that is there for the dense."""
+    fits = n_q >= 3 * bandwidth + 1 + 2 * n_c
+    return fits and n_q >= (BANDED_FROM_DIAGONAL if diagonal else BANDED_FROM)
 
 
 @inlined

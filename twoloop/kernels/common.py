@@ -73,6 +73,7 @@ class Work(NamedTuple):
     S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its factors
     W: Any  # (n_q, n_c) Cq^T; where M is banded M^-1 Cq^T, column after column
     Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences); scratch for full pivoting
+    Cq_of_S: Any  # (n_c, n_q) the Cq that S and W belong to, where M is banded; NaN: none
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     C: Any  # (n_c) constraint, and corrections
@@ -90,7 +91,7 @@ class Work(NamedTuple):
 
 
 _INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters", "lapack")
-_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx")
+_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx", "Cq_of_S")
 WORK = types.NamedTuple(
     [MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields],
     Work,
@@ -178,6 +179,7 @@ def make_work(n_q: int, n_c: int) -> Work:
         W=np.zeros((n_q, n_c)),
         Cq=np.zeros((n_c, n_q)),
         Cqx=np.zeros((n_c, n_q)),
+        Cq_of_S=np.full((n_c, n_q), np.nan),
         Q=np.zeros(n_q),
         x=np.zeros(n_q),
         C=np.zeros(n_c),

@@ -7,7 +7,6 @@ import numpy as np
 
 from twoloop.kernels.banded import banded_mass, factor_banded_mass, inverse_mass_border, solve_banded_mass
 from twoloop.kernels.common import (
-    BANDWIDTH,
     CONSTANT_MASS,
     DIAGONAL_MASS,
     DONE,
@@ -36,6 +35,15 @@ def _finite(A):
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
             if not np.isfinite(A[i, j]):
+                return False
+    return True
+
+
+@inlined
+def _equal(A, B):
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            if A[i, j] != B[i, j]:  # also true for NaN
                 return False
     return True
 
@@ -179,7 +187,7 @@ def _times_inverse_mass(f, w, x):
     if f.flags[DIAGONAL_MASS] == 1:
         for j in range(x.size):
             x[j] *= w.L[j, j]
-    elif f.flags[BANDWIDTH] >= 0:
+    elif banded_mass(f):
         solve_banded_mass(f, w, 1, x)
     else:
         ldl_solve(w.L, x)
@@ -223,6 +231,24 @@ def _schur_complement(f, w):
 
 
 @inlined
+def _factor_schur_complement(f, w):
+    """S and its factors; where M is banded only if C_q has changed, as that of linear constraints never does."""
+    banded = banded_mass(f)
+    if banded:
+        if _equal(w.Cq, w.Cq_of_S):
+            return DONE
+        w.Cq_of_S[0, 0] = np.nan
+    _schur_complement(f, w)
+    w.counters[N_FACTORIZATIONS] += 1
+    if not ldl_factor(w.S):
+        return SINGULAR if _finite(w.S) else NOT_FINITE
+    if banded:
+        for i in range(w.C.size):
+            copy(w.Cq[i], w.Cq_of_S[i])
+    return DONE
+
+
+@inlined
 def _accelerations(f, w, t, q, v, a, lam):
     """Eqs. (6)-(8); needs C_q(t, q) in w.Cq."""
     n_c, n_q = w.Cq.shape
@@ -235,10 +261,9 @@ def _accelerations(f, w, t, q, v, a, lam):
     acceleration_constraint(f, w, t, q, v)
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
-    _schur_complement(f, w)
-    w.counters[N_FACTORIZATIONS] += 1
-    if not ldl_factor(w.S):
-        return SINGULAR if _finite(w.S) else NOT_FINITE
+    code = _factor_schur_complement(f, w)
+    if code != DONE:
+        return code
     copy(w.Q, w.x)
     _times_inverse_mass(f, w, w.x)
     for i in range(n_c):
