@@ -16,6 +16,11 @@ def worst(a, b):
     return float(np.abs(np.asarray(a) - np.asarray(b)).max())
 
 
+def slope(f, e=1e-3):
+    """df(s)/ds at s = 0, central differences of order 4."""
+    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
+
+
 # --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
 
 

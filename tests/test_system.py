@@ -11,6 +11,7 @@ from tests.problems import (
     oblique_pendulum,
     oblique_start,
     pendulum,
+    slope,
     worst,
 )
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
@@ -19,10 +20,6 @@ from twoloop.mechanisms import four_bar
 numbers = st.floats(-2.0, 2.0)
 vectors = st.tuples(numbers, numbers).map(np.array)
 SYSTEMS = {"moving pivot": moving_pivot(), "oblique": oblique_pendulum(), "pendulum": pendulum()}
-
-
-def slope(f, e=1e-3):
-    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

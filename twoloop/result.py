@@ -41,6 +41,8 @@ class Statistics:
         Coordinate partitionings, the first included.
     n_factorizations : int or None
         Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, and of the partitionings.
+    n_jacobians : int or None
+        Times the derivatives of the right side were made for Newton's method in the outer loop.
     cpu_time : float
         Process time of the integration, s; compilation and checks of the input not included.
     """
@@ -53,6 +55,7 @@ class Statistics:
     n_evaluations: int | None = None
     n_partitions: int | None = None
     n_factorizations: int | None = None
+    n_jacobians: int | None = None
     cpu_time: float = 0.0
 
 
@@ -76,6 +79,13 @@ class Result:
         What happened and, after a failure, what to try.
     stats : Statistics
         Counts and CPU time.
+    rejected_error, rejected_convergence : ndarray of int (n_accepted,) or None
+        Attempts that failed the error test, and those whose loops did not converge, between the acceptance of the step
+        before (or the start) and that of this one. Those after the last accepted step of a failed run are in `stats`
+        alone. None where a foreign solver does not tell.
+    partitioned : ndarray of int (n_accepted,) or None
+        How often the coordinates were partitioned anew in the same interval; the partition at the start of the run
+        is not among them. None where a foreign solver has none.
     sol, t_events
         None: dense output and events are not available yet.
     """
@@ -89,6 +99,9 @@ class Result:
     status: Status
     message: str
     stats: Statistics
+    rejected_error: NDArray[np.int64] | None = None
+    rejected_convergence: NDArray[np.int64] | None = None
+    partitioned: NDArray[np.int64] | None = None
     sol: Callable[[float], Array] | None = None
     t_events: list[Array] | None = None
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from references.four_bar_minimal import MinimalFourBar
-from tests.problems import one_angle, violations, worst
+from tests.problems import one_angle, slope, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -30,11 +30,6 @@ def system_of(L1, L2, L3, ground):
     system = four_bar().system
     system.parameters[:] = L1, L2, L3, ground
     return system
-
-
-def slope(f, e=1e-3):
-    """df(s)/ds at s = 0, central differences of order 4."""
-    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
 
 
 @given(lengths, lengths, lengths, lengths, states, states)

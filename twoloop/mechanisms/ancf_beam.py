@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from twoloop.callbacks import callback
 from twoloop.checks import check_number, check_positive, check_size
 from twoloop.mechanisms.ancf_element import (
+    FALL,
     FOURTH,
     LAME,
     LENGTH,
@@ -25,7 +26,6 @@ from twoloop.mechanisms.ancf_element import (
     SECOND,
     SHEAR,
     STIFFNESS,
-    WEIGHT,
     elastic_energy,
     elastic_tangent,
     force,
@@ -44,6 +44,7 @@ __all__ = [
 ]
 
 GRAVITY = 9.81  # m/s^2
+STARTS = {"node": "only the base node moving (start='node')", "beam": "all of it moving (start='beam')"}
 
 # p: the parameters of the elements, then those of the base's motion
 AMPLITUDE, FREQUENCY, N_PARAMETERS = range(N_ELEMENT_PARAMETERS, N_ELEMENT_PARAMETERS + 3)
@@ -123,7 +124,7 @@ def ancf_beam(
         If an argument is out of range.
     """
     n_elements = check_size("n_elements", n_elements, 1)
-    if start not in ("node", "beam"):
+    if start not in tuple(STARTS):
         raise ValueError(
             f"start must be 'node' (the base node moves, the others rest) or 'beam' (all of it moves with the base); "
             f"given {start!r}. The base moves at t = 0: nothing else is consistent with it"
@@ -158,10 +159,10 @@ def ancf_beam(
     p[LENGTH] = l
     p[[STIFFNESS, LAME, SHEAR]] = (lame + 2.0 * shear) * area, lame * area, shear * area
     p[[SECOND, FOURTH]] = height**2 / 12.0, height**4 / 80.0
-    p[[MASS, WEIGHT]] = density * area, gravity
+    p[[MASS, FALL]] = density * area, gravity
     p[[AMPLITUDE, FREQUENCY]] = amplitude, angular_frequency
 
-    name = f"beam of {n_elements} ANCF element{'s' if n_elements > 1 else ''}, E = {youngs_modulus:g} N/m^2"
+    name = f"ANCF beam, {n_elements} elements, E = {youngs_modulus:g} N/m^2, start={start!r}"
     system = ConstrainedSystem(
         n_q=6 * (n_elements + 1),
         n_c=2,
@@ -197,26 +198,24 @@ def ancf_beam(
         t_span=(0.0, 2.0),
         energy=energy,
         parameters={"n_elements": n_elements, "start": start, **parameters},
-        note=f"assumed, as the papers do not say: straight along x at the start, gravity across it, {_STARTS[start]}",
+        note=f"start assumed, the paper's text does not tell it: straight along x, gravity across it, {STARTS[start]}",
     )
 
 
-_STARTS = {"node": "only the base node moving (start='node')", "beam": "the whole beam moving (start='beam')"}
-
-
 def very_flexible_beam(n_elements: int = 4, start: str = "node") -> Problem:
-    """The beam of 2e6 N/m^2 on a base that moves by -0.02 m sin(10 pi t); see `ancf_beam`.
+    """The paper's beam of 2e6 N/m^2 on a base that moves by -0.02 m sin(10 pi t); see `ancf_beam`.
 
     With 4 elements the straight beam's frequencies reach from 0 (it turns about the pin) over 1.771, 6.220 and 14.75 to
     3358.5 rad/s. The lowest bending frequency is 19 % above Euler and Bernoulli's 1.4836 rad/s: (lambda + 2 mu)/E =
     1.346 on the bending stiffness by locking, another 1.059 by the coarse mesh, and 1.194^2 = 1.346 x 1.059.
-    Its large motion is not converged with 4 elements either.
+    Its large motion is not converged either: with 4, 8 and 16 elements the tip's height at 1 s is 0.301, 0.001 and
+    -0.091 m.
     """
     return ancf_beam(n_elements, start, youngs_modulus=2e6, amplitude=-0.02, angular_frequency=10.0 * math.pi)
 
 
 def moderately_stiff_beam(n_elements: int = 4, start: str = "node") -> Problem:
-    """The beam of 2e8 N/m^2 on a base that moves by -0.01 m sin(2 pi t); see `ancf_beam`.
+    """The paper's beam of 2e8 N/m^2 on a base that moves by -0.01 m sin(2 pi t); see `ancf_beam`.
 
     Its frequencies are ten times those of `very_flexible_beam`, up to 33585 rad/s.
     """

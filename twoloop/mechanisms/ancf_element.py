@@ -22,8 +22,9 @@ from twoloop.callbacks import callback
 from twoloop.kernels.common import MATRIX, VECTOR, compiled
 from twoloop.mechanisms.problem import Array
 
-# places in p; stiffnesses and mass are those of a unit of length, N and kg/m
-LENGTH, STIFFNESS, LAME, SHEAR, SECOND, FOURTH, MASS, WEIGHT, N_ELEMENT_PARAMETERS = range(9)
+# places in p: length of an element; lambda + 2 mu, lambda and mu times the area of the cross-section, N; means of y^2
+# and y^4 over the thickness; mass of a unit of length, kg/m; gravity along -y, m/s^2
+LENGTH, STIFFNESS, LAME, SHEAR, SECOND, FOURTH, MASS, FALL, N_ELEMENT_PARAMETERS = range(9)
 
 
 def _gauss_points() -> Array:
@@ -43,7 +44,7 @@ def _resultants(sx, sy, kx, ky, dx, dy, p):
     eps_11 = axial + y s.k + y^2 kk, eps_22 = thick, 2 eps_12 = s.d + y k.d; their parts have the resultants n0, n1,
     n2, m0, g0, g1.
     """
-    j2, j4 = p[SECOND], p[FOURTH]  # means of y^2 and y^4 over the thickness
+    j2, j4 = p[SECOND], p[FOURTH]
     axial = 0.5 * (sx * sx + sy * sy - 1.0)
     kk = 0.5 * (kx * kx + ky * ky)
     thick = 0.5 * (dx * dx + dy * dy - 1.0)
@@ -204,7 +205,7 @@ def mass(t, q, p, M):
 @callback("force")
 def force(t, q, v, p, Q):
     l = p[LENGTH]
-    weight = p[MASS] * l * p[WEIGHT]
+    weight = p[MASS] * l * p[FALL]
     for first in range(0, q.size - 6, 6):
         Q[first + 1] -= weight / 2.0
         Q[first + 3] -= weight * l / 12.0
@@ -215,7 +216,7 @@ def force(t, q, v, p, Q):
 
 @njit(types.void(types.float64, VECTOR, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy")
 def elastic_tangent(t, q, v, p, K):
-    """Add dQ/dq of `force` at q to K (n_q, n_q): symmetric, blocks of 6 beside the diagonal, zero from gravity."""
+    """Derivative dQ/dq of `force`, into K (n_q, n_q) full of zeros: symmetric, and only neighbouring nodes couple."""
     for first in range(0, q.size - 6, 6):
         element_tangent(q[first : first + 12], p, K[first : first + 12, first : first + 12])
 

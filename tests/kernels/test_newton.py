@@ -1,0 +1,164 @@
+"""The outer loop by Newton's method: the same steps as sweeps make, and stiff problems that sweeps cannot make."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from tests.problems import G, moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, violations, worst
+from twoloop import ConstrainedSystem, RungeKutta, solve_dae
+from twoloop.mechanisms import four_bar, moderately_stiff_beam
+from twoloop.methods import PRESETS
+from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+
+TABLEAUX = {
+    tableau.name: tableau
+    for tableau in (*map(gauss, (1, 3, 4, 8)), radau_iia(2), radau_iia(3), sun_radau_iib(3), lobatto_iiie(4))
+}
+
+
+@cache
+def stiff_spring(stiffness, damping=0.0):
+    """A mass on a rigid rod, and a second one on a stiff spring from the first: n_q = 4, one constraint."""
+
+    def force(t, q, v):
+        d, u = q[2:] - q[:2], v[2:] - v[:2]
+        length = np.sqrt(d[0] * d[0] + d[1] * d[1])
+        pull = (stiffness * (length - 1.0) + damping * (d[0] * u[0] + d[1] * u[1]) / length) / length
+        return np.array([pull * d[0], pull * d[1] - 9.81, -pull * d[0], -pull * d[1] - 9.81])
+
+    return ConstrainedSystem.from_python(
+        n_q=4,
+        n_c=1,
+        mass=np.eye(4),
+        force=force,
+        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
+        gamma=lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])]),
+        compile=True,
+        name="stiff spring",
+    )
+
+
+SPRING_START = (np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4))
+SPRING_TIMES = np.linspace(0.0, 1.0, 5)
+
+
+@cache
+def stiff_spring_truth(stiffness):
+    """q at SPRING_TIMES by SciPy's Radau on the equations for (angle of the rod, x, y of the second mass)."""
+
+    def rate(t, y):
+        (angle, x, z), u = y[:3], y[3:]
+        d = np.array([x - np.cos(angle), z - np.sin(angle)])
+        pull = stiffness * (1.0 - 1.0 / np.hypot(*d)) * d
+        across = np.array([-np.sin(angle), np.cos(angle)])
+        return np.concatenate([u, [across @ (pull - [0.0, G])], -pull - [0.0, G]])
+
+    start = [0.0, 2.0, 0.0, 0.0, 0.0, 0.0]
+    y = solve_ivp(rate, (0.0, 1.0), start, "Radau", rtol=1e-10, atol=1e-12, t_eval=SPRING_TIMES).y
+    return np.array([np.cos(y[0]), np.sin(y[0]), y[1], y[2]])
+
+
+@pytest.mark.parametrize("name", TABLEAUX)
+@pytest.mark.parametrize("system", ["constant mass", "mass and damping that vary"])
+def test_newton_and_sweeps_make_the_same_steps(name, system):
+    if system == "constant mass":
+        problem = moving_pivot(), *moving_pivot_state(0.0)
+    else:
+        problem = oblique_pendulum(), *oblique_start()
+    runs = [
+        solve_dae(problem[0], (0.0, 1.0), *problem[1:], RungeKutta(TABLEAUX[name], outer=outer), step_size=0.025)
+        for outer in ("fixed-point", "newton", "auto")
+    ]
+    assert all(run.success for run in runs)
+    assert worst(runs[1].q, runs[0].q) < 1e-10 and worst(runs[1].v, runs[0].v) < 1e-9
+    assert (runs[2].q == runs[0].q).all()  # nothing stiff here
+
+
+@pytest.mark.parametrize("name", ["Radau IIA(3)", "Gauss(4)", "Sun Radau IIB(3)"])
+def test_a_stiff_spring(name):
+    truth = stiff_spring_truth(1e6)
+    errors, evaluations = [], []
+    for tol in (1e-4, 1e-6, 1e-8):
+        method = RungeKutta(TABLEAUX[name], outer="newton")
+        result = solve_dae(stiff_spring(1e6), (0.0, 1.0), *SPRING_START, method, tol, tol, t_eval=SPRING_TIMES)
+        assert result.success, result.message
+        assert max(violations(stiff_spring(1e6), result)) < 1e-12
+        errors.append(worst(result.q, truth))
+        evaluations.append(result.stats.n_evaluations)
+    assert errors[0] < 1e-3 and errors[1] < 1e-5 and errors[2] < 1e-7
+    assert evaluations[0] < 6_000  # sweeps: more than 30 000 at any tolerance
+
+
+def test_stiffness_does_not_hold_radau_back():
+    # 1000 times the frequency, and not ten times the steps
+    counts = {}
+    for stiffness in (1e2, 1e8):
+        result = solve_dae(stiff_spring(stiffness), (0.0, 1.0), *SPRING_START, "RadauIIA5", 1e-4, 1e-4)
+        assert result.success
+        counts[stiffness] = result.stats.n_accepted
+    assert counts[1e8] < 20 * counts[1e2]
+
+
+def test_damping_enters_the_derivatives():
+    # overdamped: without J_v Newton's method could not converge at these steps
+    system = stiff_spring(1e4, 1e4)
+    result = solve_dae(system, (0.0, 1.0), *SPRING_START, RungeKutta(radau_iia(3), outer="newton"), step_size=0.005)
+    fine = solve_dae(system, (0.0, 1.0), *SPRING_START, RungeKutta(radau_iia(3), outer="newton"), step_size=0.001)
+    assert result.success and fine.success
+    assert worst(result.q[:, -1], fine.q[:, -1]) < 1e-4
+    assert result.stats.n_outer < 10 * result.stats.n_accepted
+
+
+def test_derivatives_are_reused_while_newton_converges(default_four_bar):
+    problem = default_four_bar
+    result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, RungeKutta(gauss(3), outer="newton"))
+    assert result.success
+    assert 0 < result.stats.n_jacobians < 0.7 * result.stats.n_accepted
+
+
+def test_partitions_change_under_newton_too(collinear_four_bar):
+    problem = collinear_four_bar
+    truth = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11)
+    result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, RungeKutta(gauss(4), outer="newton"))
+    assert result.success and result.stats.n_partitions > 3
+    assert worst(result.q[:, -1], truth.q[:, -1]) < 1e-5
+
+
+# --- outer="auto"
+
+
+def test_auto_is_the_default_of_sunradau5_and_newton_that_of_radau():
+    assert PRESETS["SunRadau5"].outer == "auto"
+    assert PRESETS["RadauIIA5"].outer == "newton"
+
+
+@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-8])
+def test_auto_pays_for_no_derivatives_where_nothing_is_stiff(tol):
+    problem = four_bar()
+    runs = [
+        solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, RungeKutta(sun_radau_iib(3), outer=o), tol, tol)
+        for o in ("fixed-point", "auto")
+    ]
+    assert runs[1].stats.n_evaluations < 1.1 * runs[0].stats.n_evaluations
+
+
+def test_auto_does_not_crawl_on_the_stiff_beam():
+    problem = moderately_stiff_beam()
+    spent = {}
+    for outer in ("fixed-point", "auto", "newton"):
+        method = RungeKutta(radau_iia(3), outer=outer)
+        result = solve_dae(problem.system, (0.0, 0.05), problem.q0, problem.v0, method, 1e-2, 1e-2)
+        assert result.success
+        spent[outer] = result.stats.n_evaluations
+    assert spent["auto"] < 0.4 * spent["fixed-point"]
+    assert spent["newton"] < 0.1 * spent["fixed-point"]
+
+
+def test_auto_takes_newton_where_a_fixed_step_does_not_converge_by_sweeps():
+    method = {outer: RungeKutta(radau_iia(3), outer=outer) for outer in ("fixed-point", "auto")}
+    run = {o: solve_dae(stiff_spring(1e8), (0.0, 0.1), *SPRING_START, m, step_size=1e-3) for o, m in method.items()}
+    assert not run["fixed-point"].success
+    assert run["auto"].success, run["auto"].message

@@ -1,0 +1,284 @@
+"""The beam on its moving base: constraints, energy balance, frequencies, static deflection, published motions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+from scipy.linalg import eigh
+
+from tests.problems import slope, violations, worst
+from twoloop import solve_dae
+from twoloop.mechanisms import ancf_beam, moderately_stiff_beam, very_flexible_beam
+from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
+
+LOCKING = 0.7 / (1.3 * 0.4)  # (lambda + 2 mu)/E = (1 - nu)/((1 + nu)(1 - 2 nu)) at nu = 0.3: 1.346
+EULER_BERNOULLI = 1.4836  # rad/s, the lowest bending frequency of the pinned-free beam with E = 2e6
+
+# tip heights, m, at 0.2, 0.4, ... 2 s: another implementation of these equations in NumPy, written before this one;
+# SciPy's DOP853 with rtol 1e-8, the motion of the base put in exactly
+TIMES = np.arange(1, 11) / 5.0
+TIP_HEIGHTS = {
+    "flexible, node": [-0.2108, -0.9913, -0.8950, -0.1744, 0.3007, -0.1108, -0.7132, -0.9351, -0.0299, 0.3070],
+    "flexible, beam": [-0.2191, -0.9988, -0.8216, -0.0600, 0.3571, 0.1310, -0.7351, -0.8546, -0.2785, 0.1443],
+    "stiff, node": [-0.2535, -0.9007, -0.7901, -0.1776, 0.0135, -0.3583, -0.9670, -0.7115, -0.1470, 0.0014],
+}
+PRINTED = 1e-4  # the last digit above, and what two solutions with rtol 1e-8 may differ by
+
+states = st.lists(st.floats(-2.0, 2.0), min_size=30, max_size=30).map(np.array)
+times = st.floats(0.0, 3.0)
+
+
+@pytest.fixture(scope="module")
+def flexible():
+    return very_flexible_beam()
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    return moderately_stiff_beam()
+
+
+def tangent(problem):
+    K = np.zeros((problem.q0.size, problem.q0.size))
+    elastic_tangent(0.0, problem.q0, problem.v0, problem.system.parameters, K)
+    return K
+
+
+def reduced_motion(problem, t_eval, rtol=1e-8):
+    """q and v at t_eval by DOP853 on the equations without the base's two coordinates, whose motion is known."""
+    system, n = problem.system, problem.q0.size
+    amplitude, frequency = problem.parameters["amplitude"], problem.parameters["angular_frequency"]
+    M = system.mass(0.0, problem.q0)
+    inverse = np.linalg.inv(M[2:, 2:])
+    q, v, Q = np.zeros(n), np.zeros(n), np.zeros(n)
+
+    def rate(t, y):
+        q[0], q[2:] = amplitude * math.sin(frequency * t), y[: n - 2]
+        a0 = -amplitude * frequency**2 * math.sin(frequency * t)
+        Q[:] = 0.0
+        system.functions.force(t, q, v, system.parameters, Q)
+        return np.concatenate([y[n - 2 :], inverse @ (Q[2:] - M[2:, 0] * a0)])
+
+    y0 = np.concatenate([problem.q0[2:], problem.v0[2:]])
+    y = solve_ivp(rate, (0.0, t_eval[-1]), y0, "DOP853", rtol=rtol, atol=rtol, t_eval=t_eval).y
+    phase, zero = frequency * np.asarray(t_eval), np.zeros(len(t_eval))
+    q = np.vstack([amplitude * np.sin(phase), zero, y[: n - 2]])
+    return q, np.vstack([amplitude * frequency * np.cos(phase), zero, y[n - 2 :]])
+
+
+@given(times, states, states)
+def test_constraint_derivatives_are_those_of_the_constraint(flexible, t, q, v):
+    system = flexible.system
+    for unit, column in zip(np.eye(30), system.jacobian(t, q).T, strict=True):
+        assert worst(column, slope(lambda s, unit=unit: system.constraint(t, q + s * unit))) < 1e-11
+    assert worst(system.constraint_rate(t, q), slope(lambda s: system.constraint(t + s, q), 1e-4)) < 1e-9
+    difference = slope(lambda s: system.velocity_constraint(t + s, q + s * v, v), 1e-4)
+    assert worst(system.gamma(t, q, v), -difference) < 1e-8
+
+
+@given(states, states)
+def test_energy_changes_with_the_power_of_the_forces(flexible, u, v):
+    # along q'' = a without constraints: dE/dt = v . (M a - Q) for any a
+    system, q = flexible.system, flexible.q0 + 0.1 * u
+    a = np.sin(np.arange(30.0))
+    rate = slope(lambda s: flexible.energy(s, q + s * v + 0.5 * s * s * a, v + s * a))
+    power = v @ (system.mass(0.0, q) @ a - system.force(0.0, q, v))
+    assert abs(rate - power) < 1e-6 * max(1.0, abs(power))
+
+
+def test_energy_takes_one_state_or_many(flexible):
+    q = flexible.q0 + 0.1 * np.sin(np.arange(30.0))
+    many = flexible.energy(np.zeros(3), np.tile(q[:, None], 3), np.ones((30, 3)))
+    assert many.shape == (3,)
+    assert worst(many, flexible.energy(0.0, q, np.ones(30))) < 1e-12
+
+
+def test_weight_is_2_88_kg_times_gravity(flexible):
+    M = flexible.system.mass(0.0, flexible.q0)
+    up = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 0.0], 5)
+    assert abs(up @ M @ up - 7200.0 * 0.02 * 0.02) < 1e-14
+    # straight and unloaded there is no elastic force
+    assert worst(flexible.system.force(0.0, flexible.q0, flexible.v0), -9.81 * M @ up) < 1e-12
+
+
+@pytest.mark.parametrize(("start", "moving"), [("node", 1), ("beam", 5)])
+@pytest.mark.parametrize("case", [very_flexible_beam, moderately_stiff_beam])
+def test_start_is_consistent_and_said(case, start, moving):
+    problem = case(start=start)
+    system = problem.system
+    assert (system.constraint(0.0, problem.q0) == 0.0).all()
+    assert (system.velocity_constraint(0.0, problem.q0, problem.v0) == 0.0).all()
+    assert np.count_nonzero(problem.v0) == moving
+    assert problem.v0[0] == problem.parameters["amplitude"] * problem.parameters["angular_frequency"]
+    assert f"start='{start}'" in problem.note
+    assert "assumed" in problem.note
+    assert problem.parameters["start"] == start
+
+
+@pytest.mark.parametrize("case", ["flexible", "stiff"])
+def test_energy_balance_includes_the_work_of_the_base(case, request):
+    # -lam acts on the beam at the base, whose velocity is -C_t: the power is lam . C_t
+    problem = request.getfixturevalue(case)
+    end = 0.02 if case == "flexible" else 0.002
+    result = solve_dae(
+        problem.system, (0.0, end), problem.q0, problem.v0, "Gauss6", t_eval=np.linspace(0.0, end, 2001), rtol=1e-10
+    )
+    assert result.success
+    rate = np.array([problem.system.constraint_rate(t, problem.q0) for t in result.t]).T
+    work = CubicSpline(result.t, (result.lam * rate).sum(axis=0)).antiderivative()(result.t)
+    energy = problem.energy(result.t, result.q, result.v)
+    assert np.ptp(energy) > 1e-3
+    assert worst(energy - energy[0], work) < 1e-6 * np.ptp(energy)
+
+
+@pytest.mark.parametrize(("case", "factor"), [("flexible", 1.0), ("stiff", 10.0)])
+def test_frequencies_of_the_straight_beam(case, factor, request):
+    # values from the same implementation in NumPy as the tip heights
+    problem = request.getfixturevalue(case)
+    M = problem.system.mass(0.0, problem.q0)
+    w = np.sqrt(np.abs(eigh(-tangent(problem)[2:, 2:], M[2:, 2:], eigvals_only=True)))
+    assert w[0] < 1e-3 * factor
+    assert worst(w[1:4] / factor, [1.771, 6.220, 14.75]) < 5e-3
+    assert abs(w[4] / factor - 23.7) < 0.05
+    assert abs(w[-1] / factor - 3358.5) < 0.05
+    assert abs(w[1] / factor / EULER_BERNOULLI - 1.194) < 5e-4
+
+
+def test_refined_meshes_bend_with_the_frequency_of_the_locked_beam():
+    frequencies = []
+    for n in (4, 8, 16, 32):
+        problem = very_flexible_beam(n)
+        M = problem.system.mass(0.0, problem.q0)
+        w = np.sqrt(np.abs(eigh(-tangent(problem)[2:, 2:], M[2:, 2:], eigvals_only=True, subset_by_index=[0, 1])))
+        frequencies.append(w[1])
+    ratio = np.array(frequencies) / (math.sqrt(LOCKING) * EULER_BERNOULLI)
+    assert abs(ratio[0] ** 2 - 1.059) < 1e-3
+    assert abs(ratio[-1] - 1.0) < 2e-3  # shear and the inertia of turning cross-sections take the rest
+    changes = -np.diff(ratio)
+    assert np.abs(changes[:-1] / changes[1:] - 4.0).max() < 0.15  # second order
+
+
+@pytest.mark.parametrize("modulus", [2e6, 2e8])
+@pytest.mark.parametrize("n", [1, 2, 4, 8, 16, 32, 64])
+def test_static_tip_deflection_is_that_of_the_locked_beam(modulus, n):
+    # Clamped at the base, with a small load F at the tip: F L^3/(3 EI), EI times the locking factor, and F L/(mu A) by
+    # shear. The curvature k is constant over an element: it misses 1/(4 n^2) of the bending, where M is linear
+    problem = ancf_beam(n, youngs_modulus=modulus, amplitude=0.0, angular_frequency=1.0, gravity=0.0)
+    load = np.zeros(6 * n)
+    load[-5] = 1e-9 * modulus * 0.02**4
+    tip = np.linalg.solve(-tangent(problem)[6:, 6:], load)[-5]
+    bending = load[-5] / (3.0 * LOCKING * modulus * 0.02**4 / 12.0)
+    shear = load[-5] * 2.6 / (modulus * 0.02**2)
+    assert abs(tip - bending * (1.0 - 0.25 / n**2) - shear) < 5e-5 * bending / n
+    # and the deflection under that load balances the forces of the elements
+    q = problem.q0.copy()
+    q[6:] += np.linalg.solve(-tangent(problem)[6:, 6:], load)
+    assert worst(problem.system.force(0.0, q, q)[6:], -load) < 1e-4 * load[-5]
+
+
+def check_tip_heights(name, problem, end=2.0):
+    n = np.count_nonzero(end + 1e-9 > TIMES)
+    q, _ = reduced_motion(problem, TIMES[:n])
+    assert worst(tip_height(q), TIP_HEIGHTS[name][:n]) < PRINTED
+    return q
+
+
+def test_tip_of_the_very_flexible_beam(flexible):
+    q = check_tip_heights("flexible, node", flexible)
+    deflection = midpoint_deflection(q)
+    assert worst(deflection[[0, 2, 4, 6, 9]], [-0.123, -0.042, 0.247, -0.175, -0.155]) < 1e-3
+
+
+def test_tip_of_the_moderately_stiff_beam_at_first(stiff):
+    check_tip_heights("stiff, node", stiff, 0.2)
+
+
+@pytest.mark.slow
+def test_tip_of_the_moderately_stiff_beam(stiff):
+    q = check_tip_heights("stiff, node", stiff)
+    assert np.abs(midpoint_deflection(q)).max() < 0.05
+
+
+@pytest.mark.slow
+def test_tip_of_the_very_flexible_beam_that_starts_as_a_whole():
+    check_tip_heights("flexible, beam", very_flexible_beam(start="beam"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "height"), [(8, 0.001), (16, -0.091)])
+def test_four_elements_are_too_few_for_the_very_flexible_beam(n, height):
+    q, _ = reduced_motion(very_flexible_beam(n), [1.0])
+    assert abs(tip_height(q)[0] - height) < 1e-3
+    assert abs(tip_height(q)[0] - TIP_HEIGHTS["flexible, node"][4]) > 0.29
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK"])
+@pytest.mark.parametrize(("case", "end"), [("flexible", 0.05), ("stiff", 0.005)])
+def test_two_loop_procedures_agree_with_the_reduced_equations(case, end, method, request):
+    problem = request.getfixturevalue(case)
+    result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method)
+    assert result.success
+    q, v = reduced_motion(problem, [end], 1e-12)
+    assert worst(result.q[:, -1], q[:, 0]) < 1e-9
+    assert worst(result.v[:, -1], v[:, 0]) < 1e-5
+    assert violations(problem.system, result)[0] < 1e-14
+    assert result.stats.n_partitions == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK"])
+def test_two_loop_procedures_reach_the_tip_heights(flexible, method):
+    result = solve_dae(flexible.system, (0.0, 2.0), flexible.q0, flexible.v0, method, t_eval=TIMES)
+    assert result.success
+    assert worst(tip_height(result.q), TIP_HEIGHTS["flexible, node"]) < PRINTED
+
+
+def test_fine_meshes_start():
+    problem = very_flexible_beam(64)
+    result = solve_dae(problem.system, (0.0, 1e-5), problem.q0, problem.v0)
+    assert result.success
+    assert abs(result.q[0, -1] - problem.v0[0] * 1e-5) < 1e-12
+    assert violations(problem.system, result)[0] < 1e-14
+
+
+def test_outputs_of_a_bent_beam():
+    q = very_flexible_beam(2).q0.copy()
+    q[:2], q[6:8], q[12:14] = (0.0, 1.0), (0.5, 1.75), (0.0, 3.0)  # the chord points up; the middle lies to its right
+    assert tip_height(q) == 3.0
+    assert midpoint_deflection(q) == -0.5
+    assert midpoint_deflection(np.tile(q[:, None], 4)).shape == (4,)
+    with pytest.raises(ValueError, match=r"q must be of an even number of elements.*given 3"):
+        midpoint_deflection(very_flexible_beam(3).q0)
+
+
+CASE = {"youngs_modulus": 2e6, "amplitude": 0.01, "angular_frequency": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"n_elements": 0}, ValueError, "n_elements must be at least 1; given 0"),
+        ({"n_elements": 4.0}, TypeError, "n_elements must be an int"),
+        ({"start": ["node"]}, ValueError, "start must be 'node'"),
+        ({"start": "rest"}, ValueError, "start must be 'node'.*or 'beam'.*given 'rest'.*consistent"),
+        ({"youngs_modulus": -1.0}, ValueError, "youngs_modulus must be positive.*-1"),
+        ({"youngs_modulus": "steel"}, TypeError, "youngs_modulus must be a number.*steel"),
+        ({"poisson_ratio": 0.5}, ValueError, "poisson_ratio must lie between -1 and 0.5.*given 0.5"),
+        ({"poisson_ratio": -1.0}, ValueError, "poisson_ratio must lie between -1 and 0.5"),
+        ({"poisson_ratio": math.nan}, ValueError, "poisson_ratio must be finite"),
+        ({"amplitude": math.inf}, ValueError, "amplitude must be finite"),
+        ({"angular_frequency": 0.0}, ValueError, "angular_frequency must be positive"),
+        ({"density": 0.0}, ValueError, "density must be positive"),
+        ({"length": 0.0}, ValueError, "length must be positive"),
+        ({"height": -0.02}, ValueError, "height must be positive"),
+        ({"width": math.inf}, ValueError, "width must be positive and finite"),
+        ({"gravity": -9.81}, ValueError, "gravity must be at least 0.*-9.81"),
+    ],
+)
+def test_impossible_beams_say_why(arguments, error, words):
+    with pytest.raises(error, match=words):
+        ancf_beam(**{**CASE, **arguments})
