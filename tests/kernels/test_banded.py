@@ -104,6 +104,13 @@ def test_bordered_system(complex_numbers):
     assert worst(x, np.linalg.solve(whole, np.append(r, np.zeros(n_c)))[:n]) < 1e-12
 
 
+def test_other_integers_than_32_bit_are_refused(monkeypatch):
+    table = lapack.scipy.linalg.cython_lapack.__pyx_capi__
+    monkeypatch.setitem(table, "dgbtrf", "void (npy_int64 *, npy_int64 *)")
+    with pytest.raises(ImportError, match=r"cython_lapack\.dgbtrf must take 32-bit integers; it is 'void \(npy_int64"):
+        lapack.addresses()
+
+
 @pytest.mark.parametrize("lumped", [False, True])
 @pytest.mark.parametrize("damping", [0.0, 20.0])
 def test_newton_gives_the_same_run_as_dense(monkeypatch, lumped, damping):
