@@ -1,4 +1,4 @@
-"""Is what a system says about itself true? C_q, C_t and Q_d against differences of C, a constant M against another M.
+"""Is what a system says about itself true? C_q, C_t and Q_d against differences of C, a constant M, the bandwidth.
 
 A wrong sign in one of them often runs to the end and looks like a motion. Each system is looked at once.
 """
@@ -59,7 +59,44 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
         there = system.mass(t + 1.0, q + 0.1 * v)
         if np.isfinite(there).all() and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
             raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+    if system.bandwidth is not None:
+        _check_bandwidth(system, system.bandwidth, t, q + 1e-3 * v, v, 1e-3 * size)
     system.checked = True
+
+
+def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array, v: Array, shift: float) -> None:
+    """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
+    places = np.arange(system.n_q)
+    farthest, where = bandwidth, ""
+
+    def look(what: str, j: int, column: Array, level: float) -> None:
+        nonlocal farthest, where
+        distances = np.where(np.isfinite(column) & (np.abs(column) > level), np.abs(places - j), 0)
+        if distances.max() > farthest:
+            i = int(distances.argmax())
+            farthest, where = int(distances[i]), f"{what} has the entry ({i}, {j}) = {column[i]:.6g}"
+
+    for j, column in enumerate(system.mass(t, q).T):
+        look("M", j, column, 0.0)
+    for j in range(system.n_q):
+        step = np.where(places == j, shift, 0.0)
+        try:
+            force, jacobian = system.force(t, q, v), system.jacobian(t, q)
+            by_q, by_v = system.force(t, q + step, v) - force, system.force(t, q, v + step) - force
+            bent = system.jacobian(t, q + step) - jacobian
+        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
+            continue
+        level = ROUNDING * float(np.abs(force).max()) / shift
+        look("the derivative of force by q", j, by_q / shift, level)
+        look("the derivative of force by v", j, by_v / shift, level)
+        level = ROUNDING * float(np.abs(jacobian).max()) / shift
+        for k in range(system.n_c):
+            look(f"the second derivative of constraint {k} by q", j, bent[k] / shift, level)
+    if where:
+        raise ValueError(
+            f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "
+            "coordinates otherwise, or leave bandwidth out"
+        )
 
 
 def _forward(values: list[Array], e: float) -> Array:

@@ -157,11 +157,12 @@ class RungeKutta:
         )
         exponent = 1.0 / (tableau.order + 1)
         if self.outer in ("auto", "newton"):
-            from twoloop.kernels import automatic, newton
+            from twoloop.kernels import automatic, newton, newton_memory
 
             extra = newton.newton_options(tableau.A, tableau.b, tableau.c)
             options = np.concatenate([options, extra])
-            size = newton.memory_size(int(extra[newton.N_REAL] + extra[newton.N_PAIRS]), tableau.stages, n_q)
+            n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
+            size = newton_memory.memory_size(n_eigen, tableau.stages, n_q)
             newton_exponent = 1.0 / (tableau.stages + 1)
             if self.outer == "newton":
                 return Plan(newton.newton_step, options, np.zeros(size), newton_exponent)

@@ -36,11 +36,13 @@ class Statistics:
     n_inner : int or None
         Newton iterations of the inner loop.
     n_evaluations : int or None
-        Solutions of eq. (6) for accelerations and multipliers.
+        Solutions of eq. (6) for accelerations and multipliers, and evaluations of the forces alone, with which the
+        derivatives of a banded system are made.
     n_partitions : int or None
         Coordinate partitionings, the first included.
     n_factorizations : int or None
-        Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, and of the partitionings.
+        Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, of the partitionings,
+        and for Newton's method in the outer loop.
     n_jacobians : int or None
         Times the derivatives of the right side were made for Newton's method in the outer loop.
     cpu_time : float

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks import check_positive, check_size, check_span, check_times, check_vector
 from twoloop.consistency import check_start, dependent_rows, not_finite
 from twoloop.kernels import common
+from twoloop.kernels.banded import banded_pays
+from twoloop.kernels.lapack import addresses
 from twoloop.methods import PRESETS, Method, Plan
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -151,6 +153,10 @@ class _Run:
         if system.constant_mass:
             mass = system.mass(t0, q0)
             flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+        diagonal = bool(flags[common.DIAGONAL_MASS])
+        if system.bandwidth is not None and banded_pays(system.n_q, system.n_c, system.bandwidth, diagonal):
+            flags[common.BANDWIDTH] = system.bandwidth
+            self.work.lapack[:] = addresses()
         self.functions = system.functions._replace(flags=flags)
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + system.n_c)])
         self.new_state = np.zeros_like(self.state)

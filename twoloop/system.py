@@ -23,7 +23,7 @@ from twoloop.callbacks import (
     store,
 )
 from twoloop.checks import check_real, check_size
-from twoloop.kernels.common import CONSTANT_MASS, GAMMA_GIVEN, Functions
+from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GAMMA_GIVEN, N_FLAGS, Functions
 
 Array = NDArray[np.float64]
 
@@ -55,13 +55,17 @@ class ConstrainedSystem:
         The vector `p` that every callback gets.
     constant_mass : bool
         True: M depends neither on t nor on q, and is factored once.
+    bandwidth : int, optional
+        No entry (i, j) with |i - j| > bandwidth is other than zero in M, in the derivatives of the force by q and v,
+        and in the second derivatives of each constraint by q; C_q itself may be full. With it the cost of a step of a
+        large system grows in proportion to n_q. Needs a constant M. None: nothing is known.
     name : str
         Shown in messages.
 
     Raises
     ------
     TypeError, ValueError
-        If a size is not a sensible integer or a callback was not made by `twoloop.callback`.
+        If a size or the bandwidth is not a sensible integer or a callback was not made by `twoloop.callback`.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class ConstrainedSystem:
         gamma: Dispatcher | None = None,
         parameters: ArrayLike = (),
         constant_mass: bool = False,
+        bandwidth: int | None = None,
         name: str = "system",
     ):
         self.n_q = check_size("n_q", n_q, 1)
@@ -90,6 +95,11 @@ class ConstrainedSystem:
         if not isinstance(constant_mass, (bool, np.bool_)):
             raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
         self.constant_mass = bool(constant_mass)
+        self.bandwidth = None if bandwidth is None else check_size("bandwidth", bandwidth, 0)
+        if self.bandwidth is not None and not self.constant_mass:
+            raise ValueError(
+                f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
+            )
         callbacks = {
             "mass": mass,
             "force": force,
@@ -106,9 +116,10 @@ class ConstrainedSystem:
                     f"({', '.join(arguments)}); given {function!r}. Plain Python functions enter by "
                     "ConstrainedSystem.from_python"
                 )
-        flags = np.zeros(3, dtype=np.int64)
+        flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[GAMMA_GIVEN] = gamma is not None
+        flags[BANDWIDTH] = -1  # a run decides by the size
         self.functions = Functions(**callbacks, p=self.parameters, flags=flags)
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
@@ -130,6 +141,7 @@ class ConstrainedSystem:
         constraint_rate: Callable[[float, Array], ArrayLike] | None = None,
         gamma: Callable[[float, Array, Array], ArrayLike] | None = None,
         compile: bool = False,
+        bandwidth: int | None = None,
         name: str = "system",
     ) -> "ConstrainedSystem":
         """Make a system of plain functions that take arrays and return arrays.
@@ -153,6 +165,8 @@ class ConstrainedSystem:
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
+        bandwidth : int, optional
+            As for the class; `mass` must then be an array.
         name : str
             Shown in messages.
 
@@ -184,7 +198,13 @@ class ConstrainedSystem:
         functions = {kind: function for kind, function in given.items() if function is not None}
         for kind, function in functions.items():
             check_arguments(kind, function)
-        sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "constant_mass": constant_mass, "name": name}
+        sizes: dict[str, Any] = {
+            "n_q": n_q,
+            "n_c": n_c,
+            "constant_mass": constant_mass,
+            "bandwidth": bandwidth,
+            "name": name,
+        }
         if compile:
             compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
             system = cls(**sizes, **compiled)

@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit, types
 from numba.core.dispatcher import Dispatcher
 
+from twoloop.kernels.lapack import N_ROUTINES
+
 f8 = types.float64
 i8 = types.int64
 VECTOR = types.float64[::1]
@@ -43,8 +45,8 @@ class Functions(NamedTuple):
     flags: Any
 
 
-# places in Functions.flags
-CONSTANT_MASS, DIAGONAL_MASS, GAMMA_GIVEN = range(3)
+# places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense
+CONSTANT_MASS, DIAGONAL_MASS, GAMMA_GIVEN, BANDWIDTH, N_FLAGS = range(5)
 
 FUNCTIONS = types.NamedTuple(
     [
@@ -65,12 +67,13 @@ class Work(NamedTuple):
     """Arrays that an evaluation writes; made once a run. Sizes: n_q coordinates, n_c constraints."""
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) its factors, see ldl_factor
+    L: Any  # (n_q, n_q) its factors, see ldl_factor; or its banded ones, see banded.py
     Cq: Any  # (n_c, n_q) constraint Jacobian at the last position
     Cqd: Any  # (n_c, n_c) LU factors of its dependent columns
     S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its factors
-    W: Any  # (n_q, n_c) Cq^T
+    W: Any  # (n_q, n_c) Cq^T; where M is banded M^-1 Cq^T, column after column
     Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences); scratch for full pivoting
+    Cq_of_S: Any  # (n_c, n_q) the Cq that S and W belong to, where M is banded; NaN: none
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     C: Any  # (n_c) constraint, and corrections
@@ -83,11 +86,12 @@ class Work(NamedTuple):
     pivots: Any  # (n_c) row exchanges of the LU factors
     order: Any  # (n_q) scratch: column order of the full pivoting
     counters: Any  # (N_COUNTERS) see below
+    lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
     sensitivity: Any  # (1) max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
 
 
-_INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters")
-_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx")
+_INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters", "lapack")
+_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx", "Cq_of_S")
 WORK = types.NamedTuple(
     [MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields],
     Work,
@@ -175,6 +179,7 @@ def make_work(n_q: int, n_c: int) -> Work:
         W=np.zeros((n_q, n_c)),
         Cq=np.zeros((n_c, n_q)),
         Cqx=np.zeros((n_c, n_q)),
+        Cq_of_S=np.full((n_c, n_q), np.nan),
         Q=np.zeros(n_q),
         x=np.zeros(n_q),
         C=np.zeros(n_c),
@@ -187,5 +192,6 @@ def make_work(n_q: int, n_c: int) -> Work:
         pivots=np.zeros(n_c, dtype=np.int64),
         order=np.zeros(n_q, dtype=np.int64),
         counters=np.zeros(N_COUNTERS, dtype=np.int64),
+        lapack=np.zeros(N_ROUTINES, dtype=np.int64),
         sensitivity=np.zeros(1),
     )

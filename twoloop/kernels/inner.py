@@ -5,6 +5,7 @@ Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-
 
 import numpy as np
 
+from twoloop.kernels.banded import banded_mass, factor_banded_mass, inverse_mass_border, solve_banded_mass
 from twoloop.kernels.common import (
     CONSTANT_MASS,
     DIAGONAL_MASS,
@@ -34,6 +35,15 @@ def _finite(A):
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
             if not np.isfinite(A[i, j]):
+                return False
+    return True
+
+
+@inlined
+def _equal(A, B):
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            if A[i, j] != B[i, j]:  # also true for NaN
                 return False
     return True
 
@@ -160,9 +170,13 @@ def factor_mass(f, w, t, q):
     """M(t, q) and its factors; of a constant diagonal M the inverse diagonal."""
     w.M[:, :] = 0.0
     f.mass(t, q, f.p, w.M)
-    for i in range(w.Q.size):
-        copy(w.M[i], w.L[i])
-    if ldl_factor(w.L):
+    if banded_mass(f):
+        code = factor_banded_mass(f, w)
+    else:
+        for i in range(w.Q.size):
+            copy(w.M[i], w.L[i])
+        code = DONE if ldl_factor(w.L) else MASS_NOT_DEFINITE
+    if code == DONE:
         return DONE
     return MASS_NOT_DEFINITE if _finite(w.M) else NOT_FINITE
 
@@ -173,6 +187,8 @@ def _times_inverse_mass(f, w, x):
     if f.flags[DIAGONAL_MASS] == 1:
         for j in range(x.size):
             x[j] *= w.L[j, j]
+    elif banded_mass(f):
+        solve_banded_mass(f, w, 1, x)
     else:
         ldl_solve(w.L, x)
 
@@ -182,6 +198,18 @@ def _schur_complement(f, w):
     """Upper triangle of S = C_q M^-1 C_q^T into w.S."""
     n_c, n_q = w.Cq.shape
     w.S[:, :] = 0.0
+    if banded_mass(f):
+        solved = inverse_mass_border(w)
+        for i in range(n_c):
+            copy(w.Cq[i], solved[i])
+        solve_banded_mass(f, w, n_c, w.W)
+        for i in range(n_c):
+            for k in range(i, n_c):
+                total = 0.0
+                for j in range(n_q):
+                    total += w.Cq[i, j] * solved[k, j]
+                w.S[i, k] = total
+        return
     for j in range(n_q):
         for i in range(n_c):
             w.W[j, i] = w.Cq[i, j]
@@ -203,6 +231,24 @@ def _schur_complement(f, w):
 
 
 @inlined
+def _factor_schur_complement(f, w):
+    """S and its factors; where M is banded only if C_q has changed, as that of linear constraints never does."""
+    banded = banded_mass(f)
+    if banded:
+        if _equal(w.Cq, w.Cq_of_S):
+            return DONE
+        w.Cq_of_S[0, 0] = np.nan
+    _schur_complement(f, w)
+    w.counters[N_FACTORIZATIONS] += 1
+    if not ldl_factor(w.S):
+        return SINGULAR if _finite(w.S) else NOT_FINITE
+    if banded:
+        for i in range(w.C.size):
+            copy(w.Cq[i], w.Cq_of_S[i])
+    return DONE
+
+
+@inlined
 def _accelerations(f, w, t, q, v, a, lam):
     """Eqs. (6)-(8); needs C_q(t, q) in w.Cq."""
     n_c, n_q = w.Cq.shape
@@ -215,10 +261,9 @@ def _accelerations(f, w, t, q, v, a, lam):
     acceleration_constraint(f, w, t, q, v)
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
-    _schur_complement(f, w)
-    w.counters[N_FACTORIZATIONS] += 1
-    if not ldl_factor(w.S):
-        return SINGULAR if _finite(w.S) else NOT_FINITE
+    code = _factor_schur_complement(f, w)
+    if code != DONE:
+        return code
     copy(w.Q, w.x)
     _times_inverse_mass(f, w, w.x)
     for i in range(n_c):
@@ -227,11 +272,19 @@ def _accelerations(f, w, t, q, v, a, lam):
             total += w.Cq[i, j] * w.x[j]
         lam[i] = total
     ldl_solve(w.S, lam)  # (7)
-    copy(w.Q, a)
-    for i in range(n_c):
-        for j in range(n_q):
-            a[j] -= w.Cq[i, j] * lam[i]
-    _times_inverse_mass(f, w, a)  # (8)
+    if banded_mass(f):
+        # (8) with M^-1 Q and M^-1 Cq^T as they stand
+        copy(w.x, a)
+        solved = inverse_mass_border(w)
+        for i in range(n_c):
+            for j in range(n_q):
+                a[j] -= solved[i, j] * lam[i]
+    else:
+        copy(w.Q, a)
+        for i in range(n_c):
+            for j in range(n_q):
+                a[j] -= w.Cq[i, j] * lam[i]
+        _times_inverse_mass(f, w, a)  # (8)
     for j in range(n_q):
         if not np.isfinite(a[j]):
             return NOT_FINITE

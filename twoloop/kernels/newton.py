@@ -15,62 +15,59 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.kernels import newton_banded, newton_dense
 from twoloop.kernels.common import (
     ATOL,
+    BANDWIDTH,
     DONE,
     ESTIMATE,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
     N_OUTER,
     N_PARTITIONS,
     OUTER_DIVERGED,
     RTOL,
-    SINGULAR,
     STEP,
     compiled,
-    inlined,
     kernel,
 )
 from twoloop.kernels.inner import accelerations, evaluate, restore
-from twoloop.kernels.linalg import copy, lu_factor, lu_solve
-from twoloop.kernels.runge_kutta import FARTHEST, INNER_TOL, N_SCALARS, OUTER_TOL, interpolate, tableau_of
+from twoloop.kernels.linalg import copy
+from twoloop.kernels.newton_memory import (
+    A_MID,
+    A_NEW,
+    CONTRACTION,
+    E_Q,
+    E_V,
+    FRESH,
+    GAMMA0,
+    H_FACTORED,
+    H_PREVIOUS,
+    H_TRIAL,
+    HAS_JACOBIAN,
+    HAS_PREVIOUS,
+    HAS_TRIAL,
+    LAST_ACCEPTED,
+    N_EIGEN_SCALARS,
+    N_REAL,
+    PARTITION_NUMBER,
+    PREVIOUS,
+    Q_MID,
+    Q_STAGE,
+    RESIDUAL,
+    TRIAL,
+    V_MID,
+    V_STAGE,
+    block,
+    complex_vector,
+    count_eigenvalues,
+    eigen_place,
+    vector,
+)
+from twoloop.kernels.runge_kutta import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 MAX_ITERATIONS = 15
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
 STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
-DIFFERENCE = 1e-7  # displacement for the derivatives, relative to max(1, |value|)
-
-# `options` is that of runge_kutta.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
-# its real and imaginary part, the row of T^-1 and the column of T that belong to it (s real, s imaginary parts each)
-N_REAL, N_PAIRS, GAMMA0, N_EIGEN_SCALARS = range(4)
-
-# places in `memory`: advance() sets LAST_ACCEPTED after every attempt
-(
-    LAST_ACCEPTED,
-    HAS_TRIAL,
-    H_TRIAL,
-    HAS_PREVIOUS,
-    H_PREVIOUS,
-    HAS_JACOBIAN,
-    FRESH,  # the derivatives are those of the present state
-    PARTITION_NUMBER,
-    H_FACTORED,
-    CONTRACTION,  # of the last iteration
-    DAMPED,  # 0: J_v = 0
-    ERROR_BEFORE,
-    N_MEMORY_SCALARS,
-) = range(13)
-PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-
-
-def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
-    """Length of `memory`: scalars, stage blocks, vectors, J_q, J_v, a filter matrix, complex ones with their pivots."""
-    matrices = 3 + 2 * n_eigenvalues
-    return (
-        N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + matrices * n_q * n_q + (3 + n_eigenvalues) * n_q + s
-    )
 
 
 def newton_options(A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,150 +109,36 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
     return np.asarray(embedded - b)
 
 
-@inlined
-def _block(memory, s, n, which):
-    start = N_MEMORY_SCALARS + which * s * n
-    return memory[start : start + s * n].reshape((s, n))
-
-
-@inlined
-def _vector(memory, s, n, which):
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
-    return memory[start : start + n]
-
-
-@inlined
-def _matrix(memory, s, n, m, which):
-    """J_q, J_v, then the filter: (m, m)."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + which * n) * n
-    return memory[start : start + m * m].reshape((m, m))
-
-
-@inlined
-def _system(memory, s, n, m, k):
-    """Factors for the k-th eigenvalue, complex (m, m), and its pivots."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (3 + 2 * k) * n) * n
-    return memory[start : start + 2 * m * m].view(np.complex128).reshape((m, m))
-
-
-@inlined
-def _tail(memory, s, n, n_eigen, k):
-    """The k-th vector (n) behind the matrices: 0 ... n_eigen pivots (the filter's first), then a complex one."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (3 + 2 * n_eigen) * n) * n + k * n
-    return memory[start : start + n]
-
-
-@inlined
-def _eigen(options, s):
-    """First place of the eigenvalue scalars."""
-    return N_SCALARS + 2 * s * s + 3 * s
-
-
-JQ, JV, FILTER = range(3)
-
-
 @compiled
 def _derivatives(f, w, options, memory, s, t, q, v, a):
-    """J_q and J_v at (t, q, v) by differences of the two-loop right side, whose value there is a."""
-    n = q.size
-    m = w.independent.size
-    Jq, Jv = _matrix(memory, s, n, m, JQ), _matrix(memory, s, n, m, JV)
-    q_moved, v_moved = _vector(memory, s, n, Q_MOVED), _vector(memory, s, n, V_MOVED)
-    a_new = _vector(memory, s, n, A_NEW)
-    w.counters[N_JACOBIANS] += 1
-    for column in range(m):
-        j = w.independent[column]
-        copy(q, q_moved)
-        copy(v, v_moved)
-        q_moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
-        size = q_moved[j] - q[j]
-        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new, w.lam)
-        if code != DONE:
-            return code
-        for row in range(m):
-            i = w.independent[row]
-            Jq[row, column] = (a_new[i] - a[i]) / size
-    # one displacement of all velocities tells whether there is anything to difference
-    copy(q, q_moved)
-    for column in range(m):
-        j = w.independent[column]
-        v_moved[j] = v[j] + DIFFERENCE * max(1.0, abs(v[j])) * (1.0 + 0.37 * (column % 7))
-    code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new, w.lam)
-    if code != DONE:
-        return code
-    memory[DAMPED] = 0.0
-    for i in w.independent:
-        if a_new[i] != a[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
-        return DONE
-    for column in range(m):
-        j = w.independent[column]
-        copy(q, q_moved)
-        copy(v, v_moved)
-        v_moved[j] += DIFFERENCE * max(1.0, abs(v[j]))
-        size = v_moved[j] - v[j]
-        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new, w.lam)
-        if code != DONE:
-            return code
-        for row in range(m):
-            i = w.independent[row]
-            Jv[row, column] = (a_new[i] - a[i]) / size
-    return DONE
+    """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
+    if f.flags[BANDWIDTH] >= 0:
+        return newton_banded.derivatives(f, w, memory, s, t, q, v)
+    return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
 
 
 @compiled
-def _factor(w, options, memory, s, h):
-    """Factors of I - (h l)^2 J_q - h l J_v for every eigenvalue l, and for gamma0."""
-    n = w.Q.size
-    m = w.independent.size
-    Jq, Jv = _matrix(memory, s, n, m, JQ), _matrix(memory, s, n, m, JV)
-    place = _eigen(options, s)
-    n_eigen = int(options[place + N_REAL] + options[place + N_PAIRS])
-    damped = memory[DAMPED] == 1.0
-    filter_matrix = _matrix(memory, s, n, m, FILTER)
-    hl = h * options[place + GAMMA0]
-    for i in range(m):
-        for j in range(m):
-            filter_matrix[i, j] = -hl * hl * Jq[i, j]
-            if damped:
-                filter_matrix[i, j] -= hl * Jv[i, j]
-        filter_matrix[i, i] += 1.0
-    pivots = _tail(memory, s, n, n_eigen, 0).view(np.int64)
-    w.counters[N_FACTORIZATIONS] += 1
-    if not lu_factor(filter_matrix, pivots) > 0.0:
-        return SINGULAR
-    place += N_EIGEN_SCALARS + s
-    for k in range(n_eigen):
-        z = h * complex(options[place], options[place + 1])
-        place += 2 + 4 * s
-        matrix = _system(memory, s, n, m, k)
-        for i in range(m):
-            for j in range(m):
-                matrix[i, j] = -z * z * Jq[i, j]
-                if damped:
-                    matrix[i, j] -= z * Jv[i, j]
-            matrix[i, i] += 1.0
-        pivots = _tail(memory, s, n, n_eigen, 1 + k).view(np.int64)
-        w.counters[N_FACTORIZATIONS] += 1
-        if not lu_factor(matrix, pivots) > 0.0:
-            return SINGULAR
+def _factor(f, w, options, memory, s, h):
+    """Factors for steps of h, for every eigenvalue and for gamma0."""
+    if f.flags[BANDWIDTH] >= 0:
+        code = newton_banded.factor(f, w, options, memory, s, h)
+    else:
+        code = newton_dense.factor(w, options, memory, s, h)
     memory[H_FACTORED] = h
-    return DONE
+    return code
 
 
 @compiled
-def _correct(w, options, memory, s, residual, A_stage):
+def _correct(f, w, options, memory, s, residual, A_stage):
     """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
     n = w.Q.size
     m = w.independent.size
-    place = _eigen(options, s)
+    place = eigen_place(options, s)
     n_real = int(options[place + N_REAL])
-    n_eigen = n_real + int(options[place + N_PAIRS])
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (3 + 2 * n_eigen) * n) * n + (1 + n_eigen) * n
-    x = memory[start : start + 2 * m].view(np.complex128)
+    n_eigen = count_eigenvalues(options, s)
+    x = complex_vector(memory, s, n, n_eigen, 0)
     place += N_EIGEN_SCALARS + s
-    d = _block(memory, s, n, Q_STAGE)  # free between two evaluations
+    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
     d[:, :] = 0.0
     for k in range(n_eigen):
         row = place + 2
@@ -266,7 +149,10 @@ def _correct(w, options, memory, s, residual, A_stage):
             for j in range(s):
                 total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
             x[i] = total
-        lu_solve(_system(memory, s, n, m, k), _tail(memory, s, n, n_eigen, 1 + k).view(np.int64), x)
+        if f.flags[BANDWIDTH] >= 0:
+            newton_banded.solve(f, w, options, memory, s, k, x)
+        else:
+            newton_dense.solve(w, options, memory, s, k, x[:m])
         twice = 1.0 if k < n_real else 2.0
         for j in range(s):
             re, im = options[column + j], options[column + s + j]
@@ -283,9 +169,9 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Newton's method for the stage accelerations, predicted in A_stage: DONE, or why not."""
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
-    residual = _block(memory, s, n, RESIDUAL)
-    Q_stage, V_stage = _block(memory, s, n, Q_STAGE), _block(memory, s, n, V_STAGE)
-    a_new = _vector(memory, s, n, A_NEW)
+    residual = block(memory, s, n, RESIDUAL)
+    Q_stage, V_stage = block(memory, s, n, Q_STAGE), block(memory, s, n, V_STAGE)
+    a_new = vector(memory, s, n, A_NEW)
     before = 0.0
     floor = STAGNATION_FIXED
     if tolerances[ESTIMATE] == 1.0:
@@ -316,7 +202,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
             for m in w.independent:
                 scale_q = max(scale_q, abs(Q_stage[j, m]))
                 scale_v = max(scale_v, abs(V_stage[j, m]))
-        _correct(w, options, memory, s, residual, A_stage)
+        _correct(f, w, options, memory, s, residual, A_stage)
         for j in range(s):
             for m in w.independent:
                 in_q = 0.0
@@ -345,17 +231,15 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 
 @compiled
-def _estimate(w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
+def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
     """Largest component, over atol + rtol |value|, of the embedded error estimate, filtered for stiff components."""
     s, A, _, _, _, _ = tableau_of(options)
     n = q.size
     m = w.independent.size
-    place = _eigen(options, s)
+    place = eigen_place(options, s)
     gamma0 = options[place + GAMMA0]
-    n_eigen = int(options[place + N_REAL] + options[place + N_PAIRS])
     e = options[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
-    e_q, e_v = _vector(memory, s, n, E_Q), _vector(memory, s, n, E_V)
-    Jq = _matrix(memory, s, n, m, JQ)
+    e_q, e_v = vector(memory, s, n, E_Q), vector(memory, s, n, E_V)
     for i in range(m):
         j = w.independent[i]
         in_q = gamma0 * v[j]
@@ -368,12 +252,10 @@ def _estimate(w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
             in_v += e[k] * A_stage[k, j]
         e_q[i] = h * in_q
         e_v[i] = h * in_v
-    for i in range(m):
-        total = 0.0
-        for j in range(m):
-            total += Jq[i, j] * e_q[j]
-        e_v[i] += h * gamma0 * total
-    lu_solve(_matrix(memory, s, n, m, FILTER), _tail(memory, s, n, n_eigen, 0).view(np.int64), e_v[:m])
+    if f.flags[BANDWIDTH] >= 0:
+        newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
+    else:
+        newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
     error = 0.0
     for i in range(m):
         j = w.independent[i]
@@ -390,9 +272,9 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    previous, trial = _block(memory, s, n, PREVIOUS), _block(memory, s, n, TRIAL)
+    previous, trial = block(memory, s, n, PREVIOUS), block(memory, s, n, TRIAL)
     weights = memory[memory.size - s :]
-    q_mid, v_mid, a_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID), _vector(memory, s, n, A_MID)
+    q_mid, v_mid, a_mid = vector(memory, s, n, Q_MID), vector(memory, s, n, V_MID), vector(memory, s, n, A_MID)
     if memory[LAST_ACCEPTED] == 1.0:
         memory[FRESH] = 0.0
         if memory[HAS_TRIAL] == 1.0:
@@ -422,7 +304,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             memory[FRESH] = 1.0
             memory[H_FACTORED] = 0.0
         if memory[H_FACTORED] != h:
-            code = _factor(w, options, memory, s, h)
+            code = _factor(f, w, options, memory, s, h)
             if code != DONE:
                 memory[HAS_JACOBIAN] = 0.0
                 return code, np.inf
@@ -451,7 +333,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return code, np.inf
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _estimate(w, options, memory, h, tolerances, q, v, a, trial, q1, v1)
+        error = _estimate(f, w, options, memory, h, tolerances, q, v, a, trial, q1, v1)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h

@@ -174,6 +174,7 @@ def ancf_beam(
         gamma=gamma,
         parameters=p,
         constant_mass=True,
+        bandwidth=11,  # a node's neighbours
         name=name,
     )
     q0 = np.zeros((n_elements + 1, 6))

@@ -1,0 +1,246 @@
+"""The linear algebra of newton.py where M and the derivatives of the force have a band: cost in proportion to n_q.
+
+The corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r with z = h l. Multiplied by
+T^T M T, where v = T v_i are the velocities that the constraints allow, T = [I; -Cqd^-1 Cqi], this is
+
+    T^T (M - z^2 K - z D) T x = T^T M T r,    K, D = derivatives by q, v of Q - Cq^T lam, lam held
+
+but for how the dependent accelerations change with the position where T does, a term without stiffness that a
+simplified Newton may leave out. X = T x is also the solution of a banded matrix with a border,
+
+    [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
+
+K and D are differenced in groups of columns that share no row, 2 b + 1 of them for every n_q (Curtis, Powell & Reid
+1974, doi 10.1093/imamat/13.1.117).
+"""
+
+import numpy as np
+
+from twoloop.kernels.banded import add_banded_mass_times, factor_bordered, lu_band, solve_bordered
+from twoloop.kernels.common import (
+    BANDWIDTH,
+    DONE,
+    N_EVALUATIONS,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    NOT_FINITE,
+    compiled,
+    inlined,
+)
+from twoloop.kernels.lapack import DGBTRF, DGBTRS, ZGBTRF, ZGBTRS
+from twoloop.kernels.linalg import copy, lu_solve
+from twoloop.kernels.newton_dense import DIFFERENCE
+from twoloop.kernels.newton_memory import (
+    A_NEW,
+    BY_Q,
+    BY_V,
+    DAMPED,
+    FILTER,
+    GAMMA0,
+    N_EIGEN_SCALARS,
+    N_REAL,
+    Q_MOVED,
+    V_MOVED,
+    complex_vector,
+    count_eigenvalues,
+    eigen_place,
+    pivots_of,
+    space,
+    system_space,
+    vector,
+)
+
+
+@inlined
+def _band(numbers, n, b):
+    """Entry (i, j) of K or D at [i, b + j - i]."""
+    return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
+
+
+@inlined
+def _constraints(memory, s, n, n_c, b):
+    """What stands behind K: Cq, the LU of Cqd and its pivots, where the derivatives were taken."""
+    numbers = space(memory, s, n, BY_Q)
+    start = n * (2 * b + 1)
+    Cq = numbers[start : start + n_c * n].reshape((n_c, n))
+    start += n_c * n
+    Cqd = numbers[start : start + n_c * n_c].reshape((n_c, n_c))
+    start += n_c * n_c
+    return Cq, Cqd, numbers[start : start + n_c].view(np.int64)
+
+
+@compiled
+def _unbalanced(f, w, t, q, v):
+    """Q - Cq^T lam into w.Q, with the multipliers in w.lam."""
+    w.counters[N_EVALUATIONS] += 1
+    w.Q[:] = 0.0
+    f.force(t, q, v, f.p, w.Q)
+    w.Cqx[:, :] = 0.0
+    f.jacobian(t, q, f.p, w.Cqx)
+    for i in range(w.lam.size):
+        for j in range(q.size):
+            w.Q[j] -= w.Cqx[i, j] * w.lam[i]
+
+
+@compiled
+def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
+    """Columns j, j + 2 b + 1, ... at a time: DONE, or NOT_FINITE."""
+    n = q.size
+    given = v if by_v else q
+    for group in range(2 * b + 1):
+        copy(given, moved)
+        for j in range(group, n, 2 * b + 1):
+            moved[j] += DIFFERENCE * max(1.0, abs(given[j]))
+        if by_v:
+            _unbalanced(f, w, t, q, moved)
+        else:
+            _unbalanced(f, w, t, moved, v)
+        for j in range(group, n, 2 * b + 1):
+            size = moved[j] - given[j]
+            for i in range(max(0, j - b), min(n, j + b + 1)):
+                band[i, b + j - i] = (w.Q[i] - base[i]) / size
+                if not np.isfinite(band[i, b + j - i]):
+                    return NOT_FINITE
+    return DONE
+
+
+@compiled
+def derivatives(f, w, memory, s, t, q, v):
+    """K and D at a state that was evaluated just before."""
+    n = q.size
+    n_c = w.C.size
+    b = f.flags[BANDWIDTH]
+    w.counters[N_JACOBIANS] += 1
+    Cq, Cqd, pivots = _constraints(memory, s, n, n_c, b)
+    for i in range(n_c):
+        copy(w.Cq[i], Cq[i])
+        copy(w.Cqd[i], Cqd[i])
+    copy(w.pivots, pivots)
+    base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
+    _unbalanced(f, w, t, q, v)
+    copy(w.Q, base)
+    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(memory, s, n, BY_Q), n, b))
+    if code != DONE:
+        return code
+    # one displacement of all velocities tells whether there is anything to difference
+    for j in range(n):
+        moved[j] = v[j] + DIFFERENCE * max(1.0, abs(v[j])) * (1.0 + 0.37 * (j % 7))
+    _unbalanced(f, w, t, q, moved)
+    memory[DAMPED] = 0.0
+    for i in range(n):
+        if w.Q[i] != base[i]:
+            memory[DAMPED] = 1.0
+    if memory[DAMPED] == 0.0:
+        return DONE
+    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(memory, s, n, BY_V), n, b))
+
+
+@compiled
+def _fill(w, memory, s, b, z, numbers):
+    """M - z^2 K - z D to where it is factored."""
+    n = w.Q.size
+    K, D = _band(space(memory, s, n, BY_Q), n, b), _band(space(memory, s, n, BY_V), n, b)
+    damped = memory[DAMPED] == 1.0
+    target = lu_band(numbers, n, b)
+    for i in range(n):
+        for j in range(max(0, i - b), min(n, i + b + 1)):
+            value = w.M[i, j] - z * z * K[i, b + j - i]
+            if damped:
+                value -= z * D[i, b + j - i]
+            target[j, 2 * b + i - j] = value
+
+
+@compiled
+def factor(f, w, options, memory, s, h):
+    """Factors of the bordered systems of gamma0, real, and of the eigenvalues, complex."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    place = eigen_place(options, s)
+    n_eigen = count_eigenvalues(options, s)
+    n_real = int(options[place + N_REAL])
+    Cq, _, _ = _constraints(memory, s, n, w.C.size, b)
+    numbers = space(memory, s, n, FILTER)
+    _fill(w, memory, s, b, h * options[place + GAMMA0], numbers)
+    w.counters[N_FACTORIZATIONS] += 1
+    code = factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, n_eigen, 0), DGBTRF, DGBTRS)
+    place += N_EIGEN_SCALARS + s
+    for k in range(n_eigen):
+        if code != DONE:
+            return code
+        if k > 0 or n_real == 0:  # else the eigenvalue is gamma0
+            system = system_space(memory, s, n, k)
+            _fill(w, memory, s, b, h * complex(options[place], options[place + 1]), system)
+            w.counters[N_FACTORIZATIONS] += 1
+            code = factor_bordered(w, b, Cq, system, pivots_of(memory, s, n, n_eigen, 1 + k), ZGBTRF, ZGBTRS)
+        place += 2 + 4 * s
+    return code
+
+
+@compiled
+def _all_coordinates(w, memory, s, b, x, X):
+    """X = T x; of x (n_q) the first n_dof numbers count, the others are scratch."""
+    n_dof = w.independent.size
+    Cq, Cqd, pivots = _constraints(memory, s, n_dof + w.C.size, w.C.size, b)
+    for k in range(n_dof):
+        X[w.independent[k]] = x[k]
+    dependents = x[n_dof:]
+    for i in range(dependents.size):
+        dependents[i] = 0.0
+        for j in w.independent:
+            dependents[i] -= Cq[i, j] * X[j]
+    lu_solve(Cqd, pivots, dependents)
+    for k in range(dependents.size):
+        X[w.dependent[k]] = dependents[k]
+
+
+@compiled
+def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
+    """Solve with the full right side x (n_q); its first n_dof numbers become the independents of the solution."""
+    Cq, _, _ = _constraints(memory, s, x.size, w.C.size, b)
+    solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
+    for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn
+        x[k] = x[w.independent[k]]
+
+
+@compiled
+def solve(f, w, options, memory, s, k, x):
+    """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    n_eigen = count_eigenvalues(options, s)
+    pivots = pivots_of(memory, s, n, n_eigen, 1 + k)
+    if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
+        real, X = vector(memory, s, n, V_MOVED), vector(memory, s, n, Q_MOVED)
+        for i in range(n):
+            real[i] = x[i].real
+        _all_coordinates(w, memory, s, b, real, X)
+        real[:] = 0.0
+        add_banded_mass_times(w, b, X, real)
+        pivots = pivots_of(memory, s, n, n_eigen, 0)
+        _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, real)
+        for i in range(n):
+            x[i] = real[i]
+    else:
+        X = complex_vector(memory, s, n, n_eigen, 1)
+        _all_coordinates(w, memory, s, b, x, X)
+        x[:] = 0.0
+        add_banded_mass_times(w, b, X, x)
+        _solve_for_independents(w, memory, s, b, system_space(memory, s, n, k), pivots, ZGBTRS, x)
+
+
+@compiled
+def filter_error(f, w, options, memory, s, h, e_q, e_v):
+    """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    z = h * options[eigen_place(options, s) + GAMMA0]
+    K, X = _band(space(memory, s, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
+    _all_coordinates(w, memory, s, b, e_v, X)
+    e_v[:] = 0.0
+    add_banded_mass_times(w, b, X, e_v)
+    _all_coordinates(w, memory, s, b, e_q, X)
+    for i in range(n):
+        for j in range(max(0, i - b), min(n, i + b + 1)):
+            e_v[i] += z * K[i, b + j - i] * X[j]
+    pivots = pivots_of(memory, s, n, count_eigenvalues(options, s), 0)
+    _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, e_v)
