@@ -28,7 +28,6 @@ from studies.beam_runs import (
     STIFF,
     SWEEPS,
     T_END,
-    Array,
     BeamJob,
     collect,
     compile_all,
@@ -37,7 +36,7 @@ from studies.beam_runs import (
     truth_rows,
 )
 from studies.index import put_in_index
-from studies.report import Call, load_rows, load_series, parse, save_rows, save_series, stamp
+from studies.report import Array, Call, load_rows, load_series, parse, save_rows, save_series, stamp
 
 T_END_QUICK = 0.1  # s
 NEWTON_DRAWN = {SOFT: 1e-3, STIFF: 1e-2}  # tolerance of the motion in the figures, beside the paper's at its own
@@ -111,7 +110,7 @@ def run(call: Call) -> tuple[pd.DataFrame, dict[str, Array]]:
     for case, truth in truths.items():
         curves[f"{case}, {NEWTON}"] = free_motion(CASES[case](), NEWTON_DRAWN[case], t_end)
         curves[f"{case}, truth"] = {"t": truth.t, "tip": truth.tip, "middle": truth.middle}
-    series = {f"{name}: {kind}": x for name, kinds in curves.items() for kind, x in kinds.items()}
+    series: dict[str, Array] = {f"{name}: {kind}": x for name, kinds in curves.items() for kind, x in kinds.items()}
     return pd.DataFrame(rows), series
 
 
@@ -124,9 +123,10 @@ def main(words: list[str] | None = None, command: str | None = None) -> None:
         series = load_series(path.with_name("beam_series.npz"))
     else:
         line = stamp(call.command)  # before the runs: sources edited meanwhile are not theirs
-        rows, series = run(call)
+        rows, made = run(call)
         save_rows(path, rows, line)
-        save_series(path.with_name("beam_series.npz"), series)
+        save_series(path.with_name("beam_series.npz"), made)
+        series = load_series(path.with_name("beam_series.npz"))  # of the digits that a redraw has
     report(rows, series, line, call)
     figures(rows, series, call)
     text = f"[Report](beam.md), [rows](beam.csv)\n\n![Tip error against CPU time](beam_cost.png)\n\n{headline(rows)}"

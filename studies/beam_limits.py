@@ -66,7 +66,9 @@ def gauss_seidel_rate(tableau: Tableau, x: float) -> float:
     return float(np.abs(np.linalg.eigvals(sweep)).max())
 
 
-Loop = tuple[Callable[[float], Method], Callable[[float], float]]
+Make = Callable[[float], Method]
+Rate = Callable[[float], float]
+Loop = tuple[Make, Rate]
 
 
 def _loops() -> dict[str, Loop]:
@@ -138,10 +140,17 @@ def limit_rows() -> Iterator[Row]:
         return solve_dae(problem.system, (0.0, LIMIT_STEPS * h), problem.q0, problem.v0, method, step_size=h)
 
     for name, (make, rate) in _loops().items():
-        theory = bisect(lambda x, rate=rate: rate(x) < 1.0, 0.1, 20.0, 50)
-        measured = bisect(lambda x, make=make: run(make(REDUCED * TINY), x).success, 0.1, 20.0, HALVINGS)
-        at, both = measured, []
-        while not all(result.success for result in both) or not both:  # a tighter run is given up more often, by (33)
+
+        def shrinks(x: float, rate: Rate = rate) -> bool:
+            return rate(x) < 1.0
+
+        def converges(x: float, make: Make = make) -> bool:
+            return run(make(REDUCED * TINY), x).success
+
+        measured = bisect(converges, 0.1, 20.0, HALVINGS)
+        at = RATE_AT * measured
+        both = [run(make(share * TINY), at) for share in RATE_BETWEEN]
+        while not all(result.success for result in both):  # a tighter run is given up more often, by (33)
             at *= RATE_AT
             both = [run(make(share * TINY), at) for share in RATE_BETWEEN]
         loose, tight = (result.stats.n_outer or 0 for result in both)
@@ -150,7 +159,7 @@ def limit_rows() -> Iterator[Row]:
             "group": "limit",
             "solver": name,
             "w_max": w_max,
-            "theory": theory,
+            "theory": bisect(shrinks, 0.1, 20.0, 50),
             "measured": measured,
             "rate_at": at,
             "rate": (RATE_BETWEEN[1] / RATE_BETWEEN[0]) ** (1.0 / more),
@@ -214,7 +223,7 @@ def element_rows(quick: bool) -> Iterator[Row]:
 
 
 def modulus_rows(quick: bool) -> Iterator[Row]:
-    """Cost against Young's modulus, the base moving as that of the moderately stiff beam: sweeps and Newton's method."""
+    """Cost of sweeps and of Newton's method against Young's modulus; the base moves as the moderately stiff beam's."""
     base = CASES[STIFF]().parameters
     motion = {name: base[name] for name in ("amplitude", "angular_frequency")}
     for modulus in MODULI_QUICK if quick else MODULI:
@@ -253,7 +262,7 @@ def _run(problem: Problem, method: str | Method, tol: float, times: Array) -> Re
 
 
 def sensitivity(quick: bool) -> dict[str, Array]:
-    """Distance of the tip of a beam that differs a little from that of the case, against time; by case and difference."""
+    """Distance of the tip of a beam that differs a little from that of the case, against time."""
     t_end = 0.2 if quick else T_END
     times = instants(t_end, DRAWN_PER_SECOND)
     curves: dict[str, Array] = {"t": times}

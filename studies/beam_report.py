@@ -26,10 +26,19 @@ from studies.beam_runs import (
     PAPER_TOL,
     PER_SECOND,
     SOFT,
-    SOLVERS,
     STIFF,
     SWEEPS,
     for_error,
+)
+from studies.beam_tables import (
+    cheapest,
+    cost_table,
+    cpu_for,
+    element_table,
+    limit_table,
+    modulus_table,
+    run_table,
+    truth_table,
 )
 from studies.report import Array, Call, markdown_table, number
 from studies.runs import time_for
@@ -39,19 +48,6 @@ ORDER = {SOFT: "1e-3", STIFF: "1e-5"}  # s, its step sizes by order of magnitude
 SECONDS_ASKED = {SOFT: 2.0, STIFF: 60.0}  # CPU time asked of the paper's procedure here
 FACTOR_ASKED = {SOFT: 20.0, STIFF: 200.0}  # times less CPU asked of Newton's method
 GROWTH_ASKED = 24.0  # from 4 to 64 elements
-
-
-def cpu_for(rows: pd.DataFrame, case: str, solver: str) -> float:
-    """CPU time for a tip error of TARGET, s; NaN where no run is that good."""
-    found = for_error(rows, case, solver)
-    return time_for(found, TARGET) if not found.empty else float("nan")
-
-
-def cheapest(rows: pd.DataFrame, case: str, solver: str) -> pd.Series | None:
-    """The run of least CPU time among those within TARGET."""
-    found = for_error(rows, case, solver)
-    good = found[found["error_tip"] <= TARGET]
-    return None if good.empty else good.loc[good["cpu_s"].idxmin()]
 
 
 def of_paper(rows: pd.DataFrame, case: str) -> pd.Series:
@@ -201,140 +197,6 @@ def headline(rows: pd.DataFrame) -> str:
         )
     text = "; ".join(parts)
     return text[0].upper() + text[1:] + "."
-
-
-COST = (
-    "solver", "tol", "tip error (m)", "CPU (s)", "CPU at 1e-4 m (s)", "paper's / this", "steps", "rejected", "evaluations",
-    "Jacobians", "factorizations", "evaluations a step", "µs an evaluation", "h w_max, median",
-)  # fmt: skip
-
-
-def cost_table(rows: pd.DataFrame, case: str) -> str:
-    """The cheapest run of each solver within TARGET."""
-    w_max = float(rows[rows["group"] == "limit"]["w_max"].iloc[0]) * (10.0 if case == STIFF else 1.0)
-    reference = cpu_for(rows, case, PAPER)
-    lines = []
-    for solver in SOLVERS:
-        if for_error(rows, case, solver).empty:
-            continue
-        row = cheapest(rows, case, solver)
-        if row is None:
-            best = for_error(rows, case, solver)["error_tip"].min()
-            lines.append([solver, "–", f"none within; best {number(best)}", *["–"] * (len(COST) - 3)])
-            continue
-        seconds = cpu_for(rows, case, solver)
-        per_step, each = row["n_evaluations"] / row["n_steps"], 1e6 * row["cpu_s"] / row["n_evaluations"]
-        counts = [
-            number(row[k], 3) for k in ("n_steps", "n_rejected", "n_evaluations", "n_jacobians", "n_factorizations")
-        ]
-        numbers = [number(row["error_tip"]), number(row["cpu_s"]), number(seconds), number(reference / seconds)]
-        last = [number(per_step), number(each), number(row["h_median"] * w_max)]
-        lines.append([solver, f"{row['tol']:g}", *numbers, *counts, *last])
-    return markdown_table(list(COST), lines)
-
-
-def limit_table(rows: pd.DataFrame) -> str:
-    """Step limits and rates of the sweeps."""
-    header = [
-        "sweeps",
-        "h w_max: theory",
-        "no test ends them",
-        "as they are here",
-        "rate a sweep",
-        "theory",
-        "at h w_max",
-    ]
-    lines = [
-        [
-            row["solver"],
-            number(row["theory"], 3),
-            number(row["free"], 3),
-            number(row["measured"], 3),
-            number(row["rate"], 3) if row["solver"] != PAPER_SWEEPS else "–",
-            number(row["rate_theory"], 3) if row["solver"] != PAPER_SWEEPS else "–",
-            number(row["rate_at"], 3) if row["solver"] != PAPER_SWEEPS else "–",
-        ]
-        for _, row in rows[rows["group"] == "limit"].iterrows()
-    ]
-    return markdown_table(header, lines)
-
-
-def element_table(rows: pd.DataFrame) -> str:
-    """Cost of a step by number of elements."""
-    header = ["matrices", "elements", "coordinates", "CPU a step (ms)", "over the fewest", "evaluations a step",
-              "Jacobians", "steps", "w_max (rad/s)"]  # fmt: skip
-    lines = []
-    for kind, line in rows[rows["group"] == "elements"].groupby("solver", sort=False):
-        first = line.iloc[0]
-        for _, row in line.sort_values("n_elements").iterrows():
-            each = row["cpu_s"] / row["n_steps"]
-            over = each / (first["cpu_s"] / first["n_steps"])
-            lines.append(
-                [
-                    str(kind),
-                    f"{row['n_elements']:.0f}",
-                    f"{6 * (row['n_elements'] + 1):.0f}",
-                    number(1e3 * each),
-                    number(over),
-                    number(row["n_evaluations"] / row["n_steps"]),
-                    number(row["n_jacobians"]),
-                    number(row["n_steps"]),
-                    number(row["w_max"], 3),
-                ]
-            )
-    return markdown_table(header, lines)
-
-
-def modulus_table(rows: pd.DataFrame) -> str:
-    """Cost by Young's modulus."""
-    header = ["E (N/m²)", "w_max (rad/s)", "solver", "tol", "run (s)", "steps", "evaluations a second", "CPU a second (s)",
-              "Jacobians", "tip error (m)", "ended"]  # fmt: skip
-    lines = []
-    for _, row in rows[rows["group"] == "modulus"].iterrows():
-        lines.append(
-            [
-                f"{row['modulus']:.0e}",
-                number(row["w_max"], 3),
-                row["solver"],
-                f"{row['tol']:g}",
-                f"{row['t_end']:g}",
-                number(row["n_steps"], 3),
-                number(row["n_evaluations"] / row["t_end"]),
-                number(row["cpu_s"] / row["t_end"]),
-                number(row["n_jacobians"], 3),
-                number(row["error_tip"]),
-                row["status"].lower().replace("_", " "),
-            ]
-        )
-    return markdown_table(header, lines)
-
-
-def truth_table(rows: pd.DataFrame) -> str:
-    """How far the reference agrees with others."""
-    header = ["case", "compared with", "tol", "largest difference of the tip's height (m)"]
-    lines = [
-        [row["case"], row["solver"], f"{row['tol']:g}", number(row["error_tip"])]
-        for _, row in rows[rows["group"] == "truth"].iterrows()
-    ]
-    return markdown_table(header, lines)
-
-
-def run_table(rows: pd.DataFrame) -> str:
-    """All runs."""
-    header = ["case", "solver", "tol", "tip error (m)", "midpoint error (m)", "energy error (J)", "CPU (s)", "runs", "steps",
-              "rejected", "evaluations", "Jacobians", "factorizations", "median h (s)", "ended"]  # fmt: skip
-    lines = []
-    for _, row in rows[rows["group"] == "run"].iterrows():
-        errors = [number(row[name]) for name in ("error_tip", "error_middle", "error_energy")]
-        counts = [
-            number(row[k], 3) for k in ("n_steps", "n_rejected", "n_evaluations", "n_jacobians", "n_factorizations")
-        ]
-        ended = row["status"].lower().replace("_", " ")
-        if row["status"] != "REACHED_END":
-            ended += f" at {number(row['t_reached'], 3)} s"
-        some = [number(row["cpu_s"]), number(row["repeats"]), *counts, number(row["h_median"]), ended]
-        lines.append([row["case"], row["solver"], f"{row['tol']:g}", *errors, *some])
-    return markdown_table(header, lines)
 
 
 def report(rows: pd.DataFrame, series: dict[str, Array], line: str, call: Call) -> None:

@@ -1,0 +1,47 @@
+"""The beam without constraints: against other solvers, against a two-loop procedure, and what it refuses."""
+
+import numpy as np
+import pytest
+
+from references.beam_reduced import reduced_motion
+from twoloop import solve_dae
+from twoloop.mechanisms import four_bar, very_flexible_beam
+
+TIMES = [0.0, 0.03, 0.05]
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return very_flexible_beam()
+
+
+@pytest.mark.parametrize("solver", ["RK45", "LSODA"])
+def test_solvers_agree(problem, solver):
+    expected, got = (reduced_motion(problem, TIMES, 1e-10, name) for name in ("DOP853", solver))
+    assert np.abs(got[0] - expected[0]).max() < 1e-8
+    assert np.abs(got[1] - expected[1]).max() < 1e-5
+
+
+def test_the_constrained_beam_moves_alike(problem):
+    q, v = reduced_motion(problem, TIMES, 1e-11)
+    result = solve_dae(problem.system, (0.0, TIMES[-1]), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11, t_eval=TIMES)
+    assert np.abs(result.q - q).max() < 1e-10
+    assert np.abs(result.v - v).max() < 1e-6
+    for k, t in enumerate(TIMES):
+        assert np.abs(problem.system.constraint(t, q[:, k])).max() < 1e-16
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"problem": four_bar()}, "problem must be a beam of ancf_beam"),
+        ({"tol": -1.0}, "tol must be positive"),
+        ({"solver": "BDF"}, "solver must be one of DOP853, RK45, LSODA; given 'BDF'"),
+        ({"t_eval": []}, "t_eval must be a list of times"),
+        ({"t_eval": [0.2, 0.1]}, "t_eval"),
+    ],
+)
+def test_wrong_input_is_named(problem, change, words):
+    arguments = {"problem": problem, "t_eval": TIMES, "tol": 1e-8, "solver": "DOP853"}
+    with pytest.raises(ValueError, match=words):
+        reduced_motion(**{**arguments, **change})
