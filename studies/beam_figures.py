@@ -3,6 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import NullLocator
 
 from studies.beam_limits import FIXED_STEP, PERTURBED
 from studies.beam_runs import CASES, NEWTON, PAPER, PAPER_TOL, SOFT, SOLVERS, SWEEPS
@@ -66,7 +67,7 @@ def _motion(rows: pd.DataFrame, series: dict[str, Array], call: Call) -> None:
         steps.axhline(ORDERS[case], color="black", lw=1, ls=":")
         steps.text(0.02, ORDERS[case] * 1.15, "the paper's order of magnitude", fontsize=8)
         steps.set(xlabel="t (s)", ylim=(5e-6, 5e-2))
-        if case == SOFT:
+        if case == SOFT and t[-1] > PARTING:
             for panel in (tip, middle):
                 panel.axvline(PARTING, color="black", lw=1, ls=":")
         tip.set_title(f"The {case} beam", fontsize=10)
@@ -102,7 +103,7 @@ def _sensitivity(series: dict[str, Array], call: Call) -> None:
         for k, name in enumerate(PERTURBED):
             off = np.abs(series[f"sensitivity: {case}, {name}"])
             panel.semilogy(t, np.maximum(off, UNSEEN), color=f"C{k}", lw=1.1, label=name)
-        if case == SOFT:
+        if case == SOFT and t[-1] > PARTING:
             panel.axvline(PARTING, color="black", lw=1, ls=":")
             panel.text(PARTING, 2e-7, " 1.2 s", fontsize=8)
         panel.set(xlabel="t (s)", title=f"The {case} beam", ylim=(UNSEEN, 2.0))
@@ -113,7 +114,7 @@ def _sensitivity(series: dict[str, Array], call: Call) -> None:
 
 
 def _growth(rows: pd.DataFrame, call: Call) -> None:
-    plot, (mesh, stiffness) = plt.subplots(1, 2, figsize=(10.5, 4.2), layout="constrained")
+    plot, (mesh, stiffness) = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained")
     elements = rows[rows["group"] == "elements"]
     for kind, color in (("dense", "tab:gray"), ("banded", "tab:blue")):
         line = elements[elements["solver"] == kind]
@@ -121,7 +122,7 @@ def _growth(rows: pd.DataFrame, call: Call) -> None:
             mesh.loglog(line["n_elements"], 1e3 * line["cpu_s"] / line["n_steps"], "o-", color=color, label=kind)
     counts = sorted(elements["n_elements"].dropna().unique())
     mesh.set_xticks(counts, [f"{n:.0f}" for n in counts], minor=False)
-    mesh.minorticks_off()
+    mesh.xaxis.set_minor_locator(NullLocator())
     mesh.set(
         xlabel="elements",
         ylabel="CPU time a step (ms)",
@@ -135,6 +136,6 @@ def _growth(rows: pd.DataFrame, call: Call) -> None:
         label = f"{solver}, tol {tol:g}"
         stiffness.loglog(line["modulus"], line["n_evaluations"] / line["t_end"], "o", ls=ls, color=color, label=label)
     stiffness.set(xlabel="Young's modulus (N/m²)", ylabel="evaluations a second of motion", title="Cost and stiffness")
-    stiffness.legend(fontsize=8)
+    stiffness.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     plot.savefig(call.out / "beam_growth.png")
     plt.close(plot)

@@ -29,11 +29,11 @@ RATE_AT = 0.8  # of the step at which the sweeps cease to converge
 HALVINGS = 14
 PAPER_SWEEPS = "Sun Radau IIB 3, latest stages (the paper's)"
 ELEMENTS, ELEMENTS_QUICK = (4, 8, 16, 32, 64), (4, 8)
-FIXED_STEP, FIXED_STEPS, FIXED_STEPS_QUICK = 1e-3, 20, 5  # s and number, of the runs with many elements
+FIXED_STEP, FIXED_STEPS, FIXED_STEPS_QUICK = 2e-4, 50, 5  # s and number, of the runs with many elements
 MODULI, MODULI_QUICK = (2e6, 2e7, 2e8, 2e9, 2e10), (2e8, 2e9)
 MODULUS_SWEEPS_END = 0.02  # s; sweeps are run for so long only
 MODULUS_TOLS = (1e-1, 1e-2, 1e-3)
-FINE_TOL = 1e-3  # of Gauss6 with Newton's method, the reference there
+FINE_STAGES, FINE_TOL = 5, 1e-4  # of Radau IIA with Newton's method, the reference there
 SENSITIVE_TOL = {SOFT: 1e-4, STIFF: 1e-3}  # of RadauIIA5, whose error then is far below all differences
 LOOSER_TOL = 1e-2
 PERTURBED = "E + 0.1 %", "g + 0.1 %", "8 elements", "start of the whole beam", "rtol = atol = 1e-2"
@@ -231,7 +231,7 @@ def modulus_rows(quick: bool) -> Iterator[Row]:
         w_max = float(frequencies(problem)[-1])
         end = 0.2 if quick else T_END
         times = instants(end)
-        fine = _run(problem, RungeKutta(gauss(3), "newton"), FINE_TOL, times)
+        fine = _run(problem, RungeKutta(radau_iia(FINE_STAGES), "newton"), FINE_TOL, times)
         runs: list[tuple[str, Method, float, Array]] = [
             (NEWTON, RungeKutta(radau_iia(3), "newton"), tol, times) for tol in MODULUS_TOLS
         ]

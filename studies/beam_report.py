@@ -5,6 +5,7 @@ import pandas as pd
 
 from studies.beam_figures import PARTING, TARGET
 from studies.beam_limits import (
+    FINE_STAGES,
     FINE_TOL,
     FIXED_STEP,
     LIMIT_STEPS,
@@ -232,7 +233,7 @@ def report(rows: pd.DataFrame, series: dict[str, Array], line: str, call: Call) 
         element_table(rows),
         modulus_table(rows),
         f"The base moves as that of the moderately stiff beam. Sweeps run for {MODULUS_SWEEPS_END:g} s only, Newton's method for "
-        f"all of the time, its tip compared with Gauss6 (Newton's method, tol {FINE_TOL:g}).",
+        f"all of the time, its tip compared with that of {FINE_STAGES}-stage Radau IIA at tol {FINE_TOL:g}.",
         "## The reference",
         truth_table(rows),
         "## All runs",
