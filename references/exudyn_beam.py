@@ -1,9 +1,10 @@
 """The beam on a moving base as Exudyn models of its own: a cable without shear, or a geometrically exact beam.
 
 Nothing comes from twoloop's equations but the data of the beam and of its base. Both models are of slender beams, with
-E A, E I and, the second, G A: they know nothing of the stretch of the thickness, nor of Poisson's ratio otherwise. They
-meet the elements of `twoloop.mechanisms.ancf_beam` where the Poisson's ratio is 0, so that (lambda + 2 mu)/E = 1, where
-the section is slender, and where the mesh is fine; how closely, the tests say.
+E A, E I and, the second, G A: they know nothing of the stretch of the thickness, nor of Poisson's ratio otherwise. The
+elements of `twoloop.mechanisms.ancf_beam` approach them as the mesh gets finer and the section slender, where Poisson's
+ratio is 0. Where it is not, the elements lock, and it is a cable of (lambda + 2 mu)/E times the stiffness that they
+approach. How closely, tests/references/test_exudyn_beam.py says.
 """
 
 import math
