@@ -18,6 +18,15 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import compiled_gamma
+from references.ida_options import (
+    HIGHEST_ORDER,
+    NOT_TESTED,
+    check_options,
+    check_tangent,
+    no_force,
+    no_tangent,
+    tolerances,
+)
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -30,7 +39,6 @@ FORMS = {
     "stabilised": "GGL, integrated multipliers: C = 0 and C_q v + C_t = 0; multipliers' integrals in the error test",
 }
 
-NOT_TESTED = 1e12  # the absolute tolerance that takes an unknown out of IDA's error test
 SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 
@@ -52,6 +60,9 @@ def solve_ida(
     atol: float = 1e-8,
     *,
     t_eval: ArrayLike | None = None,
+    max_order: int = HIGHEST_ORDER,
+    error_test: str = "all",
+    tangent: Dispatcher | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA.
 
@@ -75,6 +86,15 @@ def solve_ida(
         scatters by a factor of 2 to 24 (15 runs) with rounding alone, which changes IDA's choice of steps and orders.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution, interpolated by IDA. None: every step is stored.
+    max_order : int
+        The highest order of the BDF, 1 to 5. Those above 2 are unstable for undamped vibrations that the step does not
+        resolve.
+    error_test : {"all", "positions"}
+        What the error test, and that of Newton's iteration, sees: all unknowns but the algebraic lam of the form
+        "index1", or q alone. IDA's norm is a mean over all unknowns: the fewer it sees, the looser the same tolerance.
+    tangent : compiled function, optional
+        (t, q, v, p, K) -> None, like a callback; adds dQ/dq to K (n_q, n_q). For a force that does not depend on v.
+        What is differenced for the Jacobian is then the residual without the force.
 
     Returns
     -------
@@ -98,10 +118,26 @@ def solve_ida(
     v0 = check_vector("v0", v0, system.n_q)
     check_positive("rtol", rtol)
     check_positive("atol", atol)
+    max_order = check_options(max_order, error_test)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
     check_start(system, t0, q0, v0)
+    check_tangent(system, tangent, t0, q0, v0)
 
-    solver = _solver(system, form, float(rtol), float(atol), t1 - t0)
+    size = 2 * system.n_q + _n_multipliers(system, form)
+    absolute = tolerances(system, size, error_test, float(atol))
+    if form == "index1":
+        absolute[2 * system.n_q :] = NOT_TESTED
+    callbacks = _callbacks(system, form, tangent)
+    solver = sksundae.ida.IDA(
+        callbacks[0],
+        jacfn=callbacks[1],
+        rtol=float(rtol),
+        atol=absolute,
+        max_order=max_order,
+        min_step=SMALLEST_STEP * (t1 - t0),
+        max_step=t1 - t0,
+        max_num_steps=10**9,  # per output time
+    )
     y0, yp0 = _start(system, form, t0, q0, v0)
     tspan = np.array([t0, t1]) if times is None else _stops(t0, t1, times)
     said = io.StringIO()
@@ -112,10 +148,10 @@ def solve_ida(
     return _result(system, form, outcome, times, said.getvalue(), cpu)
 
 
-def _solver(system: ConstrainedSystem, form: str, rtol: float, atol: float, length: float) -> Any:
-    """IDA with its callbacks and options."""
+def _callbacks(system: ConstrainedSystem, form: str, tangent: Dispatcher | None) -> tuple[Any, Any]:
+    """Residual and Jacobian as scikit-sundae calls them."""
     f = system.functions
-    residual, jacobian = _compiled(form, *f[:5], compiled_gamma(system))
+    residual, jacobian = _compiled(form, *f[:5], compiled_gamma(system), tangent)
     sizes_and_p = (system.n_q, system.n_c, f.p)
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
@@ -124,19 +160,7 @@ def _solver(system: ConstrainedSystem, form: str, rtol: float, atol: float, leng
     def jacfn(t, y, yp, res, cj, JJ):  # type: ignore[no-untyped-def]
         jacobian(t, y, yp, cj, JJ, *sizes_and_p)
 
-    n = 2 * system.n_q
-    tolerances = np.full(n + _n_multipliers(system, form), atol)
-    if form == "index1":
-        tolerances[n:] = NOT_TESTED
-    return sksundae.ida.IDA(
-        resfn,
-        jacfn=jacfn,
-        rtol=rtol,
-        atol=tolerances,
-        min_step=SMALLEST_STEP * length,
-        max_step=length,
-        max_num_steps=10**9,  # per output time
-    )
+    return resfn, jacfn
 
 
 def _n_multipliers(system: ConstrainedSystem, form: str) -> int:
@@ -204,17 +228,22 @@ def _compiled(
     jacobian: Dispatcher,
     constraint_rate: Dispatcher,
     gamma: Callable[..., None],
+    tangent: Dispatcher | None,
 ) -> tuple[Callable[..., None], Callable[..., None]]:
     """Residual (t, y, y', res, n, m, p) and Jacobian (t, y, y', cj, JJ, n, m, p) of a form.
 
     Closures, not the first-class functions that twoloop's kernels take: IDA calls from Python, where each
     first-class argument costs tens of microseconds a call.
     """
-    if form == "index1":
-        residual = _index1_residual(mass, force, jacobian, gamma)
-    else:
-        residual = _stabilised_residual(mass, force, constraint, jacobian, constraint_rate)
-    return residual, _iteration_matrix(residual, mass, jacobian, form == "index1")
+
+    def with_force(force: Dispatcher) -> Callable[..., None]:
+        if form == "index1":
+            return _index1_residual(mass, force, jacobian, gamma)
+        return _stabilised_residual(mass, force, constraint, jacobian, constraint_rate)
+
+    residual = with_force(force)
+    differenced = residual if tangent is None else with_force(no_force)
+    return residual, _iteration_matrix(differenced, mass, jacobian, tangent, form == "index1")
 
 
 def _index1_residual(
@@ -275,9 +304,18 @@ def _stabilised_residual(
 
 
 def _iteration_matrix(
-    residual: Callable[..., None], mass: Dispatcher, jacobian: Dispatcher, index1: bool
+    differenced: Callable[..., None],
+    mass: Dispatcher,
+    jacobian: Dispatcher,
+    tangent: Dispatcher | None,
+    index1: bool,
 ) -> Callable[..., None]:
-    """dF/dy + cj dF/dy': columns of q and v by differences of the residual, all others and dF/dy' exact."""
+    """dF/dy + cj dF/dy': columns of q and v by differences, -dQ/dq by the tangent, all others and dF/dy' exact.
+
+    What is differenced is the residual, without the force where there is a tangent.
+    """
+    exact = tangent is not None
+    add_tangent = no_tangent if tangent is None else tangent
 
     @njit(_JACOBIAN, error_model="numpy")
     def iteration_matrix(t, y, yp, cj, JJ, n, m, p):  # type: ignore[no-untyped-def]
@@ -286,14 +324,20 @@ def _iteration_matrix(
         mass(t, q, p, M)
         jacobian(t, q, p, Cq)
         JJ[:, :] = 0.0  # it arrives as the last call left it
-        residual(t, y, yp, here, n, m, p)
+        differenced(t, y, yp, here, n, m, p)
         for j in range(2 * n):
             step = DIFFERENCE * max(1.0, abs(y[j]))
             moved[j] = y[j] + step
-            residual(t, moved, yp, there, n, m, p)
+            differenced(t, moved, yp, there, n, m, p)
             moved[j] = y[j]
             for i in range(y.size):
                 JJ[i, j] = (there[i] - here[i]) / step
+        if exact:
+            K = np.zeros((n, n))
+            add_tangent(t, q, y[n : 2 * n].copy(), p, K)
+            for i in range(n):
+                for j in range(n):
+                    JJ[n + i, j] -= K[i, j]
         for i in range(n):
             JJ[i, i] += cj
             for j in range(n):

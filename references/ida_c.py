@@ -10,16 +10,16 @@ import ctypes
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numba import carray, cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
+from references.ida_compiled import compiled_for_ida
+from references.ida_options import HIGHEST_ORDER, check_options, check_tangent, tolerances
 from references.sundials import LONG, POINTER, REAL, library
 from twoloop.callbacks import python_force
 from twoloop.checks import check_positive, check_span, check_times, check_vector
@@ -34,13 +34,9 @@ LABEL = "SUNDIALS IDA, stabilised (GGL): the library of scikit-sundae, driven wi
 OUTPUTS = 1001  # instants of the default t_eval
 SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
 MOST_STEPS = 10**7  # between two output times
-DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 
 IDA_NORMAL, IDA_TSTOP_RETURN = 1, 1
 SUN_COMM_NULL = 0
-RAISED = -1  # what a callback returns that IDA shall not call again
-
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
 def solve_ida_c(
@@ -52,13 +48,15 @@ def solve_ida_c(
     atol: float = 1e-8,
     *,
     t_eval: ArrayLike | None = None,
+    max_order: int = HIGHEST_ORDER,
+    error_test: str = "all",
+    tangent: Dispatcher | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA, in the form "stabilised", without Python in the integration.
 
     Unknowns, residual and error test are those of `references.ida.solve_ida` with form "stabilised": q, v and the
-    integrals Lam, Mu of the multipliers; q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0; all of the
-    unknowns in the error test. The Jacobian is exact but for the columns of q and the derivatives of Q by v, which are
-    compiled differences.
+    integrals Lam, Mu of the multipliers; q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. The
+    Jacobian is exact but for the columns of q and the derivatives of Q by v, which are compiled differences.
 
     Parameters
     ----------
@@ -70,9 +68,19 @@ def solve_ida_c(
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities.
     rtol, atol : float
-        IDA's tolerances, for all unknowns.
+        IDA's tolerances, for the unknowns in the error test.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution, interpolated by IDA. None: `OUTPUTS` times, evenly.
+    max_order : int
+        The highest order of the BDF, 1 to 5. Those above 2 are unstable for undamped vibrations that the step does not
+        resolve.
+    error_test : {"all", "positions"}
+        What the error test, and that of Newton's iteration, sees: all unknowns, or q alone. IDA's norm is a mean over
+        all unknowns, so that without the others the same tolerances allow q an error sqrt((2 n_q + 2 n_c)/n_q) times
+        as large.
+    tangent : compiled function, optional
+        (t, q, v, p, K) -> None, like a callback; adds dQ/dq to K (n_q, n_q). For a force that does not depend on v.
+        The Jacobian is then exact but for the derivatives of C_q and of a varying mass by q.
 
     Returns
     -------
@@ -103,11 +111,14 @@ def solve_ida_c(
     v0 = check_vector("v0", v0, system.n_q)
     check_positive("rtol", rtol)
     check_positive("atol", atol)
+    max_order = check_options(max_order, error_test)
     times = np.linspace(t0, t1, OUTPUTS) if t_eval is None else check_times(t_eval, t0, t1, None)
     check_start(system, t0, q0, v0)
+    check_tangent(system, tangent, t0, q0, v0)
 
     sundials, state = library(), _start(system, t0, q0, v0)
-    with _integrator(sundials, system, t0, t1, state, float(rtol), float(atol)) as solver:
+    absolute = tolerances(system, state.size // 2, error_test, float(atol))
+    with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order, tangent) as solver:
         began = time.process_time()
         rows, flag, reached = _integrate(sundials.IDASolve, solver, state, t0, t1, times)
         cpu = time.process_time() - began
@@ -125,11 +136,20 @@ def _start(system: ConstrainedSystem, t0: float, q: Array, v: Array) -> Array:
 
 @contextmanager
 def _integrator(
-    sundials: SimpleNamespace, system: ConstrainedSystem, t0: float, t1: float, state: Array, rtol: float, atol: float
+    sundials: SimpleNamespace,
+    system: ConstrainedSystem,
+    t0: float,
+    t1: float,
+    state: Array,
+    rtol: float,
+    atol: Array,
+    max_order: int,
+    tangent: Dispatcher | None,
 ) -> Iterator[tuple[Any, Any, Any]]:
     """IDA's memory and its vectors y and y', which are the halves of `state`; all is freed at the end."""
     f, n = system.functions, state.size // 2
-    residual, jacobian, size = _compiled(*f[:5], system.n_q, system.n_c, f.p.size, system.constant_mass)
+    sizes = system.n_q, system.n_c, f.p.size
+    residual, jacobian, size = compiled_for_ida(*f[:5], *sizes, system.constant_mass, tangent)
     data = np.zeros(size)
     data[: f.p.size] = f.p
     data[f.p.size : f.p.size + system.n_q**2] = system.mass(t0, state[: system.n_q]).ravel()
@@ -143,13 +163,18 @@ def _integrator(
             stack.callback(free, pointer)
             return pointer
 
-        y, yp = (made("N_VMake_Serial", sundials.N_VDestroy, n, half.ctypes.data) for half in (state[:n], state[n:]))
+        y, yp, absolute = (
+            made("N_VMake_Serial", sundials.N_VDestroy, n, values.ctypes.data)
+            for values in (state[:n], state[n:], atol)
+        )
+        # not banded: ordered by nodes, the beam of 4 elements has bandwidths 23 and 21 of 64, and nothing to gain
         matrix = made("SUNDenseMatrix", sundials.SUNMatDestroy, n, n)
         linear = made("SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix)
         memory = made("IDACreate", lambda pointer: sundials.IDAFree(ctypes.byref(pointer)))
         for name, *arguments in (
             ("IDAInit", residual.address, t0, y, yp),
-            ("IDASStolerances", rtol, atol),
+            ("IDASVtolerances", rtol, absolute),
+            ("IDASetMaxOrd", max_order),
             ("IDASetUserData", data.ctypes.data),
             ("IDASetLinearSolver", linear, matrix),
             ("IDASetJacFn", jacobian.address),
@@ -244,153 +269,3 @@ def _result(
         message=message,
         stats=statistics,
     )
-
-
-@lru_cache(maxsize=64)
-def _compiled(
-    mass: Dispatcher,
-    force: Dispatcher,
-    constraint: Dispatcher,
-    jacobian: Dispatcher,
-    constraint_rate: Dispatcher,
-    n: int,
-    m: int,
-    n_p: int,
-    constant_mass: bool,
-) -> tuple[Any, Any, int]:
-    """IDA's residual and Jacobian functions, and the number of floats that their user data must hold.
-
-    The user data are [p, M, C_q, y displaced, residual there]; a constant M is there from the start. The sizes are
-    constants of the machine code.
-    """
-    size = 2 * (n + m)
-    ends = np.cumsum([n_p, n * n, m * n, size, size]).tolist()
-    after_p, after_M, after_Cq, after_y, n_memory = ends
-    array_of = library().N_VGetArrayPointer
-    matrix_of = library().SUNDenseMatrix_Data
-    residual = _residual(mass, force, constraint, jacobian, constraint_rate, n, m, constant_mass)
-    iteration_matrix = _iteration_matrix(residual, mass, force, jacobian, n, m, constant_mass)
-
-    @njit(**_OPTIONS)
-    def vector(pointer):  # type: ignore[no-untyped-def]
-        return carray(array_of(pointer), (size,))
-
-    @njit(**_OPTIONS)
-    def space(pointer):  # type: ignore[no-untyped-def]
-        memory = carray(pointer, (n_memory,), np.float64)
-        M, Cq = memory[after_p:after_M].reshape((n, n)), memory[after_M:after_Cq].reshape((m, n))
-        return memory[:n_p], M, Cq, memory[after_Cq:after_y], memory[after_y:]
-
-    pointer = types.voidptr
-
-    @cfunc(types.int32(types.float64, pointer, pointer, pointer, pointer), **_OPTIONS)
-    def residual_of_ida(t, y, yp, res, memory):  # type: ignore[no-untyped-def]
-        p, M, Cq, _, _ = space(memory)
-        try:
-            residual(t, vector(y), vector(yp), p, M, Cq, vector(res))
-        except Exception:
-            return RAISED
-        return 0
-
-    @cfunc(types.int32(types.float64, types.float64, *[pointer] * 8), **_OPTIONS)
-    def jacobian_of_ida(t, cj, y, yp, res, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
-        p, M, Cq, moved, there = space(memory)
-        columns = carray(matrix_of(J), (size, size))
-        try:
-            iteration_matrix(t, cj, vector(y), vector(yp), vector(res), p, M, Cq, moved, there, columns)
-        except Exception:
-            return RAISED
-        return 0
-
-    return residual_of_ida, jacobian_of_ida, n_memory
-
-
-def _residual(
-    mass: Dispatcher,
-    force: Dispatcher,
-    constraint: Dispatcher,
-    jacobian: Dispatcher,
-    constraint_rate: Dispatcher,
-    n: int,
-    m: int,
-    constant_mass: bool,
-) -> Callable[..., None]:
-    """(t, y, y', p, M, Cq, res) -> None: the residual at y = [q, v, Lam, Mu]; M and C_q are left as they are at q."""
-
-    @njit(**_OPTIONS)
-    def residual(t, y, yp, p, M, Cq, res):  # type: ignore[no-untyped-def]
-        q, v = y[:n], y[n : 2 * n]
-        if not constant_mass:
-            M[:, :] = 0.0
-            mass(t, q, p, M)
-        Cq[:, :] = 0.0
-        jacobian(t, q, p, Cq)
-        res[:] = 0.0
-        force(t, q, v, p, res[n : 2 * n])
-        constraint(t, q, p, res[2 * n : 2 * n + m])
-        constraint_rate(t, q, p, res[2 * n + m :])
-        for i in range(n):
-            total = -res[n + i]
-            for j in range(n):
-                total += M[i, j] * yp[n + j]
-            res[n + i] = total
-            res[i] = yp[i] - v[i]
-        for k in range(m):
-            lam, mu, rate = yp[2 * n + k], yp[2 * n + m + k], res[2 * n + m + k]
-            for i in range(n):
-                res[i] += Cq[k, i] * mu
-                res[n + i] += Cq[k, i] * lam
-                rate += Cq[k, i] * v[i]
-            res[2 * n + m + k] = rate
-
-    return residual  # type: ignore[no-any-return]
-
-
-def _iteration_matrix(
-    residual: Callable[..., None],
-    mass: Dispatcher,
-    force: Dispatcher,
-    jacobian: Dispatcher,
-    n: int,
-    m: int,
-    constant_mass: bool,
-) -> Callable[..., None]:
-    """(t, cj, y, y', res, p, M, Cq, moved, there, J) -> None: dF/dy + cj dF/dy', J[j] its column j; IDA zeroes J."""
-
-    @njit(**_OPTIONS)
-    def iteration_matrix(t, cj, y, yp, res, p, M, Cq, moved, there, J):  # type: ignore[no-untyped-def]
-        moved[:] = y
-        q, v, here_Q, there_Q = moved[:n], moved[n : 2 * n], there[:n], there[n : 2 * n]
-        if not constant_mass:
-            M[:, :] = 0.0
-            mass(t, q, p, M)
-        Cq[:, :] = 0.0
-        jacobian(t, q, p, Cq)
-        here_Q[:] = 0.0
-        force(t, q, v, p, here_Q)
-        for j in range(n):  # columns of v and of the multipliers
-            step = DIFFERENCE * max(1.0, abs(y[n + j]))
-            v[j] = y[n + j] + step
-            there_Q[:] = 0.0
-            force(t, q, v, p, there_Q)
-            v[j] = y[n + j]
-            J[n + j, j] = -1.0
-            for i in range(n):
-                J[n + j, n + i] = cj * M[i, j] - (there_Q[i] - here_Q[i]) / step
-            for k in range(m):
-                J[n + j, 2 * n + m + k] = Cq[k, j]
-                J[2 * n + k, n + j] = cj * Cq[k, j]
-                J[2 * n + m + k, j] = cj * Cq[k, j]
-                J[j, 2 * n + k] = Cq[k, j]
-        for j in range(n):  # columns of q
-            step = DIFFERENCE * max(1.0, abs(y[j]))
-            q[j] = y[j] + step
-            residual(t, moved, yp, p, M, Cq, there)
-            q[j] = y[j]
-            for i in range(2 * n):
-                J[j, i] = (there[i] - res[i]) / step
-            for i in range(2 * n + m, 2 * n + 2 * m):
-                J[j, i] = (there[i] - res[i]) / step
-            J[j, j] += cj
-
-    return iteration_matrix  # type: ignore[no-any-return]
