@@ -218,6 +218,28 @@ def test_counts_are_consistent(default_four_bar, method):
     assert stats.cpu_time > 0.0
 
 
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "PaperNewmark"])
+def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, method, monkeypatch):
+    options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
+    whole = run(default_four_bar, 3.0, **options)
+    monkeypatch.setattr("twoloop.solve.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
+    stats = whole.stats
+    assert whole.rejected_error.sum() == stats.n_rejected_error
+    assert whole.rejected_convergence.sum() == stats.n_rejected_convergence
+    assert stats.n_rejected_error + stats.n_rejected_convergence > 0
+    assert 0 < whole.partitioned.sum() == stats.n_partitions - 1
+    for k in (1, 2, 7, 8, 30):  # a run stopped after k steps has counted what the log says of them
+        short = run(default_four_bar, 3.0, **options, max_steps=k)
+        for name, counted in (
+            ("rejected_error", short.stats.n_rejected_error),
+            ("rejected_convergence", short.stats.n_rejected_convergence),
+        ):
+            assert getattr(short, name).shape == (k,)
+            assert (getattr(short, name) == getattr(whole, name)[:k]).all()
+            assert getattr(whole, name)[:k].sum() == counted
+        assert (short.partitioned == whole.partitioned[:k]).all()
+
+
 def test_evaluations_are_calls_of_the_force():
     calls = []
 

@@ -213,8 +213,8 @@ class _Run:
         first_row = every_step or (times is not None and times[0] == self.t0)
         t_parts = [np.array([self.t0])] if first_row else []
         rows = [self.state.copy()[None, :]] if first_row else []
-        h_parts: list[Array] = []
-        out_t, out_h = np.empty(BUFFER_ROWS), np.empty(BUFFER_STEPS)
+        step_parts: list[Array] = []
+        out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
         out_state = np.empty((BUFFER_ROWS, len(self.state)))
         filled = np.zeros(2, dtype=np.int64)
         cpu = 0.0
@@ -235,19 +235,22 @@ class _Run:
                 outputs,
                 out_t,
                 out_state,
-                out_h,
+                out_steps,
                 filled,
             )
             cpu += time.process_time() - began
             t_parts.append(out_t[: filled[0]].copy())
             rows.append(out_state[: filled[0]].copy())
-            h_parts.append(out_h[: filled[1]].copy())
+            step_parts.append(out_steps[: filled[1]].copy())
             report(self.clock[a.T])
         t = np.concatenate(t_parts)
         table = np.concatenate(rows)
         if times is not None and times[-1] != t1 and len(t) > 0 and t[-1] == t1:
             t, table = t[:-1], table[:-1]
         n = system.n_q
+        steps = np.concatenate(step_parts)
+        # counted from the start of the run, whose first partition is not a renewal
+        counts: NDArray[np.int64] = np.diff(steps[:, 1:], axis=0, prepend=np.array([[0.0, 0.0, 1.0]])).astype(np.int64)
         status, message = self._outcome(code)
         return Result(
             t=t,
@@ -255,10 +258,13 @@ class _Run:
             v=table[:, n : 2 * n].T,
             a=table[:, 2 * n : 3 * n].T,
             lam=table[:, 3 * n :].T,
-            h=np.concatenate(h_parts),
+            h=steps[:, a.H].copy(),
             status=status,
             message=message,
             stats=self._statistics(cpu),
+            rejected_error=counts[:, a.ERRORS - 1],
+            rejected_convergence=counts[:, a.FAILURES - 1],
+            partitioned=counts[:, a.PARTITIONS - 1],
         )
 
     def _statistics(self, cpu: float) -> Statistics:
