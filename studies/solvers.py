@@ -28,6 +28,7 @@ IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, 
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C = "IDA from C, stabilised"
 PRESETS = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark")  # of twoloop, with their own options
+ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 
 
@@ -49,6 +50,9 @@ class Solver:
         Settings that do not vary, for the row.
     two_loop : bool
         Whether it is a two-loop procedure of this project.
+    own_a : bool
+        Whether the accelerations in its results are not those of eq. (6) at its q and v, but unknowns of its own,
+        differences of v, or with Baumgarte's terms.
     """
 
     name: str
@@ -56,6 +60,7 @@ class Solver:
     run: Callable[[Problem, float, float, int], Result]
     fixed: Mapping[str, float] = field(default_factory=dict)
     two_loop: bool = False
+    own_a: bool = False
 
     def job(self, group: str, problem: Problem, t_end: float, value: float, repeats: int = 3) -> Job:
         """One run at the setting `value` as a job of a study."""
@@ -121,6 +126,11 @@ def _gear(order: int, start: str, problem: Problem, t_end: float, step: float, k
     return solve_gear(problem.system, (0.0, t_end), problem.q0, problem.v0, step, order, start=start, t_eval=kept)
 
 
+def baumgarte(method: str, alpha: float) -> str:
+    """Name of one of SciPy's solvers with Baumgarte's stabilisation."""
+    return f"{method}, Baumgarte {alpha:g}"
+
+
 def gear(order: int, start: str = "accurate") -> str:
     """Name of the stand-in for ADAMS GSTIFF."""
     return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
@@ -134,24 +144,24 @@ def _all() -> Iterator[Solver]:
     for preset in PRESETS:
         yield Solver(preset, "tol", partial(two_loop, preset), two_loop=True)
     for form in ida.FORMS:
-        yield Solver(f"IDA, {form}", "tol", partial(_ida, form))
-    yield Solver(IDA_C, "tol", _ida_c)
+        yield Solver(f"IDA, {form}", "tol", partial(_ida, form), own_a=True)
+    yield Solver(IDA_C, "tol", _ida_c, own_a=True)
     for name in ("LSODA", "DOP853", "RK45"):
         yield Solver(f"{name}, index 1", "tol", partial(_index1, name, "none", None))
     for name in ("DOP853", "RK45"):
         yield Solver(f"{name}, projected", "tol", partial(_index1, name, "projection", None))
     for name in ("LSODA", "DOP853"):
-        for alpha in (1.0, 10.0, 100.0):
+        for alpha in ALPHAS:
             run = partial(_index1, name, "baumgarte", alpha)
-            yield Solver(f"{name}, Baumgarte {alpha:g}", "tol", run, {"alpha": alpha})
+            yield Solver(baumgarte(name, alpha), "tol", run, {"alpha": alpha}, own_a=True)
     for solver in exudyn_four_bar.SOLVERS:
-        yield Solver(f"Exudyn, {solver}", "h", partial(_exudyn, solver, {}))
+        yield Solver(f"Exudyn, {solver}", "h", partial(_exudyn, solver, {}), own_a=True)
     for radius in (1.0, 0.6):
         run = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius})
-        yield Solver(f"Exudyn, GeneralizedAlpha {radius:g}", "h", run, {"spectral_radius": radius})
+        yield Solver(f"Exudyn, GeneralizedAlpha {radius:g}", "h", run, {"spectral_radius": radius}, own_a=True)
     for order in GEAR_ORDERS:
         for start in STARTS:
-            yield Solver(gear(order, start), "h", partial(_gear, order, start), {"order": order})
+            yield Solver(gear(order, start), "h", partial(_gear, order, start), {"order": order}, own_a=True)
 
 
 CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
@@ -167,7 +177,7 @@ LINE_UP: dict[str, float] = {
     "LSODA, index 1": 1e-8,
     "DOP853, index 1": 1e-8,
     "DOP853, projected": 1e-8,
-    "DOP853, Baumgarte 10": 1e-8,
+    baumgarte("DOP853", 10.0): 1e-8,
     **{f"Exudyn, {solver}": 1e-3 for solver in exudyn_four_bar.SOLVERS},
     "Exudyn, GeneralizedAlpha 0.6": 1e-3,
     "Exudyn, GeneralizedAlpha 1": 1e-3,
