@@ -2,7 +2,20 @@
 
 import numpy as np
 
-from studies.claims_verdicts import DEFAULT, Claim, Judgement, NoRows, Rows, cost, grade, long_enough, one, pick, span, value
+from studies.claims_verdicts import (
+    DEFAULT,
+    Claim,
+    Judgement,
+    NoRows,
+    Rows,
+    cost,
+    grade,
+    long_enough,
+    one,
+    pick,
+    span,
+    value,
+)
 from studies.report import number
 from studies.solvers import IRK, NEWMARK, QUARTER
 
@@ -22,32 +35,45 @@ def _index(rows: Rows) -> Judgement:
     found = pick(rows, "claims", check="index")
     least = float(found["value"].min())
     text = f"least eigenvalue / largest = {number(least)} over a period, on {len(found)} geometries"
-    return Judgement(number(least), grade(least > REGULAR), f"C_q M⁻¹ C_qᵀ: {text}. It is regular where the index is 3.")
+    return Judgement(
+        number(least), grade(least > REGULAR), f"C_q M⁻¹ C_qᵀ: {text}. It is regular where the index is 3."
+    )
 
 
 def _drift(rows: Rows) -> Judgement:
-    runs = long_enough(pick(rows, "table3", solver=("DOP853, index 1", "LSODA, index 1", "IDA, index1"), problem=DEFAULT))
+    runs = long_enough(
+        pick(rows, "table3", solver=("DOP853, index 1", "LSODA, index 1", "IDA, index1"), problem=DEFAULT)
+    )
     growth = runs["violation_late"] / runs["violation_early"]
     largest = runs["violation_q"]
     why = (
         f"Between the first and the last tenth of the run the violation grows {span(growth)} times in {len(runs)} runs; its "
         f"largest value is {span(largest)} m, the less the tighter the tolerance."
     )
-    return Judgement(f"grows {span(growth)} ×", grade(bool((growth > GROWTH).all()), bool((growth > GROWTH).any())), why)
+    return Judgement(
+        f"grows {span(growth)} ×", grade(bool((growth > GROWTH).all()), bool((growth > GROWTH).any())), why
+    )
 
 
 def _baumgarte(rows: Rows) -> Judgement:
-    theirs = float(one(rows, "motion", solver="DOP853, Baumgarte 10", group="line-up")["violation_q"])
-    ours = float(one(rows, "motion", solver=IRK, group="line-up")["violation_q"])
-    why = f"Largest violation {number(theirs)} m, beside {number(ours)} m of PaperIRK: {number(theirs / ours)} times."
-    return Judgement(f"{number(theirs)} m", grade(theirs > EXACT * ours), why)
+    runs = pick(rows, "violation", group=("line-up", "tolerances"))
+    theirs = runs[runs["solver"].str.contains("Baumgarte")]["violation_q"]
+    ours = float(one(rows, "violation", solver=IRK, group="line-up")["violation_q"])
+    why = (
+        f"Largest violation {span(theirs)} m in {len(theirs)} runs (solvers, α and tolerances), beside {number(ours)} m of PaperIRK. It "
+        "is held down, not removed: how far, the tolerance says."
+    )
+    exact = theirs <= EXACT * ours
+    return Judgement(f"{span(theirs)} m", grade(bool((~exact).all()), bool((~exact).any())), why)
 
 
 def _projection(rows: Rows) -> Judgement:
     pairs = (("IDA, stabilised", "IDA, index1"), ("DOP853, projected", "DOP853, index 1"))
     ratios, parts = [], []
     for with_it, without in pairs:
-        runs = {solver: long_enough(pick(rows, "table3", solver=solver, problem=DEFAULT)) for solver in (with_it, without)}
+        runs = {
+            solver: long_enough(pick(rows, "table3", solver=solver, problem=DEFAULT)) for solver in (with_it, without)
+        }
         for what in ("n_evaluations", "cpu_s"):
             found = [cost(runs[with_it], e, what) / cost(runs[without], e, what) for e in TARGETS]
             found = [ratio for ratio in found if not np.isnan(ratio)]
@@ -68,7 +94,9 @@ def _explicit(rows: Rows) -> Judgement:
         f"On the diagonal of b_i a_ij + b_j a_ji − b_i b_j stands −b_i², since a_ii = 0; its largest magnitude is {span(diagonal)} "
         f"in {len(diagonal)} methods. All weights would have to vanish, and they add up to 1."
     )
-    return Judgement(f"≥ {number(diagonal.min())}", grade(bool((diagonal > 1e-3).all() and (is_explicit == 0.0).all())), why)
+    return Judgement(
+        f"≥ {number(diagonal.min())}", grade(bool((diagonal > 1e-3).all() and (is_explicit == 0.0).all())), why
+    )
 
 
 def _newmark_symplectic(rows: Rows) -> Judgement:
@@ -80,7 +108,9 @@ def _newmark_symplectic(rows: Rows) -> Judgement:
         f"(|det − 1| {span(found['value'][~symplectic]) if (~symplectic).any() else '–'} at h = 0.2). The paper does not name "
         "its circumstances; its β = γ = 1/2 is the third of the cases run."
     )
-    return Judgement(f"{int(symplectic.sum())} of {len(found)} cases", grade(bool(symplectic.any() and not symplectic.all())), why)
+    return Judgement(
+        f"{int(symplectic.sum())} of {len(found)} cases", grade(bool(symplectic.any() and not symplectic.all())), why
+    )
 
 
 def measured_order(rows: Rows, case: str) -> float:
@@ -96,7 +126,10 @@ def _newmark_order(rows: Rows) -> Judgement:
     runs = pick(rows, "motion", solver="Exudyn, HHT", group="Exudyn").sort_values("h")
     if len(runs) > 1:
         error, h = runs["error_y3_short"].to_numpy(), runs["h"].to_numpy()
-        expected["HHT of Exudyn"], found["HHT of Exudyn"] = 2, float(np.log(error[-1] / error[0]) / np.log(h[-1] / h[0]))
+        expected["HHT of Exudyn"], found["HHT of Exudyn"] = (
+            2,
+            float(np.log(error[-1] / error[0]) / np.log(h[-1] / h[0])),
+        )
     text = "; ".join(f"{case}: {order:.2f}" for case, order in found.items())
     met = all(abs(found[case] - expected[case]) < ORDER for case in expected)
     return Judgement(", ".join(f"{order:.2f}" for order in found.values()), grade(met), f"Measured: {text}.")
@@ -104,7 +137,8 @@ def _newmark_order(rows: Rows) -> Judgement:
 
 def _gamma(rows: Rows) -> Judgement:
     right, wrong = (
-        value(rows, "(5)", f"{case}: largest error of C'' = C_q a - Q_d", None) for case in ("as printed", "opposite sign")
+        value(rows, "(5)", f"{case}: largest error of C'' = C_q a - Q_d", None)
+        for case in ("as printed", "opposite sign")
     )
     why = f"Along a given path the printed Q_d is wrong by {number(right)} (the differences' own error), the negative by {number(wrong)}."
     return Judgement(number(right), grade(right < 1e-6 < wrong), why)
@@ -112,10 +146,17 @@ def _gamma(rows: Rows) -> Judgement:
 
 def _formulas(rows: Rows, *cases: str) -> Judgement:
     found = pick(
-        rows, "claims", check="(6)-(15)", case=tuple(f"{case}: relative difference from the direct solution" for case in cases)
+        rows,
+        "claims",
+        check="(6)-(15)",
+        case=tuple(f"{case}: relative difference from the direct solution" for case in cases),
     )
     worst = float(found["value"].max())
-    return Judgement(number(worst), grade(worst < SAME), f"Largest relative difference, on every geometry of the rows: {number(worst)}.")
+    return Judgement(
+        number(worst),
+        grade(worst < SAME),
+        f"Largest relative difference, on every geometry of the rows: {number(worst)}.",
+    )
 
 
 def _counts(rows: Rows) -> Judgement:
@@ -126,22 +167,26 @@ def _counts(rows: Rows) -> Judgement:
 
 
 def _levels(rows: Rows) -> Judgement:
-    levels = ("position, m", "velocity, m/s", "acceleration, relative to the largest Q_d")
-    worst = [value(rows, "PaperIRK", case) for case in levels]
+    run = one(rows, "violation", solver=IRK, group="line-up")
+    worst = [float(run[f"violation_{level}"]) for level in "qva"]
     cells = pick(rows, "table3", group="Table 3: IRK", problem=DEFAULT)
     by_err_in = cells.groupby("err_in")["violation_q"].max()
     good = by_err_in[by_err_in < TIGHT]
     met = max(worst) < TIGHT
     why = (
-        f"At err_in = 1e-9: {', '.join(f'{number(w)} ({name})' for w, name in zip(worst, levels, strict=True))}. Positions over "
-        f"err_in: {'; '.join(f'{e:.0e}: {number(x)} m' for e, x in by_err_in.items())}. What err_in leaves is the square of the "
-        f"last correction; below {TIGHT:g} m for err_in of {', '.join(f'{e:.0e}' for e in good.index) or 'none'}."
+        f"At err_in = 1e-9 the largest violations of the three levels are {', '.join(number(w) for w in worst)} (m, m/s, m/s²). "
+        f"Positions over err_in, at the worst err_out: {'; '.join(f'{e:.0e}: {number(x)} m' for e, x in by_err_in.items())}. What "
+        "err_in leaves is the square of the last correction; it is below "
+        f"{TIGHT:g} m for err_in = {', '.join(f'{e:.0e}' for e in good.index) or 'none'}."
     )
     return Judgement(number(max(worst)), grade(met and len(good) == len(by_err_in), met), why)
 
 
 def _coordinates(rows: Rows) -> Judgement:
-    used = {name: value(rows, "independent coordinates", f"{name}: coordinates in one of them") for name in ("LU", "SVD", "QR")}
+    used = {
+        name: value(rows, "independent coordinates", f"{name}: coordinates in one of them")
+        for name in ("LU", "SVD", "QR")
+    }
     why = (
         f"Coordinates that make up one independent one: {', '.join(f'{name} {n:g}' for name, n in used.items())}. QR here is the "
         "orthogonal complement of the rows of C_q; QR with column pivoting would pick coordinates as LU does."
@@ -165,12 +210,18 @@ def _sweeps(rows: Rows) -> Judgement:
     runs = pick(rows, "step_size", solver=(NEWMARK, QUARTER), group="paper")
     failed, sweeps = runs["n_rejected_convergence"] / runs["n_steps"], runs["n_outer"] / runs["n_steps"]
     why = f"{span(sweeps)} sweeps a step; {span(failed)} of the steps did not converge, in {len(runs)} runs (β = 1/2 and 1/4)."
-    return Judgement(f"{span(sweeps)} sweeps", grade(bool((failed < RARELY).all() and (runs["status"] == "REACHED_END").all())), why)
+    return Judgement(
+        f"{span(sweeps)} sweeps", grade(bool((failed < RARELY).all() and (runs["status"] == "REACHED_END").all())), why
+    )
 
 
 def _beta(rows: Rows) -> Judgement:
     half, quarter = (
-        float(one(rows, "claims", check="fixed steps to 1 s", case=f"Newmark beta = {beta}, gamma = 0.5", setting=1e-3)["value"])
+        float(
+            one(rows, "claims", check="fixed steps to 1 s", case=f"Newmark beta = {beta}, gamma = 0.5", setting=1e-3)[
+                "value"
+            ]
+        )
         for beta in ("0.5", "0.25")
     )
     steps = [float(one(rows, "step_size", solver=solver)["n_steps"]) for solver in (NEWMARK, QUARTER)]
@@ -182,7 +233,9 @@ def _beta(rows: Rows) -> Judgement:
         f"an equal err_out (theory: 4^(1/3) = 1.59). Costs are compared with both below."
     )
     fair = ratio <= 1.1
-    return Judgement(f"error × {ratio:.2f}, steps × {steps[0] / steps[1]:.2f}", grade(fair, abs(order - 2.0) < ORDER), why)
+    return Judgement(
+        f"error × {ratio:.2f}, steps × {steps[0] / steps[1]:.2f}", grade(fair, abs(order - 2.0) < ORDER), why
+    )
 
 
 TABLE3 = ("error_q", "cpu_s", "n_evaluations")
@@ -209,9 +262,14 @@ CLAIMS = (
     Claim(
         "1",
         "Baumgarte's stabilisation does not satisfy the constraints exactly.",
-        "DOP853 with Baumgarte's terms, α = 10, at tolerance 1e-8.",
-        {"motion": ("group = line-up; solver = DOP853, Baumgarte 10 and PaperIRK", ("violation_q",))},
-        f"Holds if its largest violation is more than {EXACT:g} times PaperIRK's.",
+        "DOP853 and LSODA with Baumgarte's terms at several α and tolerances.",
+        {
+            "violation": (
+                "group = line-up, tolerances; solver contains Baumgarte; PaperIRK of line-up",
+                ("violation_q",),
+            )
+        },
+        f"Holds if the largest violation of every run is more than {EXACT:g} times PaperIRK's; with conditions if of some.",
         _baumgarte,
         assumed=True,
     ),
@@ -279,9 +337,9 @@ CLAIMS = (
     Claim(
         "1, 2.2, 5",
         "State-space methods satisfy the constraints strictly, on the levels of position, velocity and acceleration at once.",
-        "PaperIRK over the whole run, every accepted step; Table 3 for other err_in.",
+        "PaperIRK at the paper's settings; Table 3 for other err_in.",
         {
-            "claims": ("check = PaperIRK", VALUE),
+            "violation": ("group = line-up; solver = PaperIRK", ("violation_q", "violation_v", "violation_a")),
             "table3": ("group = Table 3: IRK, default geometry", ("err_in", "violation_q")),
         },
         f"Holds if all three are below {TIGHT:g} at err_in = 1e-9 and positions also at every other err_in; with conditions if only at 1e-9. "
@@ -303,7 +361,10 @@ CLAIMS = (
         "The partition may be made once in several steps.",
         "PaperIRK and PaperNewmark, which look at the partition after every step and renew it when it is worn.",
         {
-            "table3": ("solver = PaperIRK, PaperNewmark (beta = 1/2); err_in = err_out = 1e-9", ("n_steps", "n_partitions")),
+            "table3": (
+                "solver = PaperIRK, PaperNewmark (beta = 1/2); err_in = err_out = 1e-9",
+                ("n_steps", "n_partitions"),
+            ),
             "claims": ("check = independent coordinates; case = first choice …", VALUE),
         },
         f"Holds if in every run a partition lasts {STEPS_KEPT:g} steps or more on average.",
@@ -314,7 +375,12 @@ CLAIMS = (
         "2.3",
         "Newmark's equations can be solved by fixed-point sweeps on the accelerations alone.",
         "PaperNewmark with β = 1/2 and 1/4 at err_in = err_out = 1e-9.",
-        {"step_size": ("group = paper; solver begins with PaperNewmark", ("n_outer", "n_steps", "n_rejected_convergence", "status"))},
+        {
+            "step_size": (
+                "group = paper; solver begins with PaperNewmark",
+                ("n_outer", "n_steps", "n_rejected_convergence", "status"),
+            )
+        },
         f"Holds if all runs reach their end and fewer than {RARELY:.0%} of the steps fail to converge.",
         _sweeps,
         assumed=True,

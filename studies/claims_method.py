@@ -5,13 +5,12 @@ import pandas as pd
 
 from studies.claims_introduction import ORDER, SYMPLECTIC, VALUE, measured_order
 from studies.claims_verdicts import DEFAULT, Claim, Judgement, NoRows, Rows, grade, one, pick, span, value
+from studies.energy_drift import EPS, GAUSS, PAPER_IRK, RESOLVED, SUN
 from studies.report import number
 from studies.solvers import IRK
 
 ROUNDING = 1e-14  # defect of an order condition
 NOT_SYMPLECTIC = 1e-6  # of a determinant from 1
-EPS = float(np.finfo(float).eps)
-RESOLVED = 3.0  # standard errors from which a slope counts as one
 LONG_RUN = 1000.0  # s, the least length of a run that tells of drift
 ENERGY = ("slope", "slope_error", "t_end", "n_steps", "kinetic", "status")
 SPREAD = 2.0  # between the largest and the least h omega: the step goes with 1 / omega
@@ -36,7 +35,9 @@ def _table1(rows: Rows) -> Judgement:
 
 def _order(rows: Rows) -> Judgement:
     order = measured_order(rows, "Sun")
-    return Judgement(f"{order:.2f}", grade(order > 5.0 - ORDER), f"Error at 1 s with h = 0.02 and 0.01 s: order {order:.2f}.")
+    return Judgement(
+        f"{order:.2f}", grade(order > 5.0 - ORDER), f"Error at 1 s with h = 0.02 and 0.01 s: order {order:.2f}."
+    )
 
 
 def _map(rows: Rows) -> Judgement:
@@ -45,7 +46,7 @@ def _map(rows: Rows) -> Judgement:
     )
     why = (
         f"In canonical variables |det − 1| of a step of 0.1 s is up to {number(velocities)} for the procedure on (q_i, q̇_i), and "
-        f"{number(momenta)} if it iterates momenta (`variables=\"momenta\"`). (q_i, q̇_i) are not canonical: the reduced mass depends "
+        f'{number(momenta)} if it iterates momenta (`variables="momenta"`). (q_i, q̇_i) are not canonical: the reduced mass depends '
         "on q_i."
     )
     in_part = momenta < SYMPLECTIC < velocities < NOT_SYMPLECTIC
@@ -61,12 +62,14 @@ def drifts(run: pd.Series) -> bool:
 
 
 def _stable(rows: Rows) -> Judgement:
-    runs = pick(rows, "energy", solver=("Sun Radau IIB(3)", IRK, "Gauss(3)"))
+    runs = pick(rows, "energy", solver=(SUN, PAPER_IRK, GAUSS))
     runs = runs[runs["t_end"] == runs["t_end"].max()]
     if runs["t_end"].max() < LONG_RUN:
-        raise NoRows(f"quick run: it covers {runs['t_end'].max():g} s, and drift is looked for over {LONG_RUN:g} s or more")
+        raise NoRows(
+            f"quick run: it covers {runs['t_end'].max():g} s, and drift is looked for over {LONG_RUN:g} s or more"
+        )
     runs = runs.assign(drifts=[drifts(run) for _, run in runs.iterrows()])
-    own = runs[(runs["variables"] == "velocities") & (runs["partition"] == "lasting") & (runs["solver"] != "Gauss(3)")]
+    own = runs[(runs["variables"] == "velocities") & (runs["partition"] == "lasting") & (runs["solver"] != GAUSS)]
     calm = runs[~runs["drifts"]]
     names = [
         f"{run['solver']} on {run['variables']}, {run['partition']} partition, {run['geometry']}, "
@@ -99,7 +102,9 @@ def _reduction(rows: Rows) -> Judgement:
 
 def _jacobian(rows: Rows) -> Judgement:
     case = "Q_d given: "
-    calls = {name: value(rows, "values alone", f"{case}calls of {name} an evaluation") for name in ("mass", "force", "gamma")}
+    calls = {
+        name: value(rows, "values alone", f"{case}calls of {name} an evaluation") for name in ("mass", "force", "gamma")
+    }
     reached = value(rows, "values alone", f"{case}reached its end")
     why = (
         f"Calls for one evaluation of the accelerations: {', '.join(f'{name} {n:.3f}' for name, n in calls.items())}; difference "
@@ -109,7 +114,9 @@ def _jacobian(rows: Rows) -> Judgement:
 
 
 def _stiff(rows: Rows) -> Judgement:
-    found = pick(rows, "claims", check="stiff spring", case="largest h omega of an accepted step").sort_values("setting")
+    found = pick(rows, "claims", check="stiff spring", case="largest h omega of an accepted step").sort_values(
+        "setting"
+    )
     errors = pick(rows, "claims", check="stiff spring", case="rejected by the error")["value"]
     radius = value(rows, "Table 1", "restored: spectral radius of A", None)
     h_omega = found["value"]
@@ -150,7 +157,9 @@ def _rheonomic(rows: Rows) -> Judgement:
 
 
 def _richardson(rows: Rows) -> Judgement:
-    ratios = pick(rows, "claims", check="(26), (27)", case="median of estimate over true error", problem=DEFAULT)["value"]
+    ratios = pick(rows, "claims", check="(26), (27)", case="median of estimate over true error", problem=DEFAULT)[
+        "value"
+    ]
     why = (
         f"The undivided difference is {span(ratios)} times the true local error of the two half steps, which are kept (theory: "
         "2^5 − 1 = 31). It errs on the safe side: steps are 31^(1/6) = 1.77 times shorter than Atol and Rtol ask for."
@@ -161,9 +170,7 @@ def _richardson(rows: Rows) -> Judgement:
 
 def _components(rows: Rows) -> Judgement:
     z, n_q = value(rows, "sizes", "components of z"), value(rows, "sizes", "n_q")
-    why = (
-        f"z holds positions and velocities, {z:g} components, twice n_q = {n_q:g}. A mean over n_q would make err √2 times larger."
-    )
+    why = f"z holds positions and velocities, {z:g} components, twice n_q = {n_q:g}. A mean over n_q would make err √2 times larger."
     return Judgement(f"{z:g} = {z / n_q:g} n_q", grade(z == n_q), why)
 
 
@@ -177,7 +184,9 @@ def _exponent(rows: Rows) -> Judgement:
 
 def _stopping(rows: Rows) -> Judgement:
     changes = pick(rows, "claims", check="(32)", case="printed ratio for the change given as setting")
-    least = pick(rows, "claims", check="(32)", case="printed ratio of the least change of a value as large as the setting")
+    least = pick(
+        rows, "claims", check="(32)", case="printed ratio of the least change of a value as large as the setting"
+    )
     small = changes[changes["setting"].abs() < 1.0]
     absolute = bool((small["value"] == small["setting"].abs()).all())
     large = changes[changes["setting"] >= 1.0]["value"]
@@ -185,8 +194,8 @@ def _stopping(rows: Rows) -> Judgement:
     why = (
         f"As printed the ratio is the change itself below 1 (no scaling with y), {span(large)} whatever a positive change of 1 or more, "
         f"and {span(changes[changes['setting'] < 0.0]['value'])} for a change of −5. A value of {span(out_of_reach) if len(out_of_reach) else '–'} "
-        f"could not meet 1e-9 at all. With max(|y_i|, 1), as in this project, it is relative. On the linkage, where no independent "
-        f"value exceeds {value(rows, 'PaperIRK', 'largest q_i or v_i'):.3g}, the two hardly differ."
+        f"could not meet 1e-9 at all. With max(|y_i|, 1), as in this project, it is relative. On the linkage, where no "
+        f"component of q or v exceeds {value(rows, 'true motion', 'largest component of q or v'):.3g}, the two hardly differ."
     )
     return Judgement(f"ratio = |Δ|: {absolute}", grade(not absolute), why)
 
@@ -238,7 +247,12 @@ CLAIMS = (
         "1, 3.1",
         "Because the method is symplectic the result stays stable over long times.",
         "Energy of Sun's method over 10⁴ s: fixed and variable steps, velocities and momenta, two geometries; Gauss(3) beside it.",
-        {"energy": ("solver = Sun Radau IIB(3), PaperIRK, Gauss(3); the longest t_end", (*ENERGY, "h", "variables", "partition"))},
+        {
+            "energy": (
+                "solver = Sun Radau IIB(3), PaperIRK, Gauss(3); the longest t_end",
+                (*ENERGY, "h", "variables", "partition"),
+            )
+        },
         f"A run drifts if its slope exceeds {RESOLVED:g} standard errors and what rounding explains (ε × kinetic energy × steps), or if it "
         "fails. Holds if no run of Sun's method on (q_i, q̇_i) drifts; with conditions if other runs listed do not.",
         _stable,
@@ -326,7 +340,10 @@ CLAIMS = (
         "Sweeps in NumPy from true states at instants of a period, continued after (33) has failed; PaperIRK's own rejections.",
         {
             "claims": ("check = (33)", (*VALUE, "setting")),
-            "step_size": ("solver = PaperIRK, group = paper", ("n_rejected_convergence", "n_rejected_error", "n_steps")),
+            "step_size": (
+                "solver = PaperIRK, group = paper",
+                ("n_rejected_convergence", "n_rejected_error", "n_steps"),
+            ),
         },
         f"Holds if at most {NEEDLESS:.0%} of the steps given up would have converged within 200 sweeps.",
         _h_max,

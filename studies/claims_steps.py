@@ -46,7 +46,9 @@ def local_error(problem: Problem, phases: int) -> Iterator[Row]:
             errors.append(np.sqrt(np.mean(((fine - true) / scale) ** 2)))
         name = problem.name
         yield row("(26), (27)", "median estimate", float(np.median(estimates)), h, name)
-        yield row("(26), (27)", "median of estimate over true error", float(np.median(np.divide(estimates, errors))), h, name)
+        yield row(
+            "(26), (27)", "median of estimate over true error", float(np.median(np.divide(estimates, errors))), h, name
+        )
 
 
 def orders(problem: Problem) -> Iterator[Row]:
@@ -93,31 +95,6 @@ def needless(problem: Problem, phases: int) -> Iterator[Row]:
         yield row("(33)", "of these, converging", converging, h, problem.name)
 
 
-def long_run(problem: Problem, t_end: float) -> Iterator[Row]:
-    """Violations of PaperIRK at the paper's settings: each level, and (35), (36) early and late."""
-    system = problem.system
-    result = solve_dae(system, (0.0, t_end), problem.q0, problem.v0, method=paper_irk(LOOPS, LOOPS), rtol=TOL, atol=TOL)
-    states = list(zip(result.t, result.q.T, result.v.T, result.a.T, strict=True))
-    positions = np.array([np.abs(system.constraint(t, q)) for t, q, _, _ in states])
-    velocities = max(np.abs(system.velocity_constraint(t, q, v)).max() for t, q, v, _ in states)
-    rates = [(system.jacobian(t, q) @ a, system.gamma(t, q, v)) for t, q, v, a in states]
-    largest = max(np.abs(Q_d).max() for _, Q_d in rates)
-    t_late = 0.9 * result.t[-1]
-    early, late = result.t <= 0.1 * result.t[-1], result.t >= t_late
-    for case, value in (
-        ("reached its end", float(result.success)),
-        ("position, m", positions.max()),
-        ("velocity, m/s", velocities),
-        ("acceleration, relative to the largest Q_d", max(np.abs(a - b).max() for a, b in rates) / largest),
-        ("(35), first tenth, m", positions[early, 6].max()),
-        ("(35), last tenth, m", positions[late, 6].max()),
-        ("(36), first tenth, m", positions[early, 7].max()),
-        ("(36), last tenth, m", positions[late, 7].max()),
-        ("largest q_i or v_i", max(np.abs(result.q).max(), np.abs(result.v).max())),
-    ):
-        yield row("PaperIRK", case, float(value), t_end, problem.name)
-
-
 def _opaque(problem: Problem, calls: dict[str, int], gamma: bool) -> ConstrainedSystem:
     """The linkage given by values alone, every call of a function counted."""
     system = problem.system
@@ -154,7 +131,7 @@ def values_alone(problem: Problem) -> Iterator[Row]:
             for name in calls:
                 calls[name] = 0
             result = solve_dae(system, (0.0, t_end), problem.q0, problem.v0, method=paper_irk(), rtol=TOL, atol=TOL)
-            seen.append({**calls, "n": result.stats.n_evaluations})
+            seen.append({**calls, "n": result.stats.n_evaluations or 0})
         ends.append(result.q[:, -1])
         for name in calls:
             ratio = (seen[1][name] - seen[0][name]) / (seen[1]["n"] - seen[0]["n"])
@@ -167,7 +144,7 @@ def values_alone(problem: Problem) -> Iterator[Row]:
 
 
 def stiff() -> Iterator[Row]:
-    """Steps on a spring so weakly excited that no error counts: h times its frequency, for stiffer and stiffer springs."""
+    """Steps on springs so weakly excited that no error counts: h times the frequency, stiffer and stiffer."""
     method = paper_irk(LOOPS, LOOPS)
     for omega in (10.0, 100.0, 1000.0):
         system = ConstrainedSystem.from_python(

@@ -19,7 +19,7 @@ def independents(jacobian: Array) -> list[int]:
     """Gauss elimination with full pivoting: the columns that hold no pivot are the independent coordinates."""
     matrix, columns = jacobian.copy(), list(range(jacobian.shape[1]))
     for k in range(len(matrix)):
-        row, column = np.unravel_index(np.abs(matrix[k:, k:]).argmax(), matrix[k:, k:].shape)
+        row, column = (int(place) for place in np.unravel_index(np.abs(matrix[k:, k:]).argmax(), matrix[k:, k:].shape))
         matrix[[k, k + row]] = matrix[[k + row, k]]
         matrix[:, [k, k + column]] = matrix[:, [k + column, k]]
         columns[k], columns[k + column] = columns[k + column], columns[k]

@@ -93,6 +93,15 @@ def grade(holds: bool, in_part: bool = False) -> Verdict:
     return Verdict.CONDITIONS if in_part else Verdict.FAILS
 
 
+def not_run(why: str) -> Callable[[Rows], Judgement]:
+    """The judge of a claim for which there are no rows in any study."""
+
+    def judge(rows: Rows) -> Judgement:
+        raise NoRows(why)
+
+    return judge
+
+
 def pick(rows: Rows, study: str, **equal: Any) -> pd.DataFrame:
     """The rows of a study in which each column named has that value (or one of a tuple of values)."""
     if study not in rows:
@@ -127,7 +136,7 @@ def long_enough(runs: pd.DataFrame, least: float = LONG) -> pd.DataFrame:
 
 
 def cost(runs: pd.DataFrame, target: float, what: str) -> float:
-    """Cost `what` of these runs for an error over the run of at most `target`, not extrapolated; NaN where they have none."""
+    """Cost `what` of these runs for an error of at most `target`; NaN where it lies outside the errors they reach."""
     errors = runs["error_q"].dropna()
     if errors.empty or not errors.min() <= target <= errors.max():
         return float("nan")

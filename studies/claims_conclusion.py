@@ -1,0 +1,162 @@
+"""The claims of Section 5, the conclusion, with their judges."""
+
+import numpy as np
+
+from studies.claims_introduction import VALUE
+from studies.claims_verdicts import (
+    DEFAULT,
+    Claim,
+    Judgement,
+    NoRows,
+    Rows,
+    grade,
+    long_enough,
+    not_run,
+    one,
+    pick,
+    value,
+)
+from studies.report import number
+from studies.runs import ASTRAY, LOST
+from studies.solvers import IRK, IRK_LINE, NEWMARK, PRESETS, QUARTER
+
+AGREE = 1e-10  # m or rad
+ORDERS = {IRK_LINE: 5, NEWMARK: 2, QUARTER: 2}
+NEAR = 0.05  # of an exponent about 1 / order
+
+
+def _values(rows: Rows) -> Judgement:
+    given, differenced = (
+        value(rows, "values alone", f"{case}: difference from the compiled linkage")
+        for case in ("Q_d given", "Q_d by differences")
+    )
+    calls = {
+        case: value(rows, "values alone", f"{case}: calls of jacobian an evaluation")
+        for case in ("Q_d given", "Q_d by differences")
+    }
+    reached = min(value(rows, "values alone", f"{case}: reached its end") for case in calls)
+    works = reached == 1.0 and max(given, differenced) < AGREE
+    free = calls["Q_d by differences"] <= calls["Q_d given"]
+    why = (
+        f"Given by values alone the linkage moves as the compiled one does (difference {number(given)}). But Q_d, with second derivatives of "
+        f"C, is needed as well, which the paper's list leaves out: given, C_q is called {calls['Q_d given']:.2f} times an evaluation; by "
+        f"differences {calls['Q_d by differences']:.2f} times, with a difference of {number(differenced)} m or rad at the end."
+    )
+    return Judgement(f"{number(differenced)}", grade(works and free, works), why)
+
+
+def _long(rows: Rows) -> Judgement:
+    run = long_enough(pick(rows, "motion", solver=IRK, group="line-up")).iloc[0]
+    why = (
+        f"After {run['t_end']:g} s at the paper's settings: energy error {number(run['energy'])} J of {run['kinetic']:.3g} J, error of y3 up to "
+        f"{number(run['error_y3'])} m, which grows as t^{run['growth']:.2f} (a phase error that grows quadratically, as under a drift of energy)."
+    )
+    good = not run["lost"] and not run["astray"]
+    return Judgement(f"{number(run['error_y3'])} m", grade(good), why)
+
+
+def _because_of_order(rows: Rows) -> Judgement:
+    found = {}
+    for solver in ORDERS:
+        runs = long_enough(pick(rows, "table3", solver=solver, problem=DEFAULT))
+        runs = runs[(runs["err_in"].isna() | (runs["err_in"] == 1e-9)) & ~runs["astray"]].sort_values("error_q")
+        if len(runs) < 2:
+            raise NoRows(f"fewer than two runs of {solver} follow the motion")
+        found[solver] = float(np.polyfit(np.log(1.0 / runs["error_q"]), np.log(runs["n_evaluations"]), 1)[0])
+    texts = [f"{solver}: {p:.3f} (1 / order = {1 / ORDERS[solver]:.3f})" for solver, p in found.items()]
+    near = all(abs(p - 1.0 / ORDERS[solver]) < NEAR + 0.1 / ORDERS[solver] for solver, p in found.items())
+    less = found[IRK_LINE] < min(found[NEWMARK], found[QUARTER])
+    why = f"Evaluations go as error^−p with p = {'; '.join(texts)}: the gap widens with the accuracy asked for, as the orders say."
+    return Judgement(", ".join(f"{p:.2f}" for p in found.values()), grade(near and less, less), why)
+
+
+def _any_method(rows: Rows) -> Judgement:
+    runs = pick(rows, "motion", solver=PRESETS, group="line-up")
+    energy = pick(rows, "energy", variables="velocities", partition="lasting")
+    names = sorted({*runs["solver"], *energy["solver"]})
+    failed = [*runs[runs["status"] != "REACHED_END"]["solver"], *energy[energy["status"] != "REACHED_END"]["solver"]]
+    why = f"Run in the same two loops: {', '.join(names)}; {len(failed)} of {len(runs) + len(energy)} runs failed{': ' if failed else ''}{', '.join(failed)}."
+    return Judgement(f"{len(names)} methods", grade(not failed, len(failed) < len(runs) + len(energy)), why)
+
+
+def _bdf(rows: Rows) -> Judgement:
+    run = one(rows, "motion", solver="BDF", group="line-up")
+    why = f"Status {run['status']}, error over the run {number(run['error_q'])} m or rad at its setting in the line-up, {number(run['n_evaluations'])} evaluations."
+    return Judgement(number(run["error_q"]), grade(run["status"] == "REACHED_END" and not run["astray"]), why)
+
+
+CLAIMS = (
+    Claim(
+        "5",
+        "Only values of M, Q and C_q are needed, no formulas: the method is general.",
+        "PaperIRK on the linkage given by functions that return values, with Q_d given and with Q_d by differences.",
+        {"claims": ("check = values alone", VALUE)},
+        f"Holds if both runs agree with the compiled linkage to {AGREE:g} and Q_d costs no further values; with conditions if it does.",
+        _values,
+    ),
+    Claim(
+        "1, 5",
+        "The new procedure works well over long times.",
+        "PaperIRK at the paper's settings over 100 s.",
+        {
+            "motion": (
+                "group = line-up; solver = PaperIRK",
+                ("lost", "astray", "energy", "kinetic", "error_y3", "growth", "t_end"),
+            )
+        },
+        f"Holds if the energy error is below {LOST:.0%} of the kinetic energy and y3 errs by less than {ASTRAY:.0%} of its range.",
+        _long,
+        assumed=True,
+    ),
+    Claim(
+        "1, 5",
+        "It saves computation because its order is higher.",
+        "Evaluations over error of PaperIRK and of PaperNewmark with both β.",
+        {
+            "table3": (
+                "solver = the three, err_in = 1e-9 or none, not astray",
+                ("error_q", "n_evaluations", "astray", "t_end"),
+            )
+        },
+        f"Holds if the exponents are within {NEAR:g} + 0.1 / order of 1 / order and PaperIRK's is the least; with conditions if only the latter.",
+        _because_of_order,
+        assumed=True,
+    ),
+    Claim(
+        "5",
+        "Any implicit method for first-order equations fits into the two loops.",
+        "Gauss, Radau IIA, Sun's and Lobatto IIIE tableaux, and Newmark, all by sweeps.",
+        {
+            "motion": ("group = line-up; solver = presets of twoloop", ("status",)),
+            "energy": ("variables = velocities; partition = lasting", ("solver", "status")),
+        },
+        "Holds if all runs reach their end, with conditions if some. The step limit of sweeps (see stiff systems) applies to all.",
+        _any_method,
+        assumed=True,
+    ),
+    Claim(
+        "5",
+        "BDF fits in the same way, with positions and velocities as unknowns.",
+        "The two-loop BDF in the line-up of the motion, if there is one.",
+        {"motion": ("group = line-up; solver = BDF", ("status", "error_q", "astray", "n_evaluations"))},
+        "Holds if the run reaches its end and follows the motion.",
+        _bdf,
+        assumed=True,
+    ),
+    Claim(
+        "5",
+        "The best structure of the procedure with Newmark's method has the accelerations as unknowns.",
+        "Nothing.",
+        {},
+        "Needs runs of Newmark's method with positions or velocities as unknowns.",
+        not_run("this project iterates Newmark's method on accelerations only, as the paper does."),
+    ),
+    Claim(
+        "5",
+        "With the dependent positions integrated the procedure may work for non-holonomic systems.",
+        "Nothing.",
+        {},
+        "Needs a run of a non-holonomic system.",
+        not_run("non-holonomic constraints are not implemented."),
+    ),
+)
