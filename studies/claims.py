@@ -22,7 +22,7 @@ from twoloop.mechanisms import four_bar
 CLAIMS: tuple[Claim, ...] = (
     *claims_introduction.CLAIMS,
     *claims_method.CLAIMS,
-    *claims_four_bar.CLAIMS,
+    *claims_four_bar.CLAIMS,  # those of Sect. 4.2, the beam, go here
     *claims_conclusion.CLAIMS,
 )
 SOURCES = ("table3", "motion", "step_size", "violation", "energy")  # studies whose rows are read

@@ -49,7 +49,7 @@ def _long(rows: Rows) -> Judgement:
     run = long_enough(pick(rows, "motion", solver=IRK, group="line-up")).iloc[0]
     why = (
         f"After {run['t_end']:g} s at the paper's settings: energy error {number(run['energy'])} J of {run['kinetic']:.3g} J, error of y3 up to "
-        f"{number(run['error_y3'])} m, which grows as t^{run['growth']:.2f} (a phase error that grows quadratically, as under a drift of energy)."
+        f"{number(run['error_y3'])} m, growing as t^{run['growth']:.2f}; an error of phase under a linear drift of energy grows as t²."
     )
     good = not run["lost"] and not run["astray"]
     return Judgement(f"{number(run['error_y3'])} m", grade(good), why)
@@ -66,7 +66,7 @@ def _because_of_order(rows: Rows) -> Judgement:
     texts = [f"{solver}: {p:.3f} (1 / order = {1 / ORDERS[solver]:.3f})" for solver, p in found.items()]
     near = all(abs(p - 1.0 / ORDERS[solver]) < NEAR + 0.1 / ORDERS[solver] for solver, p in found.items())
     less = found[IRK_LINE] < min(found[NEWMARK], found[QUARTER])
-    why = f"Evaluations go as error^−p with p = {'; '.join(texts)}: the gap widens with the accuracy asked for, as the orders say."
+    why = f"Evaluations go as error^−p with p = {'; '.join(texts)}. The lesser exponent wins the more, the more accuracy is asked for."
     return Judgement(", ".join(f"{p:.2f}" for p in found.values()), grade(near and less, less), why)
 
 

@@ -35,7 +35,7 @@ MOSTLY = 0.5
 IRK_GROUP, NEWMARK_GROUP = FAMILIES
 LAST = TOLERANCES[-1]
 PRINTED_RATIO = PAPER_NEWMARK[3][3] / PAPER_IRK[3][3]  # type: ignore[operator]
-NEAR = 2.0  # factor within which a ratio counts as the printed one
+NEAR = 1.5  # factor within which a ratio counts as the printed one
 MAIN = 2.0  # times a logarithm must exceed another for its tolerance to be the main influence
 SHARES = (0.3, 0.1, 0.03, 0.01)  # m or rad: errors over the run at which the procedures are compared
 
@@ -48,7 +48,7 @@ def _closure(rows: Rows) -> Judgement:
     start = pick(rows, "claims", check="(35)", case="printed, cosine: residual at q0, m")["value"]
     why = (
         f"Along the true motion of {len(printed)} geometries (35) with a cosine of θ3 is violated by up to {span(printed)} m, at the start by "
-        f"{span(start)} m; with a sine by {number(sine.max())} m. A misprint: the results are those of a closed chain."
+        f"{span(start)} m; with a sine by {number(sine.max())} m. With a cosine the chain does not close, and bar 3 cannot start horizontal: a misprint."
     )
     return Judgement(f"{span(printed)} m", grade(bool((printed < TIGHT).all())), why)
 
@@ -113,9 +113,10 @@ def _gear_long(rows: Rows) -> Judgement:
     errors, limit = runs["error_y3"], ASTRAY * runs["range_y3"].iloc[0]
     wrong = ~(errors <= limit)
     passing = [str(k) for k, run in runs.iterrows() if run["top"] > PASSES]
+    losing = [str(k) for k, run in runs.iterrows() if run["energy"] < 0.0]
     why = (
         f"Error of y3 over {LONG:g} s at h = 0.01 s: {_by_order(errors)}; {ASTRAY:.0%} of its range is {number(limit)} m. y3 passes 0 at "
-        f"orders {', '.join(passing) or 'none'}, the others lose energy. Again of the stand-in, not of ADAMS."
+        f"orders {', '.join(passing) or 'none'}; energy is lost at orders {', '.join(losing) or 'none'}. Again of the stand-in, not of ADAMS."
     )
     return Judgement(f"{span(errors.dropna())} m", grade(bool(wrong.all()), bool(wrong.any())), why)
 
@@ -124,7 +125,7 @@ def _step(rows: Rows) -> Judgement:
     run = long_enough(pick(rows, "step_size", solver=IRK, group="paper")).iloc[0]
     why = (
         f"{run['share_steps']:.1%} of the steps of PaperIRK are longer than {STEP:g} s; they cover {run['share_time']:.2%} of the time. The "
-        f"median is {number(run['h_median'])} s. Lengths of bars of the order of a metre are behind this as much as the method is."
+        f"median is {number(run['h_median'])} s. The lengths of the bars, which set the period, have their share in it."
     )
     return Judgement(f"{run['share_time']:.2%} of the time", grade(bool(run["share_time"] > MOSTLY)), why)
 
@@ -162,18 +163,18 @@ def _newmark_time(rows: Rows) -> Judgement:
 
 def _irk_time(rows: Rows) -> Judgement:
     long_enough(pick(rows, "table3", group=IRK_GROUP, problem=DEFAULT))
-    found = {what: _influence(rows, IRK_GROUP, what, 1e-5) for what in ("cpu_s", "n_evaluations", "n_inner")}
-    whole = {what: _influence(rows, IRK_GROUP, what, 1e-3) for what in ("cpu_s", "n_inner")}
-    met = np.log(found["cpu_s"][0]) > MAIN * abs(np.log(found["cpu_s"][1]))
-    part = np.log(found["n_inner"][0]) > abs(np.log(found["n_inner"][1])) or whole["cpu_s"][0] > whole["cpu_s"][1]
+    found = {what: _influence(rows, IRK_GROUP, what, 1e-3) for what in ("cpu_s", "n_evaluations", "n_inner")}
+    fine = _influence(rows, IRK_GROUP, "cpu_s", 1e-5)
+    met = {what: np.log(by_in) > MAIN * abs(np.log(by_out)) for what, (by_in, by_out) in found.items()}
     texts = [f"{what} × {by_in:.2f} by err_in, × {by_out:.2f} by err_out" for what, (by_in, by_out) in found.items()]
     why = (
-        f"From 1e-5 to 1e-9, means over the cells: {'; '.join(texts)}. From 1e-3: time × {whole['cpu_s'][0]:.2f} by err_in and × "
-        f"{whole['cpu_s'][1]:.2f} by err_out, inner iterations × {whole['n_inner'][0]:.2f} and × {whole['n_inner'][1]:.2f}. The paper's time: × "
-        f"{3.60 / 2.08:.2f} by err_in and × {3.60 / 3.37:.2f} by err_out from 1e-3 to 1e-9. Here (32) needs more sweeps for a smaller err_out, and "
-        "an inner iteration is cheap beside an evaluation."
+        f"From 1e-3 to 1e-9, means over the cells: {'; '.join(texts)}; from 1e-5, where the outer loop no longer disturbs the error estimate, time × "
+        f"{fine[0]:.2f} and × {fine[1]:.2f}. The paper's time at the other tolerance 1e-9: × {3.60 / 2.08:.2f} and × {3.60 / 3.37:.2f}. Its growth with err_in is "
+        "that of the inner iterations, as if they made up its cost; here an evaluation weighs more, and (32) asks more sweeps for a smaller err_out."
     )
-    return Judgement(f"× {found['cpu_s'][0]:.2f}, not {found['cpu_s'][1]:.2f}", grade(bool(met), bool(part)), why)
+    return Judgement(
+        f"× {found['cpu_s'][0]:.2f}, × {found['cpu_s'][1]:.2f}", grade(bool(met["cpu_s"]), bool(met["n_inner"])), why
+    )
 
 
 def _newmark_star(rows: Rows) -> Judgement:
@@ -188,9 +189,9 @@ def _newmark_star(rows: Rows) -> Judgement:
         f"{int(other['lost'].sum())} of {len(other)}. Out of phase, by more than {ASTRAY:.0%} of the range of y3, also at err_out = "
         f"{', '.join(f'{e:.0e}' for e in astray) or 'none'}, which the paper's criterion, the line y3 = 0, does not show."
     )
-    met = bool(coarse["lost"].all())
+    met = bool(coarse["lost"].all() and not fine["lost"].any())
     number_ = f"{int(coarse['lost'].sum())} of {len(coarse)}, {int(fine['lost'].sum())} of {len(fine)}"
-    return Judgement(number_, grade(met and not fine["lost"].any(), bool(coarse["lost"].any())), why)
+    return Judgement(number_, grade(met and not fine["astray"].any(), met), why)
 
 
 def _irk_star(rows: Rows) -> Judgement:
@@ -319,7 +320,12 @@ CLAIMS = (
         "4.1",
         "Gstiff with h = 0.01 s is obviously wrong over 100 s.",
         "The stand-in for Gstiff, orders 1 to 6.",
-        {"motion": ("group = GSTIFF stand-in; h = 0.01; without ramp", ("error_y3", "range_y3", "top", "t_end"))},
+        {
+            "motion": (
+                "group = GSTIFF stand-in; h = 0.01; without ramp",
+                ("error_y3", "range_y3", "top", "energy", "t_end"),
+            )
+        },
         f"Holds if the error of y3 exceeds {ASTRAY:.0%} of its range, or the run fails, at every order; with conditions if at some.",
         _gear_long,
         assumed=True,
@@ -354,10 +360,10 @@ CLAIMS = (
     Claim(
         "4.1",
         "err_in is the main influence on the time of the new procedure.",
-        "Table 3, the columns and rows from 1e-5 on (at err_out = 1e-3 the loop disturbs the error estimate).",
+        "Table 3.",
         {"table3": ("group = Table 3: IRK, default geometry", (*CELLS, "n_inner"))},
-        f"Holds if the logarithm of the mean factor in time from 1e-5 to 1e-9 is more than {MAIN:g} times as large by err_in as by err_out; with "
-        "conditions if it is the larger in inner iterations, or in time from 1e-3 on.",
+        f"Logarithms of the mean factors from 1e-3 to 1e-9. Holds if err_in's is more than {MAIN:g} times err_out's in time; with conditions if it is so "
+        "in inner iterations only.",
         _irk_time,
         assumed=True,
     ),
@@ -366,7 +372,7 @@ CLAIMS = (
         "With err_out = 1e-3 Newmark gives no reasonable long-time result, with smaller ones it does.",
         "Table 3.",
         {"table3": ("group = Table 3: Newmark", ("err_out", "lost", "astray", "energy", "kinetic", "t_end"))},
-        f"Holds if all cells with 1e-3 are lost (energy error above {LOST:.0%} of the kinetic energy) and no other; with conditions if some.",
+        f"Holds if all cells with 1e-3 are lost (energy error above {LOST:.0%} of the kinetic energy) and no other, and the others are in phase; with conditions if they are not.",
         _newmark_star,
         assumed=True,
     ),

@@ -51,10 +51,11 @@ def paragraph(k: int, claim: Claim, found: Judgement) -> str:
         f"`{study}.csv`, rows: {which}; columns: {', '.join(f'`{column}`' for column in columns)}"
         for study, (which, columns) in claim.rows.items()
     )
+    finding = f"{found.why.rstrip('.')}." if found.verdict is Verdict.UNCHECKED else f"{found.number}. {found.why}"
     lines = [
         f"### Claim {k}",
         f"Sect. {claim.section}: {claim.statement}",
-        f"- **{found.verdict.capitalize()}**: {found.number}. {found.why[:1].upper()}{found.why[1:]}",
+        f"- **{found.verdict.capitalize()}**: {finding}",
         f"- Run: {claim.runs}",
         f"- Criterion: {claim.criterion}",
         f"- Rows: {rows or 'none'}.",

@@ -146,7 +146,7 @@ def values_alone(problem: Problem) -> Iterator[Row]:
 def stiff() -> Iterator[Row]:
     """Steps on springs so weakly excited that no error counts: h times the frequency, stiffer and stiffer."""
     method = paper_irk(LOOPS, LOOPS)
-    for omega in (10.0, 100.0, 1000.0):
+    for omega in (10.0, 1000.0):
         system = ConstrainedSystem.from_python(
             n_q=2,
             n_c=1,
@@ -161,7 +161,7 @@ def stiff() -> Iterator[Row]:
         result = solve_dae(system, span, q0, np.zeros(2), method=method, rtol=1.0, atol=1.0)
         yield row("stiff spring", "largest h omega of an accepted step", result.h.max() * omega, omega, "spring")
         yield row("stiff spring", "rejected by the error", result.stats.n_rejected_error or 0, omega, "spring")
-        yield row("stiff spring", "largest h, s", result.h.max(), omega, "spring")
+        yield row("stiff spring", "reached its end", float(result.success), omega, "spring")
 
 
 def determinants(problem: Problem) -> Iterator[Row]:
