@@ -99,10 +99,9 @@ def changes(each, rows):
         if study == "claims":
             checks = [check for check in table["check"].unique() if check in which]
             assert checks, which
-            places = [
-                table.index[table["check"].isin(checks) & (table["case"] == case)] for case in table["case"].unique()
-            ]
-            targets = [("value", place) for place in places if len(place)]
+            part = table[table["check"].isin(checks)]
+            cases = [part.index[part["case"] == case] for case in part["case"].unique()]
+            targets = [("value", place) for place in (part.index, *cases)]
         else:
             keys = [key for key in ("err_in", "solver") if key in table]
             split = [table.index, *(table.index[table[key] == one] for key in keys for one in table[key].unique())]
