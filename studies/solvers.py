@@ -122,7 +122,7 @@ def _exudyn(solver: str, options: Mapping[str, float], problem: Problem, t_end: 
 def _gear(order: int, start: str, problem: Problem, t_end: float, step: float, k: int) -> Result:
     n_steps = round(t_end / step)
     every = max(1, n_steps // STORED)
-    kept = np.append(np.arange(0, n_steps, every), n_steps) * step
+    kept = np.append(np.arange(0, n_steps, every) * step, t_end)
     return solve_gear(problem.system, (0.0, t_end), problem.q0, problem.v0, step, order, start=start, t_eval=kept)
 
 
