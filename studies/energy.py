@@ -112,7 +112,7 @@ CONTROLLED: dict[str, dict[str, list[Variant]]] = {  # what is run with step-siz
     ONE: {SUN: [MOMENTA_LASTING]},
     SWITCHING: {GAUSS: [EVEN]},
 }
-GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period between samples: no fraction of few parts, so no phase is left out
+GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 
 @dataclass(frozen=True)
@@ -165,9 +165,8 @@ def instants(job: EnergyJob, period: float) -> Array | None:
     if job.t_end <= SHORT:
         return None
     interval = GOLDEN * period
-    if job.h is not None:  # the multiple of h whose part of a period is nearest to the golden section
-        strides = np.arange(1, int(2.0 * period / job.h))
-        interval = job.h * float(strides[np.abs(strides * job.h / period % 1.0 - GOLDEN).argmin()])
+    if job.h is not None:  # on the grid, where landing changes no step: four times as many
+        interval = job.h * round(0.25 * interval / job.h)
     n_intervals = int(job.t_end / interval * (1.0 - 1e-12))
     return interval * np.arange(n_intervals + 1, dtype=np.float64)
 

@@ -300,8 +300,8 @@ not mirrored, because each step follows from the one before; symplecticity and r
 Except in PaperIRK the accepted state is moreover the extrapolated one, which is not the tableau's."""
 
 
-ORDERS = """Across mirrored changes of the partition the drift of Sun's tableau falls with its order 5, as jumps of order h^5 must, and so does Radau IIA's
-everywhere. On one partition the drift of Sun's method on (q_i, v_i) falls faster, as h^7: there the error of order h^5 averages out over a swing
+ORDERS = """Across mirrored changes of the partition the drift of Sun's tableau falls with its order 5, as jumps of order h^5 must, and so does
+Radau IIA's on one partition, where nothing makes its error average out. On one partition the drift of Sun's method on (q_i, v_i) falls faster, as h^7: there the error of order h^5 averages out over a swing
 and back, which is measured, not derived here. It is why the drift is easily overlooked at small steps, and it is no property of a symplectic map, whose drift vanishes.
 Where the partition lasts until worn, the order is uneven: the place at which a partition wears out jumps from one step to the next."""
 
@@ -318,10 +318,11 @@ def _notes(rows: pd.DataFrame) -> str:
             f"{rows[rows['geometry'] == name]['kinetic'].iloc[0]:.3g} J ({name})" for name in (ONE, SWITCHING)
         )
         + ".",
-        "**Energy error** is E(t) − E(0). Long runs store it at intervals of 0.382 of a period (with fixed steps, the "
-        "multiple of h nearest to that golden section), so that samples spread evenly over the phases and a sampling beat is "
-        "not taken for a drift. Runs with step-size control land on these instants, which shortens up to two steps in each "
-        "interval and is part of the run measured; fixed steps are not changed by it. Short runs store every step and land nowhere.",
+        "**Energy error** is E(t) − E(0). Long runs store it at intervals of 0.382 of a period, the golden section, or with "
+        "fixed steps of a quarter of that, rounded to a multiple of h, so that samples spread evenly over the phases and a "
+        "beat of samples and period is not taken for a drift. Runs with step-size control land on these instants, which "
+        "shortens up to two steps in each interval and is part of the run measured; fixed steps are not changed by it. Short "
+        "runs store every step and land nowhere else.",
         f"**Drift** is the slope of a least-squares line through the means of {int(windows[ONE])} ({ONE}) and "
         f"{int(windows[SWITCHING])} ({SWITCHING}) windows of whole periods. Its standard error comes from the slopes in ten "
         "equal parts of the run (their standard deviation over √10): right for a random walk, whose increments in the ten parts are "
