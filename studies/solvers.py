@@ -16,7 +16,7 @@ from studies.runs import Job
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.methods import Method
-from twoloop.tableaux import sun_radau_iib
+from twoloop.tableaux import gauss, sun_radau_iib
 
 ERR_IN = 1e-9  # err_in and ...
 PAPER_TOL = 1e-5  # ... Atol = Rtol of the paper
@@ -27,7 +27,8 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C = "IDA from C, stabilised"
-PRESETS = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark")  # of twoloop, with their own options
+CANONICAL = "Gauss6, momenta, symmetric"
+PRESETS = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", "BDF")  # of twoloop, with their own options
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 
@@ -87,6 +88,11 @@ def _paper_newmark(beta: float, problem: Problem, t_end: float, err_out: float, 
     return two_loop(paper_newmark(ERR_IN, err_out, beta), problem, t_end, PAPER_TOL, k)
 
 
+def _canonical(problem: Problem, t_end: float, step: float, k: int) -> Result:
+    method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
+    return solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, method=method, step_size=step)
+
+
 def _ida(form: str, problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
     # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
     instants = np.linspace(0.0, t_end, INSTANTS)
@@ -143,6 +149,7 @@ def _all() -> Iterator[Solver]:
         yield Solver(name, "err_out", partial(_paper_newmark, beta), {"err_in": ERR_IN}, two_loop=True)
     for preset in PRESETS:
         yield Solver(preset, "tol", partial(two_loop, preset), two_loop=True)
+    yield Solver(CANONICAL, "h", _canonical, two_loop=True)
     for form in ida.FORMS:
         yield Solver(f"IDA, {form}", "tol", partial(_ida, form), own_a=True)
     yield Solver(IDA_C, "tol", _ida_c, own_a=True)
@@ -172,6 +179,7 @@ LINE_UP: dict[str, float] = {
     NEWMARK: 1e-9,
     QUARTER: 1e-9,
     **dict.fromkeys(PRESETS, 1e-8),
+    CANONICAL: 0.01,
     **{f"IDA, {form}": 1e-8 for form in ida.FORMS},
     IDA_C: 1e-8,
     "LSODA, index 1": 1e-8,

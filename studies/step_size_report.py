@@ -9,7 +9,7 @@ from studies.solvers import IRK, NEWMARK, QUARTER
 
 LONG = 0.02  # s; the paper: Runge-Kutta steps are longer than this most of the time
 IDA_STEPS = "IDA, stabilised"
-ZOOMED = (IRK, NEWMARK, QUARTER, "SunRadau5", "Gauss12", "Newmark", IDA_STEPS, "LSODA, index 1", "DOP853, projected")
+ZOOMED = (IRK, NEWMARK, QUARTER, "SunRadau5", "Gauss12", "BDF", IDA_STEPS, "LSODA, index 1", "DOP853, projected")
 
 MARKS = {  # curve: (marker, colour, label)
     "error": ("x", "black", "PaperIRK: error too large, shortened to this step"),

@@ -21,7 +21,7 @@ PAPER_NEWMARK = (
 )
 
 FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
-PRESETS_SHOWN = ("SunRadau5", "Gauss6", "Gauss12")
+PRESETS_SHOWN = ("SunRadau5", "Gauss6", "Gauss12", "BDF")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2")
 EXPLICIT = ("LSODA, index 1", "DOP853, index 1", "DOP853, projected")
 TWO_LOOP = (IRK, NEWMARK, QUARTER, IRK_LINE, *PRESETS_SHOWN)
@@ -133,6 +133,7 @@ SHOWN = {  # the lines of the figure: ours solid, others dashed
     IRK_LINE: ("tab:red", "^-"),
     "SunRadau5": ("tab:purple", "v-"),
     "Gauss12": ("tab:blue", "o-"),
+    "BDF": ("tab:pink", "X-"),
     "IDA, stabilised": ("tab:olive", "<--"),
     IDA_C: ("tab:green", ">--"),
     "Exudyn, TrapezoidalIndex2": ("tab:cyan", "D--"),

@@ -19,6 +19,7 @@ LEVELS_DRAWN = {  # line of the figure: ours solid, others dashed
     IRK: ("tab:blue", "-"),
     NEWMARK: ("tab:orange", "-"),
     "Gauss12": ("tab:purple", "-"),
+    "BDF": ("tab:brown", "-"),
     "IDA, index1": ("tab:olive", "--"),
     "IDA, stabilised": ("tab:green", "--"),
     "LSODA, index 1": ("tab:gray", "--"),
