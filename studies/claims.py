@@ -8,7 +8,7 @@ import pandas as pd
 from rich.progress import track
 
 from studies import claims_algebra as algebra
-from studies import claims_conclusion, claims_four_bar, claims_introduction, claims_method
+from studies import claims_conclusion, claims_four_bar, claims_introduction, claims_method, claims_table3
 from studies import claims_steps as steps
 from studies.claims_report import judged, report, summary
 from studies.claims_verdicts import Claim
@@ -22,7 +22,8 @@ from twoloop.mechanisms import four_bar
 CLAIMS: tuple[Claim, ...] = (
     *claims_introduction.CLAIMS,
     *claims_method.CLAIMS,
-    *claims_four_bar.CLAIMS,  # those of Sect. 4.2, the beam, go here
+    *claims_four_bar.CLAIMS,
+    *claims_table3.CLAIMS,  # those of Sect. 4.2, the beam, go after these
     *claims_conclusion.CLAIMS,
 )
 SOURCES = ("table3", "motion", "step_size", "violation", "energy")  # studies whose rows are read

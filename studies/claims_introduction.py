@@ -104,7 +104,7 @@ def _explicit(rows: Rows) -> Judgement:
         f"in {len(diagonal)} methods. All weights would have to vanish, and they add up to 1."
     )
     return Judgement(
-        f"≥ {number(diagonal.min())}", grade(bool((diagonal > 1e-3).all() and (is_explicit == 0.0).all())), why
+        f"defect ≥ {number(diagonal.min())}", grade(bool((diagonal > 1e-3).all() and (is_explicit == 0.0).all())), why
     )
 
 
@@ -118,7 +118,7 @@ def _newmark_symplectic(rows: Rows) -> Judgement:
         "its circumstances; its β = γ = 1/2 is the third of the cases run."
     )
     return Judgement(
-        f"{int(symplectic.sum())} of {len(found)} cases", grade(bool(symplectic.any() and not symplectic.all())), why
+        f"{int(symplectic.sum())} of {len(found)} (β, γ)", grade(bool(symplectic.any() and not symplectic.all())), why
     )
 
 
@@ -141,7 +141,9 @@ def _newmark_order(rows: Rows) -> Judgement:
         )
     text = "; ".join(f"{case}: {order:.2f}" for case, order in found.items())
     met = all(abs(found[case] - expected[case]) < ORDER for case in expected)
-    return Judgement(", ".join(f"{order:.2f}" for order in found.values()), grade(met), f"Measured: {text}.")
+    return Judgement(
+        f"orders {', '.join(f'{order:.2f}' for order in found.values())}", grade(met), f"Measured: {text}."
+    )
 
 
 def _gamma(rows: Rows) -> Judgement:
@@ -150,7 +152,7 @@ def _gamma(rows: Rows) -> Judgement:
         for case in ("as printed", "opposite sign")
     )
     why = f"Along a given path the printed Q_d is wrong by {number(right)} (the differences' own error), the negative by {number(wrong)}."
-    return Judgement(number(right), grade(right < 1e-6 < wrong), why)
+    return Judgement(f"error {number(right)}", grade(right < 1e-6 < wrong), why)
 
 
 def _formulas(rows: Rows, *cases: str) -> Judgement:
@@ -162,7 +164,7 @@ def _formulas(rows: Rows, *cases: str) -> Judgement:
     )
     worst = float(found["value"].max())
     return Judgement(
-        number(worst),
+        f"difference {number(worst)}",
         grade(worst < SAME),
         f"Largest relative difference, on every geometry of the rows: {number(worst)}.",
     )
@@ -188,7 +190,11 @@ def _levels(rows: Rows) -> Judgement:
         "err_in leaves is the square of the last correction; it is below "
         f"{TIGHT:g} m for err_in = {', '.join(f'{e:.0e}' for e in good.index) or 'none'}."
     )
-    return Judgement(number(max(worst)), grade(met and len(good) == len(by_err_in), met), why)
+    return Judgement(
+        f"{number(worst[0])} m at err_in 1e-9, {number(by_err_in.max())} m at {by_err_in.idxmax():.0e}",
+        grade(met and len(good) == len(by_err_in), met),
+        why,
+    )
 
 
 def _coordinates(rows: Rows) -> Judgement:
@@ -201,7 +207,7 @@ def _coordinates(rows: Rows) -> Judgement:
         "orthogonal complement of the rows of C_q; QR with column pivoting would pick coordinates as LU does."
     )
     numbers = ", ".join(f"{n:g}" for n in used.values())
-    return Judgement(numbers, grade(used["LU"] == 1 and used["SVD"] > 1 and used["QR"] > 1), why)
+    return Judgement(f"{numbers} coordinates", grade(used["LU"] == 1 and used["SVD"] > 1 and used["QR"] > 1), why)
 
 
 def _lasting(rows: Rows) -> Judgement:

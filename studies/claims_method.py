@@ -30,13 +30,13 @@ def _table1(rows: Rows) -> Judgement:
         f"fails by {number(sixth)}, so the order is not 6. The text at hand lost b_3, c_3 and a_33; Σb = 1, symplecticity and the row "
         f"sums give 1/9, 1 and 1/18 (without them the conditions fail by {number(lost)}). twoloop's tableau differs by {number(difference)}."
     )
-    return Judgement(number(defect), grade(max(defect, symplectic) < ROUNDING and sixth > 1e-6), why)
+    return Judgement(f"defect {number(defect)}", grade(max(defect, symplectic) < ROUNDING and sixth > 1e-6), why)
 
 
 def _order(rows: Rows) -> Judgement:
     order = measured_order(rows, "Sun")
     return Judgement(
-        f"{order:.2f}",
+        f"order {order:.2f}",
         grade(order > 5.0 - ORDER),
         f"Error at 1 s with h = 0.02 and 0.01 s: order {order:.2f}. On linear problems Sun's method is of order 6.",
     )
@@ -52,7 +52,7 @@ def _map(rows: Rows) -> Judgement:
         "on q_i."
     )
     in_part = momenta < SYMPLECTIC < velocities < NOT_SYMPLECTIC
-    return Judgement(number(velocities), grade(velocities < SYMPLECTIC, in_part), why)
+    return Judgement(f"det off by {number(velocities)}", grade(velocities < SYMPLECTIC, in_part), why)
 
 
 def drifts(run: pd.Series) -> bool:
@@ -102,7 +102,7 @@ def _reduction(rows: Rows) -> Judgement:
         f"Two sets of stages that give the same y_n+1 (to {number(given)}) and differ by up to {number(stages)} give next iterates that "
         f"differ by {number(after)}. The sweep is a map of the s stages K_i, 2 s n unknowns; y_n+1 alone does not determine them for s > 1."
     )
-    return Judgement(number(after), grade(after < 1e3 * max(given, EPS)), why)
+    return Judgement(f"next y differ by {number(after)}", grade(after < 1e3 * max(given, EPS)), why)
 
 
 def _jacobian(rows: Rows) -> Judgement:
@@ -159,7 +159,7 @@ def _rheonomic(rows: Rows) -> Judgement:
         f"For a pendulum with a moving pivot q̇_d changes by {number(by_q)} m/s with q_i at equal q̇_i, and by {number(by_t)} m/s with t "
         "at equal q_i and q̇_i: q̇_d = g_1(t, q_i, q̇_i), q_d = g_2(t, q_i). A slip of notation: (23) and the algorithm are right."
     )
-    return Judgement(f"{number(by_q)}, {number(by_t)}", grade(max(by_q, by_t) < 1e-10), why)
+    return Judgement(f"q̇_d changes by {number(by_q)}, {number(by_t)} m/s", grade(max(by_q, by_t) < 1e-10), why)
 
 
 def _richardson(rows: Rows) -> Judgement:
@@ -171,7 +171,7 @@ def _richardson(rows: Rows) -> Judgement:
         "2^5 − 1 = 31). It errs on the safe side: steps are 31^(1/6) = 1.77 times shorter than Atol and Rtol ask for."
     )
     near = bool(((ratios > 1.0 / FACTOR_2) & (ratios < FACTOR_2)).all())
-    return Judgement(f"× {span(ratios)}", grade(near, bool((ratios >= FACTOR_2).all())), why)
+    return Judgement(f"{span(ratios)} × the error", grade(near, bool((ratios >= FACTOR_2).all())), why)
 
 
 def _components(rows: Rows) -> Judgement:

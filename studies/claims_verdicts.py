@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from studies.report import number
 from studies.runs import time_for
 from twoloop.mechanisms import four_bar
 
@@ -151,5 +152,5 @@ def cell(rows: Rows, group: str, err_in: float, err_out: float, problem: str = D
 def span(values: Any) -> str:
     """Least and largest of some numbers, in few digits."""
     array = np.asarray(list(values), dtype=float)
-    low, high = f"{array.min():.3g}", f"{array.max():.3g}"
+    low, high = number(array.min()), number(array.max())
     return low if low == high else f"{low} to {high}"
