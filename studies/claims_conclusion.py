@@ -117,7 +117,7 @@ CLAIMS = (
         {
             "table3": (
                 "solver = the three, err_in = 1e-9 or none, not astray",
-                ("error_q", "n_evaluations", "astray", "t_end"),
+                ("n_evaluations", "error_q", "astray", "t_end"),
             )
         },
         f"Holds if the exponents are within {NEAR:.0%} of 1 / order and PaperIRK's is the least; with conditions if only the latter.",

@@ -38,7 +38,9 @@ def _index(rows: Rows) -> Judgement:
     least = float(found["value"].min())
     text = f"least eigenvalue / largest = {number(least)} over a period, on {len(found)} geometries"
     return Judgement(
-        number(least), grade(least > REGULAR), f"C_q M⁻¹ C_qᵀ: {text}. It is regular where the index is 3."
+        f"≥ {number(least)} of the largest",
+        grade(least > REGULAR),
+        f"C_q M⁻¹ C_qᵀ: {text}. It is regular where the index is 3.",
     )
 
 
@@ -253,7 +255,7 @@ def _beta(rows: Rows) -> Judgement:
     )
 
 
-TABLE3 = ("error_q", "cpu_s", "n_evaluations")
+TABLE3 = ("cpu_s", "n_evaluations", "error_q")
 VALUE = ("check", "case", "value")
 
 CLAIMS = (

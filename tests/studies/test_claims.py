@@ -110,7 +110,7 @@ def changes(each, rows):
             for different in DIFFERENT:
                 changed = table.astype({column: object})
                 changed.loc[place, column] = different
-                yield {**rows, study: changed}
+                yield {**rows, study: changed.infer_objects()}
 
 
 @pytest.mark.parametrize("each", [each for each in CLAIMS if each.rows], ids=lambda each: each.statement[:40])
