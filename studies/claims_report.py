@@ -114,4 +114,5 @@ HOW = f"""- **A verdict** is what a function of `studies/claims_*.py` makes of t
   that depend on it compare patterns, not runs.
 - **GSTIFF** is not here. Its stand-in is a fixed-step BDF on the index-3 form (`references/gear.py`), of orders 1 to 6, because the paper tells neither order nor
   version.
-- **CPU time** is noisy; where it decides, evaluations decide with it."""
+- **CPU time** is noisy; where it decides, counts, which are not, stand beside it.
+- **To recompute**: `python -m studies.claims --redraw` judges the saved rows again; change a row and see the verdict follow."""
