@@ -213,7 +213,9 @@ class _Run:
         first_row = every_step or (times is not None and times[0] == self.t0)
         t_parts = [np.array([self.t0])] if first_row else []
         rows = [self.state.copy()[None, :]] if first_row else []
-        step_parts: list[Array] = []
+        h_parts: list[Array] = []
+        count_parts: list[NDArray[np.int64]] = []
+        counted = np.array([[0.0, 0.0, 1.0]])  # so far; the first partition of a run is not a renewal
         out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
         out_state = np.empty((BUFFER_ROWS, len(self.state)))
         filled = np.zeros(2, dtype=np.int64)
@@ -241,16 +243,17 @@ class _Run:
             cpu += time.process_time() - began
             t_parts.append(out_t[: filled[0]].copy())
             rows.append(out_state[: filled[0]].copy())
-            step_parts.append(out_steps[: filled[1]].copy())
+            steps = out_steps[: filled[1]]
+            h_parts.append(steps[:, a.H].copy())
+            count_parts.append(np.diff(steps[:, a.ERRORS :], axis=0, prepend=counted).astype(np.int64))
+            counted = steps[-1:, a.ERRORS :].copy() if len(steps) else counted
             report(self.clock[a.T])
         t = np.concatenate(t_parts)
         table = np.concatenate(rows)
         if times is not None and times[-1] != t1 and len(t) > 0 and t[-1] == t1:
             t, table = t[:-1], table[:-1]
         n = system.n_q
-        steps = np.concatenate(step_parts)
-        # counted from the start of the run, whose first partition is not a renewal
-        counts: NDArray[np.int64] = np.diff(steps[:, 1:], axis=0, prepend=np.array([[0.0, 0.0, 1.0]])).astype(np.int64)
+        errors, failures, partitions = np.concatenate(count_parts).T
         status, message = self._outcome(code)
         return Result(
             t=t,
@@ -258,13 +261,13 @@ class _Run:
             v=table[:, n : 2 * n].T,
             a=table[:, 2 * n : 3 * n].T,
             lam=table[:, 3 * n :].T,
-            h=steps[:, a.H].copy(),
+            h=np.concatenate(h_parts),
             status=status,
             message=message,
             stats=self._statistics(cpu),
-            rejected_error=counts[:, a.ERRORS - 1],
-            rejected_convergence=counts[:, a.FAILURES - 1],
-            partitioned=counts[:, a.PARTITIONS - 1],
+            rejected_error=errors,
+            rejected_convergence=failures,
+            partitioned=partitions,
         )
 
     def _statistics(self, cpu: float) -> Statistics:
