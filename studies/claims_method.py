@@ -100,7 +100,7 @@ def _reduction(rows: Rows) -> Judgement:
     )
     why = (
         f"Two sets of stages that give the same y_n+1 (to {number(given)}) and differ by up to {number(stages)} give next iterates that "
-        f"differ by {number(after)}. The sweep is a map of the s stages K_i, 2 s n unknowns; y_n+1 alone does not determine them for s > 1."
+        f"differ by {number(after)}. The sweep is a map of the s stages K_i, 2 s n unknowns; y_n+1 alone does not determine them for s > 1. The algorithm printed below (18) carries the K_i from sweep to sweep, and works."
     )
     return Judgement(f"next y differ by {number(after)}", grade(after < 1e3 * max(given, EPS)), why)
 
@@ -142,12 +142,12 @@ def _embedding(rows: Rows) -> Judgement:
         runs = pick(rows, "claims", check="embedding", case=case).sort_values("setting")
         error, h = runs["value"].to_numpy(), runs["setting"].to_numpy()
         orders[case], errors[case] = float(np.log(error[-1] / error[0]) / np.log(h[-1] / h[0])), error[0]
-    one_, other = orders["embedded"], orders["y_d constant in a step"]
+    inside, outside = orders["embedded"], orders["y_d constant in a step"]
     why = (
-        f"Order at 0.4 s with h = 0.04 and 0.02 s: {one_:.2f} with the dependents at every stage, {other:.2f} with y_d constant in a "
+        f"Order at 0.4 s with h = 0.04 and 0.02 s: {inside:.2f} with the dependents at every stage, {outside:.2f} with y_d constant in a "
         f"step; errors at 0.02 s {number(errors['embedded'])} and {number(errors['y_d constant in a step'])}."
     )
-    return Judgement(f"order {one_:.2f}, not {other:.2f}", grade(one_ > 5.0 - 2 * ORDER and other < 2.0), why)
+    return Judgement(f"order {inside:.2f}, not {outside:.2f}", grade(inside > 5.0 - 2 * ORDER and outside < 2.0), why)
 
 
 def _rheonomic(rows: Rows) -> Judgement:
