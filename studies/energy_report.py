@@ -301,7 +301,7 @@ Except in PaperIRK the accepted state is moreover the extrapolated one, which is
 
 
 ORDERS = """Across mirrored changes of the partition the drift of Sun's tableau falls with its order 5, as jumps of order h^5 must, and so does
-Radau IIA's on one partition, where nothing makes its error average out. On one partition the drift of Sun's method on (q_i, v_i) falls faster, as h^7: there the error of order h^5 averages out over a swing
+Radau IIA's on one partition. There the drift of Sun's method on (q_i, v_i) falls faster, as h^7: the error of order h^5 averages out over a swing
 and back, which is measured, not derived here. It is why the drift is easily overlooked at small steps, and it is no property of a symplectic map, whose drift vanishes.
 Where the partition lasts until worn, the order is uneven: the place at which a partition wears out jumps from one step to the next."""
 
