@@ -22,15 +22,18 @@ from exudyn.itemInterface import (
 )
 from numpy.typing import NDArray
 
-from twoloop.checks import check_size, check_vector
+from twoloop.checks import check_number, check_size, check_vector
 from twoloop.mechanisms.problem import Problem
 from twoloop.result import Result, Statistics, Status
 
 Array = NDArray[np.float64]
 
+SPECTRAL_RADIUS = 0.9  # Exudyn's default
+ALPHA = -0.3  # of HHT; the default of MSC Adams, whose HHT integrator is the usual one on index 3
 SOLVERS = {
     "GeneralizedAlpha": "Exudyn generalized-alpha, spectral radius 0.9, index 3, fixed step",
     "TrapezoidalIndex2": "Exudyn trapezoidal rule, index 2, fixed step",
+    "HHT": "Exudyn's generalized-alpha solver with the coefficients of Hilber, Hughes and Taylor, index 3, fixed step",
 }
 
 _OUTPUTS = (
@@ -41,7 +44,14 @@ _OUTPUTS = (
 
 
 def solve_exudyn(
-    problem: Problem, t_end: float, n_steps: int, solver: str = "GeneralizedAlpha", *, store_every: int = 1
+    problem: Problem,
+    t_end: float,
+    n_steps: int,
+    solver: str = "GeneralizedAlpha",
+    *,
+    spectral_radius: float | None = None,
+    alpha: float | None = None,
+    store_every: int = 1,
 ) -> Result:
     """Run the four-bar linkage from rest with one of Exudyn's implicit solvers, with a fixed step.
 
@@ -53,8 +63,24 @@ def solve_exudyn(
         End, s; the run starts at 0.
     n_steps : int
         Number of steps.
-    solver : {"GeneralizedAlpha", "TrapezoidalIndex2"}
+    solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
         `SOLVERS` describes each in a line fit for a table.
+
+        "GeneralizedAlpha": J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, on index 3 by M. Arnold and
+        O. Bruels, Multibody Syst. Dyn. 18 (2007) 185-202. From the spectral radius r at infinite frequency
+        alpha_m = (2 r - 1)/(r + 1), alpha_f = r/(r + 1), gamma = 1/2 - alpha_m + alpha_f, beta = (gamma + 1/2)^2/4.
+
+        "HHT": alpha_m = 0, alpha_f = -alpha, gamma = (1 - 2 alpha)/2, beta = (1 - alpha)^2/4 (Hilber, Hughes and
+        Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292). Exudyn has no setting for it: its settings know alpha_m
+        and alpha_f through r only, and r = 1/2, where alpha_m vanishes, is HHT with alpha = -1/3. For the others its
+        solver is started and its four coefficients are overwritten before the first step. This is the
+        formula of HHT-I3, not its step-size control.
+    spectral_radius : float, optional
+        Of "GeneralizedAlpha" alone, 0 (most damping) to 1 (none). None: 0.9, Exudyn's default. With 1 the index-3
+        form is weakly unstable: on the four-bar linkage the run fails within seconds, whatever the step.
+    alpha : float, optional
+        Of "HHT" alone, -1/3 (most damping) to 0 (the trapezoidal rule, as unstable as a spectral radius of 1). None:
+        -0.3, the default of MSC Adams.
     store_every : int
         Store the start and every so many steps; `n_steps` must be a multiple of it.
 
@@ -66,7 +92,7 @@ def solve_exudyn(
         accumulated sum. `h` is empty unless every step is stored. A step that does not converge gives what was stored
         before it, `Status.SOLVER_FAILED` and Exudyn's text. Of the statistics Exudyn tells steps (n_accepted), Newton
         iterations (n_outer) and Jacobians, each with its factorisation (n_factorizations); cpu_time is that of
-        SolveDynamic.
+        the solver, its initialisation included.
 
     Raises
     ------
@@ -81,19 +107,53 @@ def solve_exudyn(
         raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
     if solver not in SOLVERS:
         raise ValueError(f"solver must be one of {', '.join(SOLVERS)}; given {solver!r}")
+    radius = _option("spectral_radius", spectral_radius, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
+    strength = _option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
 
     q0 = _positions(problem)
     _container, mbs, sensors = _model(problem, q0)
     settings = _settings(t_end, n_steps, store_every)
-    failure = ""
+    settings.timeIntegration.generalizedAlpha.spectralRadius = radius
     with _silence():
         began = time.process_time()
-        try:
-            mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
-        except exu.SolverError as error:
-            failure = f"{error}: {mbs.sys['dynamicSolver'].GetErrorString()}"
+        failure = _solve_hht(mbs, settings, strength) if solver == "HHT" else _solve(mbs, settings, solver)
         cpu = time.process_time() - began
     return _result(mbs, sensors, q0, store_every == 1, failure, cpu)
+
+
+def _option(
+    name: str, value: float | None, default: float, span: tuple[float, float], owner: str, solver: str
+) -> float:
+    """The value of an option that belongs to one solver, checked."""
+    if value is None:
+        return default
+    if solver != owner:
+        raise ValueError(f"{name} belongs to solver={owner!r}; given {name}={value!r} with solver={solver!r}")
+    if not span[0] <= check_number(name, value) <= span[1]:
+        raise ValueError(f"{name} must be between {span[0]:g} and {span[1]:g}; given {value!r}")
+    return float(value)
+
+
+def _solve(mbs: Any, settings: Any, solver: str) -> str:
+    """Run one of Exudyn's own solvers; the text of a failure, or nothing."""
+    try:
+        mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
+    except exu.SolverError as error:
+        return f"{error}: {mbs.sys['dynamicSolver'].GetErrorString()}"
+    return ""
+
+
+def _solve_hht(mbs: Any, settings: Any, alpha: float) -> str:
+    """Run the generalized-alpha solver with HHT's coefficients; the text of a failure, or nothing."""
+    solver: Any = exu.MainSolverImplicitSecondOrder()
+    mbs.sys["dynamicSolver"] = solver  # where SolveDynamic leaves it, too
+    solver.InitializeSolver(mbs, settings)
+    solver.alphaM, solver.alphaF = 0.0, -alpha
+    solver.newmarkBeta, solver.newmarkGamma = 0.25 * (1.0 - alpha) ** 2, 0.5 - alpha
+    solver.factJacAlgorithmic = 1.0 - solver.alphaF  # (1 - alpha_f) / (1 - alpha_m)
+    reached = solver.SolveSteps(mbs, settings)
+    solver.FinalizeSolver(mbs, settings)
+    return "" if reached else f"SolveSteps terminated: {solver.GetErrorString()}"
 
 
 @contextlib.contextmanager

@@ -2,21 +2,36 @@
 
 import importlib
 import sys
+import traceback
 
-STUDIES = ("linkage", "table3")
+from studies.index import STUDIES
 
 
 def main() -> None:
     words = sys.argv[1:]
-    modules = {name: importlib.import_module(f"studies.{name}") for name in STUDIES}
-    if words[:1] != ["all"]:
-        if words:
-            sys.exit(f"usage: python -m studies [all [--quick] [--out DIR]]; given {' '.join(words)}")
-        for name, module in modules.items():
+    if words[:1] == ["all"]:
+        run_all(words[1:])
+    elif words:
+        sys.exit(f"usage: python -m studies [all [--quick] [--out DIR]]; given {' '.join(words)}")
+    else:
+        for name in STUDIES:
+            module = importlib.import_module(f"studies.{name}")
             print(f"python -m studies.{name:10s} {(module.__doc__ or '').splitlines()[0]}")
-        return
-    for name, module in modules.items():
-        module.main([*words[1:]], command=f"python -m studies.{name} {' '.join(words[1:])}".strip())
+
+
+def run_all(words: list[str]) -> None:
+    """Run every study; one that fails does not keep the others from running, and is named at the end."""
+    failed = []
+    for name in STUDIES:
+        print(f"--- {name}", flush=True)
+        try:
+            module = importlib.import_module(f"studies.{name}")
+            module.main(words, command=f"python -m studies.{name} {' '.join(words)}".strip())
+        except Exception:  # a bug in one study; what is not an Exception (Ctrl-C, wrong options) ends the run
+            traceback.print_exc()
+            failed.append(name)
+    if failed:
+        sys.exit(f"{len(failed)} of {len(STUDIES)} studies failed, see above: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

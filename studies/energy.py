@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from studies.energy_drift import (
+    BDF_LOOP,
     GAUSS,
     GAUSS_12,
     LOBATTO,
@@ -36,10 +37,11 @@ from studies.energy_drift import (
     windows,
 )
 from studies.energy_report import figures, headline, report
+from studies.index import put_in_index
 from studies.kept_rows import KeptRows, Row
 from studies.report import Call, load_rows, parse, save_rows, stamp
 from studies.runs import Truth
-from twoloop import Newmark, Result, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.methods import Method
 from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
@@ -61,12 +63,13 @@ METHODS: dict[str, Method] = {
     NEWMARK_QUARTER: Newmark(0.25),
     NEWMARK_HALF: Newmark(0.5),
     PAPER_IRK: paper_irk(),
+    BDF_LOOP: BDF(),
     PAPER_NEWMARK_QUARTER: paper_newmark(1e-9, ERR_OUT, beta=0.25),
     PAPER_NEWMARK_HALF: paper_newmark(1e-9, ERR_OUT),
 }
 SHORT, LONG = 100.0, 10_000.0  # s
 QUICK = (75.0, 50.0)  # s, long and short of the quick version
-H, H_ORDER_2 = 0.02, 0.01  # s
+H, H_SMALL = 0.02, 0.01  # s; the smaller one for the methods of order 2, and for BDF, which does not converge with H
 BASIC, EVEN = VELOCITIES_LASTING, VELOCITIES_SYMMETRIC
 FIXED: dict[str, dict[str, list[Variant]]] = {  # geometry: method: (variables, partition)
     ONE: {
@@ -78,6 +81,7 @@ FIXED: dict[str, dict[str, list[Variant]]] = {  # geometry: method: (variables, 
         MIDPOINT: [BASIC, MOMENTA_LASTING],
         NEWMARK_QUARTER: [BASIC],
         NEWMARK_HALF: [BASIC],
+        BDF_LOOP: [BASIC],
     },
     SWITCHING: {
         SUN: [BASIC, EVEN, MOMENTA_LASTING, MOMENTA_SYMMETRIC],
@@ -88,6 +92,7 @@ FIXED: dict[str, dict[str, list[Variant]]] = {  # geometry: method: (variables, 
         MIDPOINT: [BASIC, EVEN, MOMENTA_SYMMETRIC],
         NEWMARK_QUARTER: [BASIC],
         NEWMARK_HALF: [BASIC],
+        BDF_LOOP: [BASIC],
     },
 }
 TOLERANCES = {  # Rtol = Atol; for PaperNewmark it is err_out
@@ -98,6 +103,7 @@ TOLERANCES = {  # Rtol = Atol; for PaperNewmark it is err_out
     GAUSS: 1e-5,
     LOBATTO: 1e-5,
     RADAU: 1e-5,
+    BDF_LOOP: 1e-5,
 }
 LADDER = (0.015, 0.01)  # s, smaller steps that tell the order of a drift
 LADDERED: list[tuple[str, str, Variant]] = [
@@ -137,7 +143,7 @@ def jobs(quick: bool) -> Iterator[EnergyJob]:
                 for variant in (BASIC, *CONTROLLED[geometry].get(solver, [])):
                     yield EnergyJob(geometry, t_end, solver, None, tol, *variant)
             for solver, variants in FIXED[geometry].items():
-                h = H_ORDER_2 if solver in (MIDPOINT, NEWMARK_QUARTER, NEWMARK_HALF) else H
+                h = H_SMALL if solver in (MIDPOINT, NEWMARK_QUARTER, NEWMARK_HALF, BDF_LOOP) else H
                 for variant in variants:
                     yield EnergyJob(geometry, t_end, solver, h, None, *variant)
     for geometry, solver, variant in LADDERED:
@@ -245,7 +251,9 @@ def main(words: list[str] | None = None, command: str | None = None) -> None:
         rows, series, line = run(call)
     report(rows, line, call)
     figures(rows, series, call)
-    print(headline(rows))
+    picture = "![Energy over the long run](energy_long.png)"
+    text = f"[Report](energy.md), [rows](energy.csv)\n\n{picture}\n\n{headline(rows)}"
+    put_in_index(call, "energy", __doc__, text, line)
     print(f"wrote energy.md, energy.csv, energy_windows.csv and figures to {call.out}")
 
 

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 SUN, GAUSS, LOBATTO, RADAU = "Sun Radau IIB(3)", "Gauss(3)", "Lobatto IIIE(4)", "Radau IIA(3)"
 GAUSS_12, MIDPOINT = "Gauss(6)", "implicit midpoint"
 NEWMARK_QUARTER, NEWMARK_HALF = "Newmark, β = 1/4", "Newmark, β = 1/2"
-PAPER_IRK = "PaperIRK"
+PAPER_IRK, BDF_LOOP = "PaperIRK", "BDF"
 PAPER_NEWMARK_QUARTER, PAPER_NEWMARK_HALF = "PaperNewmark, β = 1/4", "PaperNewmark, β = 1/2"
 ONE, SWITCHING = "one partition", "switching"
 Variables = Literal["velocities", "momenta"]

@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 
 from studies.energy_drift import (
+    BDF_LOOP,
     CREEPS,
     DRIFTS,
     GAUSS,
@@ -338,7 +339,7 @@ def _notes(rows: pd.DataFrame) -> str:
         "geometry and length, over that of the row; with ≥, over the largest slope the row does not exclude (slope and "
         f"{RESOLVED:g} standard errors).",
         "**Variables**: (q_i, v_i), the paper's, or (q_i, p_i). **Partition**: lasting, kept until max |C_qd⁻¹ C_qi| has grown "
-        "threefold, or symmetric, chosen in the middle of each step. Newmark, PaperIRK and PaperNewmark have no such options.",
+        "threefold, or symmetric, chosen in the middle of each step. Newmark, BDF, PaperIRK and PaperNewmark have no such options.",
         "**Steps** were chosen so that energy errors stand clear of rounding and every method converges: compare rows with the "
         "same h, and the methods of order 2 among themselves. Outer loops iterate to 1e-14 at fixed steps. `PaperNewmark`: the tolerance is err_out.",
         "**CPU times** are not measured here: runs share the cores. Evaluations (whole evaluations, dependents and "
@@ -356,6 +357,7 @@ COLORS = {
     NEWMARK_QUARTER: "tab:gray",
     NEWMARK_HALF: "black",
     PAPER_IRK: "tab:purple",
+    BDF_LOOP: "tab:olive",
     PAPER_NEWMARK_QUARTER: "tab:pink",
     PAPER_NEWMARK_HALF: "tab:brown",
 }

@@ -4,7 +4,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from references.four_bar_minimal import MinimalFourBar
-from studies.report import parse
+from studies.index import put_in_index
+from studies.report import parse, stamp
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
 
@@ -51,6 +52,8 @@ def main(words: list[str] | None = None, command: str | None = None) -> None:
         draw(one, problem)
     figure.suptitle("Released from rest (dark, thick); drawn at equal intervals of time, later is lighter", fontsize=9)
     figure.savefig(call.out / "linkage.png")
+    plt.close(figure)
+    put_in_index(call, "linkage", __doc__, "![The linkage in its motion](linkage.png)", stamp(call.command))
     print(f"wrote {call.out / 'linkage.png'}")
 
 

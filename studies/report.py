@@ -11,9 +11,13 @@ from io import StringIO
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 mpl.use("Agg")
+
+Array = NDArray[np.floating]
 
 ROOT = Path(__file__).parent.parent
 REPORTS = ROOT / "reports"
@@ -104,6 +108,18 @@ def load_rows(path: Path) -> tuple[pd.DataFrame, str]:
     """Read what `save_rows` wrote."""
     first, rest = path.read_text().split("\n", 1)
     return pd.read_csv(StringIO(rest)), first.removeprefix("# ")
+
+
+def save_series(path: Path, series: dict[str, Array]) -> None:
+    """Write named arrays, of which figures are drawn, beside the rows."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(x, np.float32) for name, x in series.items()})
+
+
+def load_series(path: Path) -> dict[str, Array]:
+    """Read what `save_series` wrote."""
+    with np.load(path) as stored:
+        return {name: stored[name] for name in stored.files}
 
 
 def put_in_readme(text: str) -> None:

@@ -58,6 +58,9 @@ class Job:
     repeats: int = 3
 
 
+Measure = Callable[[Job, Result, "Truth"], dict[str, Any]]
+
+
 class Truth:
     """Reference motion of a four-bar linkage, and what can be said of one period of it.
 
@@ -143,8 +146,14 @@ def _run(job: Job, k: int) -> Result:
         return Result(nothing, columns, columns, columns, lam, nothing, status, str(error), Statistics())
 
 
-def collect(jobs: Iterable[Job], truths: dict[str, Truth], t_end: float) -> pd.DataFrame:
-    """Run all jobs, round by round so that a slow minute of the machine falls on all alike, under a progress bar."""
+def collect(
+    jobs: Iterable[Job], truths: dict[str, Truth], t_end: float, measure: Measure | None = None
+) -> pd.DataFrame:
+    """Run all jobs, round by round so that a slow minute of the machine falls on all alike, under a progress bar.
+
+    `measure(job, result, truth)` adds columns of a study's own to the row; an entry need not be a number, and stays
+    with the repeat that becomes the row.
+    """
     jobs = list(jobs)
     described: list[list[dict[str, Any]]] = [[] for _ in jobs]
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -156,20 +165,22 @@ def collect(jobs: Iterable[Job], truths: dict[str, Truth], t_end: float) -> pd.D
                     continue
                 settings = ", ".join(f"{key}={value:g}" for key, value in job.settings.items())
                 progress.update(task, description=f"{job.solver} ({settings})"[:50].ljust(50))
-                rows.append(_describe(_run(job, k), job.problem, truths[job.problem.name], t_end))
+                result, truth = _run(job, k), truths[job.problem.name]
+                more = {} if measure is None else measure(job, result, truth)
+                rows.append(_describe(result, job.problem, truth, t_end) | more)
                 progress.advance(task)
         progress.update(task, description="done".ljust(50))
     return pd.DataFrame([_median_row(job, rows) for job, rows in zip(jobs, described, strict=True)])
 
 
-def time_for(rows: pd.DataFrame, target: float) -> float:
-    """CPU time for an error over the run of at most `target`; NaN where no run of these rows is that good.
+def time_for(rows: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
+    """CPU time (or another cost) for an error over the run of at most `target`; NaN where no run is that good.
 
     Between the two runs on either side of the target, on the log-log line through them: solvers whose settings lie
     far apart are not made to look dear by it.
     """
     runs = rows[rows["error_q"].notna()].sort_values("error_q")
-    errors, times = runs["error_q"].to_numpy(), runs["cpu_s"].to_numpy()
+    errors, times = runs["error_q"].to_numpy(), runs[what].to_numpy()
     n_good = int((errors <= target).sum())
     if n_good == 0:
         return float("nan")

@@ -5,32 +5,25 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
-import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from references import exudyn_four_bar, ida
-from references.exudyn_four_bar import solve_exudyn
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import solve_index1
+from references import ida
+from studies.index import put_in_index
 from studies.report import REPORTS, Call, load_rows, parse, put_in_readme, save_rows, stamp
 from studies.runs import Job, Truth, collect
+from studies.solvers import CATALOGUE, IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER, two_loop
 from studies.table3_report import (
     EXPLICIT,
+    EXUDYN,
     FAMILIES,
-    IDA_C,
-    IRK,
-    IRK_LINE,
-    NEWMARK,
     PAPER_IRK,
     PAPER_NEWMARK,
     PRESETS_SHOWN,
-    QUARTER,
     TOLERANCES,
     figure,
     grid,
@@ -39,43 +32,11 @@ from studies.table3_report import (
     report,
     time_of,
 )
-from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop import paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.methods import Method
-from twoloop.tableaux import sun_radau_iib
 
-INSTANTS = 2001  # output times of solvers that interpolate
-NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is the row's
 SECOND = {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}
-
-
-def _ours(problem: Problem, method: str | Method, t_end: float, tolerance: float, k: int) -> Result:
-    return solve_dae(
-        problem.system, (0.0, t_end), problem.q0, problem.v0, method=method, rtol=tolerance, atol=tolerance
-    )
-
-
-def _ida(problem: Problem, form: str, t_end: float, tolerance: float, k: int) -> Result:
-    # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
-    instants = np.linspace(0.0, t_end, INSTANTS)
-    rtol = tolerance * (1.0 + NUDGE * k)
-    return solve_ida(problem.system, (0.0, t_end), problem.q0, problem.v0, form, rtol, tolerance, t_eval=instants)
-
-
-def _ida_c(problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
-    instants = np.linspace(0.0, t_end, INSTANTS)
-    rtol = tolerance * (1.0 + NUDGE * k)
-    return solve_ida_c(problem.system, (0.0, t_end), problem.q0, problem.v0, rtol, tolerance, t_eval=instants)
-
-
-def _index1(problem: Problem, method: str, stabilisation: str, t_end: float, tolerance: float, k: int) -> Result:
-    system, span = problem.system, (0.0, t_end)
-    return solve_index1(system, span, problem.q0, problem.v0, method, tolerance, tolerance, stabilisation=stabilisation)
-
-
-def _exudyn(problem: Problem, solver: str, t_end: float, step: float, k: int) -> Result:
-    n_steps = round(t_end / step)
-    return solve_exudyn(problem, t_end, n_steps, solver, store_every=max(1, n_steps // 5000))
 
 
 def cells(problem: Problem, t_end: float, grid: list[tuple[float, float]], repeats: int) -> Iterator[Job]:
@@ -83,39 +44,34 @@ def cells(problem: Problem, t_end: float, grid: list[tuple[float, float]], repea
     for (group, solver), (err_in, err_out) in itertools.product(FAMILIES.items(), grid):
         method: Method = paper_irk(err_in, err_out) if solver == IRK else paper_newmark(err_in, err_out)
         settings = {"err_in": err_in, "err_out": err_out}
-        yield Job(group, solver, problem, partial(_ours, problem, method, t_end, 1e-5), settings, repeats)
+        yield Job(group, solver, problem, partial(two_loop, method, problem, t_end, 1e-5), settings, repeats)
 
 
 def others(problem: Problem, t_end: float, quick: bool) -> Iterator[Job]:
     """Both procedures along one parameter, the presets, IDA, Exudyn and SciPy."""
 
-    def job(solver: str, run: Callable[[int], Result], settings: dict[str, float], repeats: int = 3) -> Job:
-        return Job("comparison", solver, problem, run, settings, repeats)
+    def job(solver: str, value: float, repeats: int = 3) -> Job:
+        return CATALOGUE[solver].job("comparison", problem, t_end, value, repeats)
 
-    for solver, beta in ((NEWMARK, 0.5), (QUARTER, 0.25)):
+    for solver in (NEWMARK, QUARTER):
         for err_out in (1e-6,) if quick else (1e-6, 1e-8, 1e-10):
-            method: Method = paper_newmark(1e-9, err_out, beta)
-            settings = {"err_in": 1e-9, "err_out": err_out}
-            yield job(solver, partial(_ours, problem, method, t_end, 1e-5), settings, 3 if err_out > 1e-9 else 1)
+            yield job(solver, err_out, 3 if err_out > 1e-9 else 1)
     for tolerance in (1e-5, 1e-8) if quick else (1e-3, 1e-5, 1e-7, 1e-9):
-        method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", 1e-9, 1e-4 * tolerance)
-        yield job(IRK_LINE, partial(_ours, problem, method, t_end, tolerance), {"tol": tolerance})
+        yield job(IRK_LINE, tolerance)
     for name in PRESETS_SHOWN:
         for tolerance in (1e-5, 1e-8) if quick else (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
-            yield job(name, partial(_ours, problem, name, t_end, tolerance), {"tol": tolerance})
+            yield job(name, tolerance)
     for tolerance in (1e-5, 1e-7) if quick else (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11):
         for form in ("stabilised",) if quick else ida.FORMS:
-            yield job(f"IDA, {form}", partial(_ida, problem, form, t_end, tolerance), {"tol": tolerance})
+            yield job(f"IDA, {form}", tolerance)
         if not quick:  # its residual and Jacobian, like those of SciPy's solvers, take seconds to compile
-            yield job(IDA_C, partial(_ida_c, problem, t_end, tolerance), {"tol": tolerance})
-    for solver, (name, stabilisation) in ({} if quick else EXPLICIT).items():
-        for tolerance in (1e-5, 1e-7) if quick else (1e-5, 1e-7, 1e-9, 1e-11):
-            run = partial(_index1, problem, name, stabilisation, t_end, tolerance)
-            yield job(solver, run, {"tol": tolerance})
-    for solver in exudyn_four_bar.SOLVERS:
+            yield job(IDA_C, tolerance)
+    for solver in () if quick else EXPLICIT:
+        for tolerance in (1e-5, 1e-7, 1e-9, 1e-11):
+            yield job(solver, tolerance)
+    for solver in EXUDYN:
         for step in (1e-2, 2e-3) if quick else (1e-2, 4e-3, 2e-3, 1e-3, 4e-4, 1e-4):
-            run = partial(_exudyn, problem, solver, t_end, step)
-            yield job(f"Exudyn, {solver}", run, {"h": step}, 3 if step >= 1e-3 else 1)
+            yield job(f"Exudyn, {solver}", step, 3 if step >= 1e-3 else 1)
 
 
 def run(call: Call) -> pd.DataFrame:
@@ -180,6 +136,8 @@ def main(words: list[str] | None = None, command: str | None = None) -> None:
         save_rows(path, rows, line)
     report(rows, line, call)
     figure(rows, call)
+    text = f"[Report](table3.md), [rows](table3.csv)\n\n{headline(rows, line)}"
+    put_in_index(call, "table3", __doc__, text, line)
     if call.out == REPORTS:
         put_in_readme(headline(rows, line))
     show(rows)

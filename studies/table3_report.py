@@ -7,6 +7,7 @@ import pandas as pd
 from references import exudyn_four_bar, ida, ida_c
 from studies.report import Call, markdown_table, number
 from studies.runs import ASTRAY, CHECKED, LOST, time_for
+from studies.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9)
 
@@ -19,16 +20,10 @@ PAPER_NEWMARK = (
     (None, 3.09, 13.40, 50.93),
 )
 
-IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
-IRK_LINE = "PaperIRK, Atol = Rtol varied"
 FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
-PRESETS_SHOWN = ("SunRadau5", "Gauss6", "Gauss12")
-IDA_C = "IDA from C, stabilised"
-EXPLICIT = {  # solver: (SciPy's name, what is done against drift)
-    "LSODA, index 1": ("LSODA", "none"),
-    "DOP853, index 1": ("DOP853", "none"),
-    "DOP853, projected": ("DOP853", "projection"),
-}
+PRESETS_SHOWN = ("SunRadau5", "Gauss6", "Gauss12", "BDF")
+EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2")
+EXPLICIT = ("LSODA, index 1", "DOP853, index 1", "DOP853, projected")
 TWO_LOOP = (IRK, NEWMARK, QUARTER, IRK_LINE, *PRESETS_SHOWN)
 
 
@@ -138,6 +133,7 @@ SHOWN = {  # the lines of the figure: ours solid, others dashed
     IRK_LINE: ("tab:red", "^-"),
     "SunRadau5": ("tab:purple", "v-"),
     "Gauss12": ("tab:blue", "o-"),
+    "BDF": ("tab:pink", "X-"),
     "IDA, stabilised": ("tab:olive", "<--"),
     IDA_C: ("tab:green", ">--"),
     "Exudyn, TrapezoidalIndex2": ("tab:cyan", "D--"),
@@ -347,7 +343,7 @@ def _notes(rows: pd.DataFrame) -> str:
         + f". `{IDA_C}`: {ida_c.LABEL}. IDA's error at one tolerance scatters by factors with rounding alone, so its rows "
         "are the run of median error of three whose rtol differs by 1e-5.",
         "**Exudyn**: "
-        + "; ".join(f"`{solver}` is {label}" for solver, label in exudyn_four_bar.SOLVERS.items())
+        + "; ".join(f"`{solver}` is {exudyn_four_bar.SOLVERS[solver]}" for solver in EXUDYN)
         + ". Its own bodies and joints; only lengths, masses, gravity and the initial angles are shared.",
         "**LSODA, DOP853**: SciPy's, on the index-1 equations with a compiled right side (`references/index1.py`); plain "
         "they drift off the constraints, projected they do not.",

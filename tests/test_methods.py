@@ -5,14 +5,14 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from twoloop import Newmark, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop import BDF, Newmark, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods import PRESETS
 from twoloop.tableaux import gauss, sun_radau_iib
 
 
 def test_presets_are_those_promised():
     gausses = {f"Gauss{order}" for order in range(4, 17, 2)}
-    assert set(PRESETS) >= {"SunRadau5", "RadauIIA5", "Newmark", "PaperIRK", "PaperNewmark"} | gausses
+    assert set(PRESETS) >= {"SunRadau5", "RadauIIA5", "Newmark", "BDF", "PaperIRK", "PaperNewmark"} | gausses
 
 
 @pytest.mark.parametrize("order", range(4, 17, 2))
@@ -32,6 +32,8 @@ def test_methods_are_frozen():
         RungeKutta(gauss(2)).inner_tol = 1.0
     with pytest.raises(FrozenInstanceError):
         Newmark().beta = 1.0
+    with pytest.raises(FrozenInstanceError):
+        BDF().max_order = 1
 
 
 def test_papers_newmark_has_beta_as_printed_and_takes_another():
@@ -82,6 +84,11 @@ def test_names_are_different():
         (lambda: Newmark(error_tol=-1.0), ValueError, "error_tol must be positive"),
         (lambda: Newmark(inner_tol=True), TypeError, "inner_tol must be a number"),
         (lambda: Newmark(outer_tol=np.inf), ValueError, "outer_tol must be positive and finite"),
+        (lambda: BDF(max_order=0), ValueError, "max_order must be at least 1; given 0"),
+        (lambda: BDF(max_order=6), ValueError, "max_order must be at most 5; given 6"),
+        (lambda: BDF(max_order=2.0), TypeError, "max_order must be an int; given 2.0"),
+        (lambda: BDF(inner_tol=0.0), ValueError, "inner_tol must be positive"),
+        (lambda: BDF(outer_tol="1"), TypeError, "outer_tol must be a number"),
     ],
 )
 def test_wrong_options_are_named(make, error, words):

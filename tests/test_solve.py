@@ -35,7 +35,7 @@ def test_every_preset_solves_the_pendulum(method):
     assert violations(pendulum(), result)[0] < 1e-9
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "Newmark"])
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "Newmark", "BDF"])
 def test_a_smaller_tolerance_gives_a_smaller_error(default_four_bar, method):
     errors = [
         worst(run(default_four_bar, method=method, rtol=tol, atol=tol).q[:, -1], default_four_bar.reference.q)
@@ -127,7 +127,7 @@ def test_a_first_step_longer_than_the_span_is_cut():
     assert result.t[-1] == 1e-3
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark"])
+@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark", "BDF"])
 def test_max_step_is_respected(method):
     free = swing(method=method, rtol=1e-5, atol=1e-5)
     bound = 0.5 * free.h.max()
@@ -204,7 +204,7 @@ def test_progress_draws_a_bar(capsys):
 # --- statistics
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "Newmark", "PaperNewmark"])
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "Newmark", "BDF", "PaperNewmark"])
 def test_counts_are_consistent(default_four_bar, method):
     result = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6)
     stats = result.stats
@@ -216,6 +216,28 @@ def test_counts_are_consistent(default_four_bar, method):
     assert 1 <= stats.n_partitions <= stats.n_factorizations
     assert stats.n_factorizations > stats.n_inner
     assert stats.cpu_time > 0.0
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "PaperNewmark"])
+def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, method, monkeypatch):
+    options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
+    whole = run(default_four_bar, 3.0, **options)
+    monkeypatch.setattr("twoloop.solve.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
+    stats = whole.stats
+    assert whole.rejected_error.sum() == stats.n_rejected_error
+    assert whole.rejected_convergence.sum() == stats.n_rejected_convergence
+    assert stats.n_rejected_error + stats.n_rejected_convergence > 0
+    assert 0 < whole.partitioned.sum() == stats.n_partitions - 1
+    for k in (1, 2, 7, 8, 30):  # a run stopped after k steps has counted what the log says of them
+        short = run(default_four_bar, 3.0, **options, max_steps=k)
+        for name, counted in (
+            ("rejected_error", short.stats.n_rejected_error),
+            ("rejected_convergence", short.stats.n_rejected_convergence),
+        ):
+            assert getattr(short, name).shape == (k,)
+            assert (getattr(short, name) == getattr(whole, name)[:k]).all()
+            assert getattr(whole, name)[:k].sum() == counted
+        assert (short.partitioned == whole.partitioned[:k]).all()
 
 
 def test_evaluations_are_calls_of_the_force():
@@ -357,8 +379,8 @@ def test_memory_of_a_run_grows_only_with_the_stored_output(default_four_bar):
 
     peak(0.1)  # compiled and cached
     short, long = peak(1.0), peak(30.0)
-    h_bytes = 4 * 8 * 30000  # result.h itself: at most so many steps, and copies on the way
-    assert long - short < h_bytes
+    step_bytes = 4 * 8 * 30000  # result.h and three counts: at most so many steps, and copies on the way
+    assert long - short < step_bytes
 
 
 @pytest.mark.parametrize("method", sorted(PRESETS))

@@ -76,6 +76,13 @@ class Result:
         What happened and, after a failure, what to try.
     stats : Statistics
         Counts and CPU time.
+    rejected_error, rejected_convergence : ndarray of int (n_accepted,) or None
+        Attempts that failed the error test, and those whose loops did not converge, between the acceptance of the step
+        before (or the start) and that of this one. Those after the last accepted step of a failed run are in `stats`
+        alone. None where a foreign solver does not tell.
+    partitioned : ndarray of int (n_accepted,) or None
+        How often the coordinates were partitioned anew in the same interval; the partition at the start of the run
+        is not among them. None where a foreign solver has none.
     sol, t_events
         None: dense output and events are not available yet.
     """
@@ -89,6 +96,9 @@ class Result:
     status: Status
     message: str
     stats: Statistics
+    rejected_error: NDArray[np.int64] | None = None
+    rejected_convergence: NDArray[np.int64] | None = None
+    partitioned: NDArray[np.int64] | None = None
     sol: Callable[[float], Array] | None = None
     t_events: list[Array] | None = None
 

@@ -51,12 +51,12 @@ def solve_dae(
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities (see `consistent_state`).
     method : str or method object
-        "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "PaperIRK", "PaperNewmark", or an
-        object: `RungeKutta(...)`, `Newmark(...)`.
+        "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "BDF", "PaperIRK", "PaperNewmark",
+        or an object: `RungeKutta(...)`, `Newmark(...)`, `BDF(...)`.
     rtol, atol : float
         A step is accepted when its estimated error over atol + rtol |value| is at most 1: the largest component of
-        positions and velocities for `RungeKutta` (the root mean square with error="richardson-paper"), the root mean
-        square of the positions for `Newmark`, unless it has `error_tol`, its own test.
+        positions and velocities for `RungeKutta` (the root mean square with error="richardson-paper") and `BDF`, the
+        root mean square of the positions for `Newmark`, unless it has `error_tol`, its own test.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution; steps are shortened to land on them. None: every
         accepted step is stored.
@@ -214,7 +214,9 @@ class _Run:
         t_parts = [np.array([self.t0])] if first_row else []
         rows = [self.state.copy()[None, :]] if first_row else []
         h_parts: list[Array] = []
-        out_t, out_h = np.empty(BUFFER_ROWS), np.empty(BUFFER_STEPS)
+        count_parts: list[NDArray[np.int64]] = []
+        counted = np.array([[0.0, 0.0, 1.0]])  # so far; the first partition of a run is not a renewal
+        out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
         out_state = np.empty((BUFFER_ROWS, len(self.state)))
         filled = np.zeros(2, dtype=np.int64)
         cpu = 0.0
@@ -235,19 +237,23 @@ class _Run:
                 outputs,
                 out_t,
                 out_state,
-                out_h,
+                out_steps,
                 filled,
             )
             cpu += time.process_time() - began
             t_parts.append(out_t[: filled[0]].copy())
             rows.append(out_state[: filled[0]].copy())
-            h_parts.append(out_h[: filled[1]].copy())
+            steps = out_steps[: filled[1]]
+            h_parts.append(steps[:, a.H].copy())
+            count_parts.append(np.diff(steps[:, a.ERRORS :], axis=0, prepend=counted).astype(np.int64))
+            counted = steps[-1:, a.ERRORS :].copy() if len(steps) else counted
             report(self.clock[a.T])
         t = np.concatenate(t_parts)
         table = np.concatenate(rows)
         if times is not None and times[-1] != t1 and len(t) > 0 and t[-1] == t1:
             t, table = t[:-1], table[:-1]
         n = system.n_q
+        errors, failures, partitions = np.concatenate(count_parts).T
         status, message = self._outcome(code)
         return Result(
             t=t,
@@ -259,6 +265,9 @@ class _Run:
             status=status,
             message=message,
             stats=self._statistics(cpu),
+            rejected_error=errors,
+            rejected_convergence=failures,
+            partitioned=partitions,
         )
 
     def _statistics(self, cpu: float) -> Statistics:

@@ -14,8 +14,10 @@ from twoloop.result import Status
 BOUNDS = {
     ("default", "GeneralizedAlpha"): 1.3e-4,
     ("default", "TrapezoidalIndex2"): 6e-5,
+    ("default", "HHT"): 1.7e-4,
     ("collinear", "GeneralizedAlpha"): 1e-3,
     ("collinear", "TrapezoidalIndex2"): 5e-4,
+    ("collinear", "HHT"): 1e-3,
 }
 PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 
@@ -60,6 +62,36 @@ def test_stores_every_so_many_steps(n_steps, store_every):
     assert result.stats.n_accepted == n_steps and result.h.size == 0
 
 
+def test_hht_of_most_damping_is_generalized_alpha_of_radius_one_half():
+    # alpha_m vanishes there: one is set by Exudyn itself, the other by overwriting the coefficients
+    problem = PROBLEMS["default"]
+    ours = solve_exudyn(problem, 2.0, 200, "HHT", alpha=-1.0 / 3.0)
+    exudyns = solve_exudyn(problem, 2.0, 200, spectral_radius=0.5)
+    default = solve_exudyn(problem, 2.0, 200)
+    assert np.abs(ours.q - exudyns.q).max() < 1e-10 and np.abs(ours.a - exudyns.a).max() < 1e-6
+    assert np.abs(ours.q - default.q).max() > 1e-4
+    assert ours.stats.n_outer == exudyns.stats.n_outer
+
+
+def test_damping_grows_as_the_spectral_radius_and_alpha_fall():
+    problem = PROBLEMS["default"]
+
+    def gained(**options):
+        result = solve_exudyn(problem, 4.0, 400, **options)
+        drift = problem.energy(result.t, result.q, result.v) - problem.energy(0.0, problem.q0, problem.v0)
+        return drift.min()
+
+    assert 0.0 > gained(spectral_radius=0.9) > gained(spectral_radius=0.5) > gained(spectral_radius=0.0)
+    assert 0.0 > gained(solver="HHT", alpha=-0.05) > gained(solver="HHT")
+
+
+@pytest.mark.parametrize("options", [{"spectral_radius": 1.0}, {"solver": "HHT", "alpha": 0.0}])
+def test_without_damping_index_3_is_unstable(options):
+    result = solve_exudyn(PROBLEMS["default"], 10.0, 1000, **options)
+    assert result.status is Status.SOLVER_FAILED and "terminated" in result.message and 1.0 < result.t[-1] < 9.0
+    assert result.stats.n_accepted == result.h.size == result.t.size - 1
+
+
 def test_failure_comes_back_as_a_row(capfd):
     result = solve_exudyn(PROBLEMS["default"], 10.0, 200)
     assert result.status is Status.SOLVER_FAILED and not result.success
@@ -77,7 +109,7 @@ def test_writes_no_files(tmp_path, monkeypatch):
 
 def test_wrong_arguments_are_named():
     problem = PROBLEMS["default"]
-    with pytest.raises(ValueError, match="solver must be one of GeneralizedAlpha, TrapezoidalIndex2"):
+    with pytest.raises(ValueError, match="solver must be one of GeneralizedAlpha, TrapezoidalIndex2, HHT"):
         solve_exudyn(problem, 1.0, 10, "RK44")
     with pytest.raises(ValueError, match="multiple of store_every = 3"):
         solve_exudyn(problem, 1.0, 10, store_every=3)
@@ -85,3 +117,11 @@ def test_wrong_arguments_are_named():
         solve_exudyn(problem, -1.0, 10)
     with pytest.raises(TypeError, match="n_steps must be an int"):
         solve_exudyn(problem, 1.0, 10.0)
+    with pytest.raises(ValueError, match=r"spectral_radius must be between 0 and 1; given 1\.1"):
+        solve_exudyn(problem, 1.0, 10, spectral_radius=1.1)
+    with pytest.raises(ValueError, match=r"alpha must be between -0\.333333 and 0; given 0\.3"):
+        solve_exudyn(problem, 1.0, 10, "HHT", alpha=0.3)
+    with pytest.raises(ValueError, match=r"alpha belongs to solver='HHT'; given alpha=-0\.1 with solver='General"):
+        solve_exudyn(problem, 1.0, 10, alpha=-0.1)
+    with pytest.raises(ValueError, match="spectral_radius belongs to solver='GeneralizedAlpha'"):
+        solve_exudyn(problem, 1.0, 10, "HHT", spectral_radius=0.9)

@@ -95,6 +95,20 @@ def test_a_solver_that_is_not_there_is_a_row(problem, truths):
     assert missing["status"] == "SOLVER_FAILED" and missing["message"] == "no such library" and missing["lost"]
 
 
+def test_a_study_adds_columns_of_its_own(problem, truths):
+    def measure(job, result, truth):
+        return {"last": result.t[-1], "period": truth.minimal.period, "steps": result.h}
+
+    rows = collect([job(problem)], truths, T_END, measure)
+    assert rows["last"][0] == T_END and rows["period"][0] == truths[problem.name].minimal.period
+    assert rows["steps"][0].sum() == pytest.approx(T_END)
+
+
+def test_cost_for_an_error_can_be_a_count():
+    rows = rows_of(error_q=[1e-2, 1e-4], cpu_s=[1.0, 10.0], n_evaluations=[100.0, 10000.0])
+    assert time_for(rows, 1e-3, "n_evaluations") == pytest.approx(1000.0)
+
+
 def test_repeats_give_the_same_counts(problem, truths):
     runs = [row(problem, truths, method=paper_irk(), rtol=1e-5, atol=1e-5) for _ in range(2)]
     for key in ("n_steps", "n_evaluations", "n_inner", "n_outer", "error_q"):

@@ -12,6 +12,7 @@ from twoloop.kernels.common import (
     INTEGERS,
     MATRIX,
     N_ACCEPTED,
+    N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
     NOT_FINITE,
@@ -49,6 +50,9 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     N_CONTROL,
 ) = range(12)
 
+# places in a row of `out_steps`: the size of an accepted step, and the counters so far
+H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
+
 # places in `clock`, carried from call to call
 T, H_NEXT, H_LIMIT, LIMIT_AGE, NEXT_OUTPUT, T_START, N_FIXED, FAILURE_CODE, H_FAILED, N_CLOCK = range(10)
 
@@ -75,7 +79,7 @@ _ADVANCE = i8(
     StepFunction,
     *(VECTOR,) * 9,
     MATRIX,
-    VECTOR,
+    MATRIX,
     INTEGERS,
 )
 
@@ -102,13 +106,13 @@ def advance(
     outputs,
     out_t,
     out_state,
-    out_h,
+    out_steps,
     filled,
 ):
     """Step on from (clock, state) until every time in `outputs` is reached; steps are shortened to land on them.
 
     Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
-    out_t / out_state and the entries of out_h that this call wrote.
+    out_t / out_state and those of out_steps, every accepted step, that this call wrote.
     """
     f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
     fixed = control[FIXED_STEP] > 0.0
@@ -117,7 +121,7 @@ def advance(
     filled[0] = 0
     filled[1] = 0
     while True:
-        if filled[0] == out_t.size or filled[1] == out_h.size:
+        if filled[0] == out_t.size or filled[1] == out_steps.shape[0]:
             return BUFFER_FULL
         if w.counters[N_ACCEPTED] >= control[MAX_STEPS]:
             return MAX_STEPS_REACHED
@@ -181,7 +185,10 @@ def advance(
         else:
             clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
         copy(new_state, state)
-        out_h[filled[1]] = size
+        out_steps[filled[1], H] = size
+        out_steps[filled[1], ERRORS] = w.counters[N_REJECTED_ERROR]
+        out_steps[filled[1], FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
+        out_steps[filled[1], PARTITIONS] = w.counters[N_PARTITIONS]
         filled[1] += 1
         if lands or control[STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[T]

@@ -1,0 +1,44 @@
+"""The catalogue of solvers: every entry runs on the four-bar linkage and follows the truth."""
+
+import numpy as np
+import pytest
+
+from references.four_bar_minimal import trajectory
+from studies.solvers import CATALOGUE, IRK, LINE_UP, baumgarte, gear
+from twoloop.mechanisms import four_bar
+
+T_END = 0.2
+COMPILING = ("IDA", "LSODA", "DOP853", "RK45")  # seconds each, and tested by the studies that show them
+
+
+def setting(name):
+    return LINE_UP.get(name, {"tol": 1e-6, "h": 1e-3, "err_out": 1e-8}[CATALOGUE[name].setting])
+
+
+@pytest.mark.parametrize("name", [name for name in CATALOGUE if not name.startswith(COMPILING)])
+def test_every_solver_runs_at_one_setting(name):
+    problem = four_bar()
+    result = CATALOGUE[name].run(problem, T_END, setting(name), 0)
+    assert result.success and result.t[-1] == pytest.approx(T_END)
+    bound = 0.02 if ", order 1" in name else 1e-3  # implicit Euler
+    assert np.abs(result.q - trajectory(problem.parameters, result.t)[0]).max() < bound
+
+
+def test_a_job_carries_what_its_row_needs():
+    job = CATALOGUE[IRK].job("group", four_bar(), T_END, 1e-7, 2)
+    assert job.solver == IRK and job.repeats == 2
+    assert job.settings == {"err_in": 1e-9, "tol": 1e-5, "err_out": 1e-7}
+    assert CATALOGUE[gear(3, "ramp")].job("", four_bar(), T_END, 0.01).settings == {"order": 3, "h": 0.01}
+    assert CATALOGUE[baumgarte("DOP853", 10.0)].job("", four_bar(), T_END, 1e-6).settings["alpha"] == 10.0
+
+
+def test_names_and_flags_agree():
+    assert set(LINE_UP) <= set(CATALOGUE)
+    assert all(solver.name == name for name, solver in CATALOGUE.items())
+    assert CATALOGUE["SunRadau5"].two_loop and CATALOGUE["IDA, index1"].own_a
+
+
+def test_long_runs_of_fixed_steps_are_thinned_and_end_at_the_end():
+    result = CATALOGUE[gear(2)].run(four_bar(), 0.7, 5e-5, 0)
+    assert result.stats.n_accepted == 14000 and result.t.size == 7001
+    assert result.t[-1] == 0.7
