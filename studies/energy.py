@@ -118,6 +118,7 @@ CONTROLLED: dict[str, dict[str, list[Variant]]] = {  # what is run with step-siz
     ONE: {SUN: [MOMENTA_LASTING]},
     SWITCHING: {GAUSS: [EVEN]},
 }
+MANY_STEPS = (PAPER_NEWMARK_QUARTER, PAPER_NEWMARK_HALF, BDF_LOOP)  # under step-size control, too many to keep
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 
@@ -167,12 +168,16 @@ def method_of(job: EnergyJob) -> Method:
 
 
 def instants(job: EnergyJob, period: float) -> Array | None:
-    """Where the energy is taken: at every step of a short run, else at times that spread evenly over the phases."""
-    if job.t_end <= SHORT:
+    """Where the energy is taken: None, at every step, or where these are too many at times spread over the phases.
+
+    Landing on such times changes no fixed step, and a small part of many short ones; other controlled steps are so
+    long that landing would make another run of it.
+    """
+    if job.t_end <= SHORT or (job.tol is not None and job.solver not in MANY_STEPS):
         return None
-    interval = GOLDEN * period
-    if job.h is not None:  # on the grid, where landing changes no step: four times as many
-        interval = job.h * round(0.25 * interval / job.h)
+    interval = 0.25 * GOLDEN * period
+    if job.h is not None:
+        interval = job.h * round(interval / job.h)
     n_intervals = int(job.t_end / interval * (1.0 - 1e-12))
     return interval * np.arange(n_intervals + 1, dtype=np.float64)
 
