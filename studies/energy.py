@@ -227,8 +227,9 @@ def _counts(result: Result) -> Row:
 def run(call: Call) -> tuple[pd.DataFrame, pd.DataFrame, str]:
     """Make all rows and the series of windows, going on where an interrupted run of the same sources was."""
     first, _ = truth_of(SWITCHING)
-    for name in (SUN, PAPER_IRK, NEWMARK_QUARTER):
-        solve_dae(first.system, (0.0, 0.01), first.q0, first.v0, METHODS[name])  # compile once, not in every process
+    momenta = RungeKutta(sun_radau_iib(3), variables="momenta")
+    for method in (momenta, *(METHODS[name] for name in (SUN, PAPER_IRK, NEWMARK_QUARTER, BDF_LOOP))):
+        solve_dae(first.system, (0.0, 0.01), first.q0, first.v0, method)  # compile once, not in every process
     line = stamp(call.command)  # before the runs: sources edited meanwhile are not theirs
     keyed = {repr(job): job for job in jobs(call.quick)}
     with KeptRows(call.out / "energy.partial.jsonl", {"quick": call.quick}) as kept:

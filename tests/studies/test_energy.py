@@ -53,7 +53,7 @@ def rows(quick):
 
 
 def test_only_the_report_is_left(quick):
-    names = {"energy.md", "energy.csv", "energy_windows.csv", "energy_long.png", "energy_variable.png"}
+    names = {"README.md", "energy.md", "energy.csv", "energy_windows.csv", "energy_long.png", "energy_variable.png"}
     assert {path.name for path in quick.iterdir()} == names | {"energy_short.png"}
 
 
