@@ -3,9 +3,6 @@
 Nothing comes from twoloop's equations but the lengths, the mass per length, gravity and the initial angles.
 """
 
-import contextlib
-import time
-from collections.abc import Iterator
 from typing import Any
 
 import exudyn as exu
@@ -18,29 +15,17 @@ from exudyn.itemInterface import (
     ObjectGround,
     ObjectJointRevolute2D,
     ObjectRigidBody2D,
-    SensorNode,
 )
 from numpy.typing import NDArray
 
-from twoloop.checks import check_number, check_size, check_vector
+from references.exudyn_run import ALPHA, SOLVERS, SPECTRAL_RADIUS, add_sensors, check_run, run
+from twoloop.checks import check_number
 from twoloop.mechanisms.problem import Problem
-from twoloop.result import Result, Statistics, Status
+from twoloop.result import Result
+
+__all__ = ["SOLVERS", "solve_exudyn"]
 
 Array = NDArray[np.float64]
-
-SPECTRAL_RADIUS = 0.9  # Exudyn's default
-ALPHA = -0.3  # of HHT; the default of MSC Adams, whose HHT integrator is the usual one on index 3
-SOLVERS = {
-    "GeneralizedAlpha": "Exudyn generalized-alpha, spectral radius 0.9, index 3, fixed step",
-    "TrapezoidalIndex2": "Exudyn trapezoidal rule, index 2, fixed step",
-    "HHT": "Exudyn's generalized-alpha solver with the coefficients of Hilber, Hughes and Taylor, index 3, fixed step",
-}
-
-_OUTPUTS = (
-    exu.OutputVariableType.Coordinates,  # displacements from the initial position
-    exu.OutputVariableType.Coordinates_t,
-    exu.OutputVariableType.Coordinates_tt,
-)
 
 
 def solve_exudyn(
@@ -99,26 +84,14 @@ def solve_exudyn(
     TypeError, ValueError
         If an argument is wrong, naming it.
     """
-    t_end = float(check_vector("t_end", [t_end], 1)[0])
-    if not t_end > 0.0:
-        raise ValueError(f"t_end must be positive; given {t_end!r}")
-    n_steps, store_every = check_size("n_steps", n_steps, 1), check_size("store_every", store_every, 1)
-    if n_steps % store_every != 0:
-        raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
-    if solver not in SOLVERS:
-        raise ValueError(f"solver must be one of {', '.join(SOLVERS)}; given {solver!r}")
+    t_end, n_steps, store_every = check_run(t_end, n_steps, solver, store_every)
+    if not isinstance(problem, Problem) or "L3" not in problem.parameters:
+        raise TypeError(f"problem must be a linkage of twoloop.mechanisms.four_bar; given {problem!r}")
     radius = _option("spectral_radius", spectral_radius, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
     strength = _option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
-
     q0 = _positions(problem)
     _container, mbs, sensors = _model(problem, q0)
-    settings = _settings(t_end, n_steps, store_every)
-    settings.timeIntegration.generalizedAlpha.spectralRadius = radius
-    with _silence():
-        began = time.process_time()
-        failure = _solve_hht(mbs, settings, strength) if solver == "HHT" else _solve(mbs, settings, solver)
-        cpu = time.process_time() - began
-    return _result(mbs, sensors, q0, store_every == 1, failure, cpu)
+    return run(mbs, sensors, q0, 8, t_end, n_steps, solver, store_every, radius, strength)
 
 
 def _option(
@@ -132,39 +105,6 @@ def _option(
     if not span[0] <= check_number(name, value) <= span[1]:
         raise ValueError(f"{name} must be between {span[0]:g} and {span[1]:g}; given {value!r}")
     return float(value)
-
-
-def _solve(mbs: Any, settings: Any, solver: str) -> str:
-    """Run one of Exudyn's own solvers; the text of a failure, or nothing."""
-    try:
-        mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
-    except exu.SolverError as error:
-        return f"{error}: {mbs.sys['dynamicSolver'].GetErrorString()}"
-    return ""
-
-
-def _solve_hht(mbs: Any, settings: Any, alpha: float) -> str:
-    """Run the generalized-alpha solver with HHT's coefficients; the text of a failure, or nothing."""
-    solver: Any = exu.MainSolverImplicitSecondOrder()
-    mbs.sys["dynamicSolver"] = solver  # where SolveDynamic leaves it, too
-    solver.InitializeSolver(mbs, settings)
-    solver.alphaM, solver.alphaF = 0.0, -alpha
-    solver.newmarkBeta, solver.newmarkGamma = 0.25 * (1.0 - alpha) ** 2, 0.5 - alpha
-    solver.factJacAlgorithmic = 1.0 - solver.alphaF  # (1 - alpha_f) / (1 - alpha_m)
-    reached = solver.SolveSteps(mbs, settings)
-    solver.FinalizeSolver(mbs, settings)
-    return "" if reached else f"SolveSteps terminated: {solver.GetErrorString()}"
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep Exudyn, whose console switch is global, from printing."""
-    before = exu.config.printToConsole
-    exu.config.printToConsole = False
-    try:
-        yield
-    finally:
-        exu.config.printToConsole = before
 
 
 def _positions(problem: Problem) -> Array:
@@ -198,55 +138,8 @@ def _model(problem: Problem, q0: Array) -> tuple[Any, Any, list[list[int]]]:
         )
         mbs.AddObject(ObjectJointRevolute2D(markerNumbers=[before, near]))
         before = far
-        sensors.append(
-            [
-                mbs.AddSensor(
-                    SensorNode(nodeNumber=node, storeInternal=True, writeToFile=False, outputVariableType=output)
-                )
-                for output in _OUTPUTS
-            ]
-        )
+        sensors.append(add_sensors(mbs, node))
     end = mbs.AddMarker(MarkerBodyPosition(bodyNumber=ground, localPosition=[p["L"], 0.0, 0.0]))
     mbs.AddObject(ObjectJointRevolute2D(markerNumbers=[before, end]))
     mbs.Assemble()
     return container, mbs, sensors
-
-
-def _settings(t_end: float, n_steps: int, store_every: int) -> Any:
-    settings = exu.SimulationSettings()
-    settings.timeIntegration.endTime = t_end
-    settings.timeIntegration.numberOfSteps = n_steps
-    # on a Newton failure it would halve the step for good and end "successfully" with a wrong answer
-    settings.timeIntegration.adaptiveStep = False
-    settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.newton.modifiedNewtonJacUpdatePerStep = True
-    settings.solution.file.write = False
-    # a little less than the period, for Exudyn's times are sums that carry rounding
-    settings.solution.sensors.writePeriod = (1.0 - 1e-9) * store_every * t_end / n_steps
-    return settings
-
-
-def _result(mbs: Any, sensors: list[list[int]], q0: Array, every_step: bool, failure: str, cpu: float) -> Result:
-    tables = [[mbs.GetSensorStoredData(sensor) for sensor in bar] for bar in sensors]  # (n_t, 1 + 3), time first
-    t = tables[0][0][:, 0]
-    q, v, a = (np.concatenate([bar[k][:, 1:] for bar in tables], axis=1).T for k in range(len(_OUTPUTS)))
-    did = mbs.sys["dynamicSolver"].it
-    message = f"Exudyn reached the end, t = {t[-1]:g}."
-    if failure:
-        message = f"Exudyn failed in the step to t = {did.currentTime:.10g}: {failure}. Take more steps."
-    return Result(
-        t=t,
-        q=q + q0[:, None],
-        v=v,
-        a=a,
-        lam=np.full((8, t.size), np.nan),
-        h=np.full(t.size - 1, did.currentStepSize) if every_step else np.empty(0),
-        status=Status.SOLVER_FAILED if failure else Status.REACHED_END,
-        message=message,
-        stats=Statistics(
-            n_accepted=did.currentStepIndex - (2 if failure else 1),  # the index counts from 1, and the failed step
-            n_outer=did.newtonStepsCount,
-            n_factorizations=did.newtonJacobiCount,
-            cpu_time=cpu,
-        ),
-    )

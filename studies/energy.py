@@ -118,6 +118,7 @@ CONTROLLED: dict[str, dict[str, list[Variant]]] = {  # what is run with step-siz
     ONE: {SUN: [MOMENTA_LASTING]},
     SWITCHING: {GAUSS: [EVEN]},
 }
+MANY_STEPS = (PAPER_NEWMARK_QUARTER, PAPER_NEWMARK_HALF, BDF_LOOP)  # under step-size control, too many to keep
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 
@@ -167,12 +168,16 @@ def method_of(job: EnergyJob) -> Method:
 
 
 def instants(job: EnergyJob, period: float) -> Array | None:
-    """Where the energy is taken: at every step of a short run, else at times that spread evenly over the phases."""
-    if job.t_end <= SHORT:
+    """Where the energy is taken: None, at every step, or where these are too many at times spread over the phases.
+
+    Landing on such times changes no fixed step, and a small part of many short ones; other controlled steps are so
+    long that landing would make another run of it.
+    """
+    if job.t_end <= SHORT or (job.tol is not None and job.solver not in MANY_STEPS):
         return None
-    interval = GOLDEN * period
-    if job.h is not None:  # on the grid, where landing changes no step: four times as many
-        interval = job.h * round(0.25 * interval / job.h)
+    interval = 0.25 * GOLDEN * period
+    if job.h is not None:
+        interval = job.h * round(interval / job.h)
     n_intervals = int(job.t_end / interval * (1.0 - 1e-12))
     return interval * np.arange(n_intervals + 1, dtype=np.float64)
 
@@ -222,8 +227,9 @@ def _counts(result: Result) -> Row:
 def run(call: Call) -> tuple[pd.DataFrame, pd.DataFrame, str]:
     """Make all rows and the series of windows, going on where an interrupted run of the same sources was."""
     first, _ = truth_of(SWITCHING)
-    for name in (SUN, PAPER_IRK, NEWMARK_QUARTER):
-        solve_dae(first.system, (0.0, 0.01), first.q0, first.v0, METHODS[name])  # compile once, not in every process
+    momenta = RungeKutta(sun_radau_iib(3), variables="momenta")
+    for method in (momenta, *(METHODS[name] for name in (SUN, PAPER_IRK, NEWMARK_QUARTER, BDF_LOOP))):
+        solve_dae(first.system, (0.0, 0.01), first.q0, first.v0, method)  # compile once, not in every process
     line = stamp(call.command)  # before the runs: sources edited meanwhile are not theirs
     keyed = {repr(job): job for job in jobs(call.quick)}
     with KeptRows(call.out / "energy.partial.jsonl", {"quick": call.quick}) as kept:

@@ -96,6 +96,8 @@ def test_branch_minus_one_is_below_and_one_above():
 
 @given(lengths, lengths, lengths, lengths, angles, branches)
 def test_energy_is_kept_by_any_geometry_over_a_short_run(L1, L2, L3, ground, theta3, branch):
+    # where all four bars can lie in line, the motion may pass a position in which the constraints lose rank
+    assume(min(abs(L1 + s * L2 + r * L3 + k * ground) for s in (-1, 1) for r in (-1, 1) for k in (-1, 1)) > 0.02)
     problem = assembled(L1, L2, L3, ground, theta3, branch)
     result = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-9, atol=1e-9)
     assert result.success, (problem.name, result.message)
@@ -131,22 +133,25 @@ def test_reference_period_is_the_one_at_which_the_linkage_rests_again(default_fo
     assert abs(MinimalFourBar.from_parameters(default_four_bar.parameters).period - period) < 1e-12
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "RadauIIA5"])
+# the embedded estimate of RadauIIA5 is of order 3, and its steps continue unextrapolated
+TIGHT = {"SunRadau5": 1e-10, "Gauss6": 1e-10, "Gauss12": 1e-10, "RadauIIA5": 1e-11}
+
+
+@pytest.mark.parametrize("method", TIGHT)
 def test_default_linkage_agrees_with_its_reference_to_nine_digits(default_four_bar, method):
-    problem = default_four_bar
-    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=1e-10, atol=1e-10)
+    problem, tol = default_four_bar, TIGHT[method]
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
     assert result.success
     assert worst(result.q[:, -1], problem.reference.q) < 5e-10
     assert worst(result.v[:, -1], problem.reference.v) < 1e-9
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "RadauIIA5"])
+@pytest.mark.parametrize("method", TIGHT)
 def test_second_geometry_agrees_with_the_minimal_form_to_nine_digits(collinear_four_bar, method):
     problem = collinear_four_bar
     times = np.linspace(0.0, 10.0, 41)
-    result = solve_dae(
-        problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=1e-10, atol=1e-10, t_eval=times
-    )
+    tol = TIGHT[method]
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method, tol, tol, t_eval=times)
     q, v = MinimalFourBar.from_parameters(problem.parameters).states(times)
     assert worst(result.q, q) < 1e-9
     assert worst(result.v, v) < 5e-9

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numba import njit
 
 from references import ida_c, sundials
 from references.four_bar_minimal import trajectory
@@ -21,7 +22,7 @@ PROBLEM = four_bar()
 # largest error of q at 1001 instants over 10 s: three times the largest of 15 runs that differ in rounding
 BOUNDS = {1e-5: 5.4e-2, 1e-7: 1.3e-3, 1e-9: 2.4e-5, 1e-11: 3e-7}
 SCALES = {"q": 1.0, "v": 10.0, "a": 250.0, "lam": 250.0}  # errors against those of q, about
-GOOD, NAN, RAISES = range(3)  # what the force of the pendulum below does after t = 1: its parameter
+GOOD, NAN, RAISES, SPRING = range(4)  # what the force of the pendulum below does (2 of them after t = 1): its parameter
 
 
 def run(t_end, tolerance, **options):
@@ -42,10 +43,18 @@ def mass(t, q, p, M):
 def force(t, q, v, p, Q):
     Q[0] = -0.1 * v[0] * abs(v[0])
     Q[1] = -9.81
+    if p[0] == 3.0:
+        Q[0] = -5.0 * q[0] * q[1] ** 2
     if t > 1.0 and p[0] == 1.0:
         Q[1] = np.nan
     if t > 1.0 and p[0] == 2.0:
         raise ValueError("the motor burnt out")
+
+
+@njit
+def spring_tangent(t, q, v, p, K):
+    K[0, 0] += -5.0 * q[1] ** 2
+    K[0, 1] += -10.0 * q[0] * q[1]
 
 
 @callback("constraint")
@@ -114,13 +123,17 @@ def test_moving_pivot_without_gamma_and_with_a_mass_that_varies():
         assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-4
 
 
-@pytest.mark.parametrize("system", [PROBLEM.system, pendulum()[0]], ids=["four-bar", "moving pivot"])
-def test_jacobian_is_that_of_the_residual(system):
+@pytest.mark.parametrize(
+    ("system", "tangent"),
+    [(PROBLEM.system, None), (pendulum()[0], None), (pendulum(SPRING)[0], spring_tangent)],
+    ids=["four-bar", "moving pivot", "exact tangent"],
+)
+def test_jacobian_is_that_of_the_residual(system, tangent):
     n, m, f = system.n_q, system.n_c, system.functions
     rng = np.random.default_rng(5)
     t, cj, y, yp = 0.3, 7.0, rng.normal(size=2 * (n + m)), rng.normal(size=2 * (n + m))
     residual = residual_at(*f[:5], n, m, system.constant_mass)
-    matrix = iteration_matrix_at(*f[:5], n, m, system.constant_mass, None)
+    matrix = iteration_matrix_at(*f[:5], n, m, system.constant_mass, tangent)
     space = system.parameters, system.mass(t, y[:n]), np.zeros((m, n))
 
     def value(y, yp):

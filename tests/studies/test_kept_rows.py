@@ -134,7 +134,7 @@ def test_a_killed_study_goes_on_and_ends_with_the_same_rows(tmp_path, path):
             assert study.poll() is None
             time.sleep(0.01)
         study.kill()
-        study.communicate(timeout=30)  # ends when its worker has gone too
+        study.communicate(timeout=120)  # ends when its worker has gone too
     chosen = {repr(job): job for job in list(jobs(quick=True))[-3:]}
     with KeptRows(path, {}) as kept:
         assert 2 <= kept.n_taken_over <= 3

@@ -1,0 +1,140 @@
+"""What the Exudyn models share: sensors, a run with a fixed step, silence, statistics."""
+
+import contextlib
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import exudyn as exu
+import numpy as np
+from exudyn.itemInterface import SensorNode
+from numpy.typing import NDArray
+
+from twoloop.checks import check_size, check_vector
+from twoloop.result import Result, Statistics, Status
+
+Array = NDArray[np.float64]
+
+SPECTRAL_RADIUS = 0.9  # Exudyn's default
+ALPHA = -0.3  # of HHT; the default of MSC Adams, whose HHT integrator is the usual one on index 3
+SOLVERS = {
+    "GeneralizedAlpha": "Exudyn generalized-alpha, spectral radius 0.9, index 3, fixed step",
+    "TrapezoidalIndex2": "Exudyn trapezoidal rule, index 2, fixed step",
+    "HHT": "Exudyn's generalized-alpha solver with the coefficients of Hilber, Hughes and Taylor, index 3, fixed step",
+}
+
+_OUTPUTS = (
+    exu.OutputVariableType.Coordinates,  # displacements from the reference position
+    exu.OutputVariableType.Coordinates_t,
+    exu.OutputVariableType.Coordinates_tt,
+)
+
+
+def check_run(t_end: float, n_steps: int, solver: str, store_every: int) -> tuple[float, int, int]:
+    """Return t_end, n_steps and store_every, or say what is wrong with an argument."""
+    t_end = float(check_vector("t_end", [t_end], 1)[0])
+    if not t_end > 0.0:
+        raise ValueError(f"t_end must be positive; given {t_end!r}")
+    n_steps, store_every = check_size("n_steps", n_steps, 1), check_size("store_every", store_every, 1)
+    if n_steps % store_every != 0:
+        raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
+    if solver not in SOLVERS:
+        raise ValueError(f"solver must be one of {', '.join(SOLVERS)}; given {solver!r}")
+    return t_end, n_steps, store_every
+
+
+def add_sensors(mbs: Any, node: int) -> list[int]:
+    """Sensors of a node's coordinates, velocities and accelerations."""
+    options = {"nodeNumber": node, "storeInternal": True, "writeToFile": False}
+    return [mbs.AddSensor(SensorNode(**options, outputVariableType=output)) for output in _OUTPUTS]
+
+
+def run(
+    mbs: Any,
+    sensors: Sequence[list[int]],
+    reference: Array,
+    n_c: int,
+    t_end: float,
+    n_steps: int,
+    solver: str,
+    store_every: int,
+    radius: float = SPECTRAL_RADIUS,
+    alpha: float = ALPHA,
+) -> Result:
+    """Solve an assembled system whose nodes have these sensors and reference coordinates, with n_c constraints."""
+    settings = _settings(t_end, n_steps, store_every)
+    settings.timeIntegration.generalizedAlpha.spectralRadius = radius
+    with _silence():
+        began = time.process_time()
+        failure = _solve_hht(mbs, settings, alpha) if solver == "HHT" else _solve(mbs, settings, solver)
+        cpu = time.process_time() - began
+    tables = [[mbs.GetSensorStoredData(sensor) for sensor in node] for node in sensors]  # (n_t, 1 + n), time first
+    t = tables[0][0][:, 0]
+    q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
+    did = mbs.sys["dynamicSolver"].it
+    message = f"Exudyn reached the end, t = {t[-1]:g}."
+    if failure:
+        message = f"Exudyn failed in the step to t = {did.currentTime:.10g}: {failure}. Take more steps."
+    return Result(
+        t=t,
+        q=q + reference[:, None],
+        v=v,
+        a=a,
+        lam=np.full((n_c, t.size), np.nan),
+        h=np.full(t.size - 1, did.currentStepSize) if store_every == 1 else np.empty(0),
+        status=Status.SOLVER_FAILED if failure else Status.REACHED_END,
+        message=message,
+        stats=Statistics(
+            n_accepted=did.currentStepIndex - (2 if failure else 1),  # the index counts from 1, and the failed step
+            n_outer=did.newtonStepsCount,
+            n_factorizations=did.newtonJacobiCount,
+            cpu_time=cpu,
+        ),
+    )
+
+
+def _solve(mbs: Any, settings: Any, solver: str) -> str:
+    """Run one of Exudyn's own solvers; the text of a failure, or nothing."""
+    try:
+        mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
+    except exu.SolverError as error:
+        return f"{error}: {mbs.sys['dynamicSolver'].GetErrorString()}"
+    return ""
+
+
+def _solve_hht(mbs: Any, settings: Any, alpha: float) -> str:
+    """Run the generalized-alpha solver with HHT's coefficients; the text of a failure, or nothing."""
+    solver: Any = exu.MainSolverImplicitSecondOrder()
+    mbs.sys["dynamicSolver"] = solver  # where SolveDynamic leaves it, too
+    solver.InitializeSolver(mbs, settings)
+    solver.alphaM, solver.alphaF = 0.0, -alpha
+    solver.newmarkBeta, solver.newmarkGamma = 0.25 * (1.0 - alpha) ** 2, 0.5 - alpha
+    solver.factJacAlgorithmic = 1.0 - solver.alphaF  # (1 - alpha_f) / (1 - alpha_m)
+    reached = solver.SolveSteps(mbs, settings)
+    solver.FinalizeSolver(mbs, settings)
+    return "" if reached else f"SolveSteps terminated: {solver.GetErrorString()}"
+
+
+def _settings(t_end: float, n_steps: int, store_every: int) -> Any:
+    settings = exu.SimulationSettings()
+    settings.timeIntegration.endTime = t_end
+    settings.timeIntegration.numberOfSteps = n_steps
+    # on a Newton failure it would halve the step for good and end "successfully" with a wrong answer
+    settings.timeIntegration.adaptiveStep = False
+    settings.timeIntegration.verboseMode = 0
+    settings.timeIntegration.newton.modifiedNewtonJacUpdatePerStep = True
+    settings.solution.file.write = False
+    # a little less than the period, for Exudyn's times are sums that carry rounding
+    settings.solution.sensors.writePeriod = (1.0 - 1e-9) * store_every * t_end / n_steps
+    return settings
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep Exudyn, whose console switch is global, from printing."""
+    before = exu.config.printToConsole
+    exu.config.printToConsole = False
+    try:
+        yield
+    finally:
+        exu.config.printToConsole = before

@@ -1,0 +1,127 @@
+"""The paper's equations and its outer loop in plain NumPy, apart from the kernels, to look inside a single step."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop import ConstrainedSystem
+from twoloop.tableaux import Tableau
+
+Array = NDArray[np.float64]
+
+NEWTON_TOL = 1e-14
+MAX_NEWTON = 30
+HOPELESS = 1e6  # a change from sweep to sweep beyond which nothing converges any more
+
+
+def independents(jacobian: Array) -> list[int]:
+    """Gauss elimination with full pivoting: the columns that hold no pivot are the independent coordinates."""
+    matrix, columns = jacobian.copy(), list(range(jacobian.shape[1]))
+    for k in range(len(matrix)):
+        row, column = (int(place) for place in np.unravel_index(np.abs(matrix[k:, k:]).argmax(), matrix[k:, k:].shape))
+        matrix[[k, k + row]] = matrix[[k + row, k]]
+        matrix[:, [k, k + column]] = matrix[:, [k + column, k]]
+        columns[k], columns[k + column] = columns[k + column], columns[k]
+        matrix[k + 1 :] -= np.outer(matrix[k + 1 :, k] / matrix[k, k], matrix[k])
+    return sorted(columns[len(matrix) :])
+
+
+def choice(n_q: int, independent: list[int]) -> Array:
+    """I_in of (14), (15)."""
+    return np.eye(n_q)[independent]
+
+
+def kkt(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+    """Accelerations and multipliers from (6), solved whole."""
+    jacobian = system.jacobian(t, q)
+    zero = np.zeros((system.n_c, system.n_c))
+    matrix = np.block([[system.mass(t, q), jacobian.T], [jacobian, zero]])
+    solution = np.linalg.solve(matrix, np.concatenate([system.force(t, q, v), system.gamma(t, q, v)]))
+    return solution[: system.n_q], solution[system.n_q :]
+
+
+@dataclass
+class Step:
+    """The outer loop of one step, sweep by sweep; the independents keep y_n, h and the prediction of the stages.
+
+    Attributes
+    ----------
+    A_stage, V_stage : ndarray (s, n_q)
+        The stages' K = [a, v].
+    q1, v1 : ndarray (n_q,)
+        End of the step after the last sweep, on the constraints.
+    """
+
+    system: ConstrainedSystem
+    tableau: Tableau
+    t: float
+    h: float
+    q: Array
+    v: Array
+    frozen: bool = False  # y_d stays what it was at the beginning of the step, as where (3), (4) are not embedded
+
+    def __post_init__(self) -> None:
+        self.independent = independents(self.system.jacobian(self.t, self.q))
+        self.I_in = choice(self.system.n_q, self.independent)
+        a, _ = kkt(self.system, self.t, self.q, self.v)
+        self.q1, self.v1 = self.dependents(self.t + self.h, self.q + self.h * self.v, self.v + self.h * a)
+        a1, _ = kkt(self.system, self.t + self.h, self.q1, self.v1)
+        stages = self.tableau.stages
+        self.A_stage, self.V_stage = np.tile(a1, (stages, 1)), np.tile(self.v1, (stages, 1))
+
+    def dependents(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Dependent positions by (15), dependent velocities by (14)."""
+        q = q.copy()
+        for _ in range(MAX_NEWTON):
+            matrix = np.vstack([self.system.jacobian(t, q), self.I_in])
+            zero = np.zeros(len(self.independent))
+            correction = np.linalg.solve(matrix, np.concatenate([-self.system.constraint(t, q), zero]))
+            q += correction
+            if np.abs(correction).max() < NEWTON_TOL * max(1.0, np.abs(q).max()):
+                break
+        matrix = np.vstack([self.system.jacobian(t, q), self.I_in])
+        v = np.linalg.solve(matrix, np.concatenate([-self.system.constraint_rate(t, q), v[self.independent]]))
+        return q, v
+
+    def sweep(self) -> tuple[float, float]:
+        """One sweep, stage after stage; the change by (32), as it should read, and the norm of (33)."""
+        q_old, v_old = self.q1, self.v1
+        A, b, c = self.tableau.A, self.tableau.b, self.tableau.c
+        for j in range(self.tableau.stages):
+            q, v = self._moved(A[j])
+            if not self.frozen:
+                q, v = self.dependents(self.t + c[j] * self.h, q, v)
+            self.A_stage[j], _ = kkt(self.system, self.t + c[j] * self.h, q, v)
+            self.V_stage[j] = v
+        self.q1, self.v1 = self.dependents(self.t + self.h, *self._moved(b))
+        i = self.independent
+        change = max(
+            np.max(np.abs(new[i] - old[i]) / np.maximum(np.abs(new[i]), 1.0))
+            for new, old in ((self.q1, q_old), (self.v1, v_old))
+        )
+        norm = np.sqrt(np.sum((self.q1 - q_old) ** 2) + np.sum((self.v1 - v_old) ** 2))
+        return float(change), float(norm)
+
+    def _moved(self, weights: Array) -> tuple[Array, Array]:
+        """y_n + h sum(weights K) for the independents; the others stay at the beginning of the step."""
+        q, v, i = self.q.copy(), self.v.copy(), self.independent
+        q[i] += self.h * weights @ self.V_stage[:, i]
+        v[i] += self.h * weights @ self.A_stage[:, i]
+        return q, v
+
+    def converge(self, tolerance: float, sweeps: int) -> tuple[bool, bool]:
+        """Sweep until (32) holds; whether it came to that, and whether (33) would have given the step up before."""
+        before, refused = np.inf, False
+        for _ in range(sweeps):
+            try:
+                change, norm = self.sweep()
+            except np.linalg.LinAlgError:
+                return False, True
+            if not norm < HOPELESS:
+                return False, True
+            if change <= tolerance:
+                return True, refused
+            refused |= norm > before
+            before = norm
+        return False, refused
