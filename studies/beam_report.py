@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from studies.beam_figures import PARTING, TARGET
+from studies.beam_figures import TARGET
 from studies.beam_limits import (
     FINE_STAGES,
     FINE_TOL,
@@ -12,8 +12,10 @@ from studies.beam_limits import (
     LOOSER_TOL,
     MODULUS_SWEEPS_END,
     PAPER_SWEEPS,
+    PARTING,
     PERTURBED,
     REDUCED,
+    VISIBLE,
 )
 from studies.beam_runs import (
     BDF,
@@ -22,6 +24,8 @@ from studies.beam_runs import (
     IDA_C,
     IDA_C_LOOSE,
     NEWTON,
+    NEWTON_4,
+    NEWTON_5,
     NEWTON_GAUSS,
     PAPER,
     PAPER_TOL,
@@ -38,10 +42,11 @@ from studies.beam_tables import (
     element_table,
     limit_table,
     modulus_table,
+    power,
     run_table,
     truth_table,
 )
-from studies.report import Array, Call, markdown_table, number
+from studies.report import Call, markdown_table, number
 from studies.runs import time_for
 
 PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
@@ -49,6 +54,7 @@ ORDER = {SOFT: "1e-3", STIFF: "1e-5"}  # s, its step sizes by order of magnitude
 SECONDS_ASKED = {SOFT: 2.0, STIFF: 60.0}  # CPU time asked of the paper's procedure here
 FACTOR_ASKED = {SOFT: 20.0, STIFF: 200.0}  # times less CPU asked of Newton's method
 GROWTH_ASKED = 24.0  # from 4 to 64 elements
+JACOBIAN = 30  # evaluations that the differences of one take: 28 columns, the middle, one for the velocities
 
 
 def of_paper(rows: pd.DataFrame, case: str) -> pd.Series:
@@ -68,7 +74,7 @@ def least(rows: pd.DataFrame, case: str, solvers: tuple[str, ...]) -> tuple[str,
     return min(known.items(), key=lambda item: item[1]) if known else ("none", float("nan"))
 
 
-NEWTONS, IDAS = (NEWTON, NEWTON_GAUSS), (IDA_C, IDA_C_LOOSE)
+NEWTONS, IDAS = (NEWTON, NEWTON_4, NEWTON_5, NEWTON_GAUSS), (IDA_C, IDA_C_LOOSE)
 
 
 def goals(rows: pd.DataFrame) -> list[list[str]]:
@@ -89,7 +95,11 @@ def goals(rows: pd.DataFrame) -> list[list[str]]:
         asked = (
             f"Newton's method, {case}: {FACTOR_ASKED[case]:g} times less CPU than the paper's at a tip error of 0.1 mm"
         )
-        goal(asked, f"{_times(value)} ({solver}, {number(seconds)} s)", value, value >= FACTOR_ASKED[case])
+        own = of_paper(rows, case)["cpu_s"] / seconds
+        measured = (
+            f"{_times(value)} ({solver}, {number(seconds)} s); {_times(own)} if the paper's keeps its own tolerances"
+        )
+        goal(asked, measured, value, value >= FACTOR_ASKED[case])
     for case in CASES:
         (ours, own), (other, theirs) = least(rows, case, NEWTONS), least(rows, case, IDAS)
         value = theirs / own
@@ -104,7 +114,12 @@ def goals(rows: pd.DataFrame) -> list[list[str]]:
         asked, f"{_times(value)} to {counts.max():g} elements", value if known else float("nan"), value <= GROWTH_ASKED
     )
     value, text = stiffness_growth(rows)
-    goal("Newton's method at E = 2e10: about the cost of E = 2e8", text, value, value < 2.0)
+    goal(
+        "Newton's method at E = 2e10: about the cost of E = 2e8 (less than twice) at a tip error of 0.1 mm",
+        text,
+        value,
+        value < 2.0,
+    )
     return lines
 
 
@@ -129,16 +144,19 @@ def stiffness_growth(rows: pd.DataFrame) -> tuple[float, str]:
     counts, seconds = (
         modulus_cost(rows, stiffest, what) / modulus_cost(rows, 2e8, what) for what in ("n_evaluations", "cpu_s")
     )
-    return counts, f"{_times(counts)} the evaluations, {number(seconds)} times the CPU, from 2e8 to {stiffest:.0e} N/m²"
+    return (
+        counts,
+        f"{_times(counts)} the evaluations, {number(seconds)} times the CPU, from 2e8 to {power(stiffest)} N/m²",
+    )
 
 
-def summary(rows: pd.DataFrame, series: dict[str, Array]) -> list[str]:
+def summary(rows: pd.DataFrame) -> list[str]:
     """The findings."""
     lines = []
     for case in CASES:
         row = of_paper(rows, case)
         lines.append(
-            f"The paper's procedure, {case} beam, Atol = Rtol = {PAPER_TOL:g}: {row['status'].lower().replace('_', ' ')}, "
+            f"The paper's procedure, {case} beam, Atol = Rtol = {power(PAPER_TOL)}: {row['status'].lower().replace('_', ' ')}, "
             f"{number(row['n_steps'], 3)} steps of {number(row['h_median'])} s in the middle and {number(row['h_max'])} s "
             f"at most (the paper: order {ORDER[case]} s), {number(row['n_evaluations'])} evaluations, "
             f"{number(row['cpu_s'])} s of CPU for {row['t_end']:g} s of motion (the paper, on its machine: "
@@ -158,7 +176,7 @@ def summary(rows: pd.DataFrame, series: dict[str, Array]) -> list[str]:
             f"Newton's method as the outer loop, {case} beam: {number(seconds)} s of CPU for a tip error of "
             f"{1e3 * TARGET:g} mm ({solver}), {_times(value)} less than the paper's procedure."
         )
-    return [*lines, _limit_text(rows), *_sensitivity_text(series)]
+    return [*lines, _limit_text(rows), *_sensitivity_text(rows)]
 
 
 def _limit_text(rows: pd.DataFrame) -> str:
@@ -170,18 +188,17 @@ def _limit_text(rows: pd.DataFrame) -> str:
     )
 
 
-def _sensitivity_text(series: dict[str, Array]) -> list[str]:
-    t = series["sensitivity: t"]
+def _sensitivity_text(rows: pd.DataFrame) -> list[str]:
     lines = []
     for case in CASES:
-        texts = []
-        for name in PERTURBED:
-            off = np.abs(series[f"sensitivity: {case}, {name}"])
-            before = off[t <= PARTING].max()
-            texts.append(f"{name} {number(before)} and {number(off.max())} m")
+        runs = rows[(rows["group"] == "sensitivity") & (rows["case"] == case)]
+        end = runs["t_end"].iloc[0]
+        texts = [
+            f"{run['solver']} {number(run['before'])} and {number(run['largest'])} m" for _, run in runs.iterrows()
+        ]
         lines.append(
-            f"Sensitivity, {case} beam, largest change of the tip's height until {min(PARTING, t[-1]):g} s and until "
-            f"{t[-1]:g} s: {'; '.join(texts)}."
+            f"Sensitivity, {case} beam, largest change of the tip's height until {min(PARTING, end):g} s and until {end:g} s: "
+            f"{'; '.join(texts)}."
         )
     return lines
 
@@ -200,12 +217,12 @@ def headline(rows: pd.DataFrame) -> str:
     return text[0].upper() + text[1:] + "."
 
 
-def report(rows: pd.DataFrame, series: dict[str, Array], line: str, call: Call) -> None:
+def report(rows: pd.DataFrame, line: str, call: Call) -> None:
     """Write beam.md."""
     parts = [
         "# The flexible beam on a moving base (Sect. 4.2 of the paper)",
         f"Generated by {line}. Do not edit; rows in `beam.csv`, curves in `beam_series.npz`.",
-        "\n".join(f"- {text}" for text in summary(rows, series)),
+        "\n".join(f"- {text}" for text in summary(rows)),
         "**The start is assumed**, here as everywhere below: straight along x, gravity across it, only the base node moving. "
         "The paper's text tells neither this nor the length of its runs; its figures are lost, so that it can be compared with by "
         "its prose alone: times, orders of magnitude of the steps, and until when its results agree with those of others.",
@@ -227,13 +244,13 @@ def report(rows: pd.DataFrame, series: dict[str, Array], line: str, call: Call) 
         _limit_notes(),
         "## Why results part after 1.2 s",
         "![Change of the tip's height](beam_sensitivity.png)",
-        _parting(series),
+        _parting(rows),
         "## More elements, stiffer beams",
         "![Cost against elements and against Young's modulus](beam_growth.png)",
         element_table(rows),
         modulus_table(rows),
         f"The base moves as that of the moderately stiff beam. Sweeps run for {MODULUS_SWEEPS_END:g} s only, Newton's method for "
-        f"all of the time, its tip compared with that of {FINE_STAGES}-stage Radau IIA at tol {FINE_TOL:g}.",
+        f"all of the time, its tip compared with that of {FINE_STAGES}-stage Radau IIA at tol {power(FINE_TOL)}.",
         "## The reference",
         truth_table(rows),
         "## All runs",
@@ -254,13 +271,24 @@ def _obstacles(rows: pd.DataFrame) -> str:
             continue
         own = min(ours, key=lambda row: float(row["cpu_s"]))
         ida = min(theirs, key=lambda row: float(row["cpu_s"]))
+        swept = for_error(rows, case, SWEEPS)
+        each = float((swept["cpu_s"] / swept["n_evaluations"]).median())
+        share = each * own["n_evaluations"] / own["cpu_s"]
         texts.append(
-            f"- {case}: {own['solver']} takes {number(own['n_steps'], 3)} steps with "
-            f"{number(own['n_evaluations'] / own['n_steps'])} evaluations each and {number(1e6 * own['cpu_s'] / own['n_steps'])} "
-            f"µs a step; {ida['solver']} takes {number(ida['n_steps'], 3)} steps with "
-            f"{number(ida['n_evaluations'] / ida['n_steps'])} residuals each and {number(1e6 * ida['cpu_s'] / ida['n_steps'])} µs a step."
+            f"- {case}: {own['solver']} takes {number(own['n_steps'], 3)} steps of {number(own['n_evaluations'] / own['n_steps'])} "
+            f"evaluations and {number(1e6 * own['cpu_s'] / own['n_steps'])} µs; at the {number(1e6 * each)} µs that an evaluation costs in "
+            f"sweeps, evaluations are {share:.0%} of its time, {own['n_jacobians'] * JACOBIAN / own['n_evaluations']:.0%} of them for "
+            f"Jacobians, and algebra is the rest. {ida['solver']} takes {number(ida['n_steps'], 3)} steps of "
+            f"{number(ida['n_evaluations'] / ida['n_steps'])} residuals and {number(1e6 * ida['cpu_s'] / ida['n_steps'])} µs, all in all."
         )
-    return "\n".join(["Where the time goes:", "", *texts]) if texts else ""
+    notes = (
+        "What stands in the way where a goal is not reached: the very flexible beam's tip depends on its fast vibrations, so that for 0.1 mm "
+        "every method has to resolve them (see h w_max in the table below). There the step limit of sweeps costs little, and what "
+        "counts is the cost of a step: a multistep method has one stage, a Runge–Kutta step of Newton's method three or more, each evaluated "
+        "at every iteration. The stiff beam's vibrations need not be resolved, and Newton's method steps over them; the paper's procedure "
+        "cannot, whatever its tolerance: its loosest run is still far more exact than asked."
+    )
+    return "\n\n".join(["Where the time goes:", "\n".join(texts), notes]) if texts else ""
 
 
 def _limit_notes() -> str:
@@ -276,18 +304,21 @@ def _limit_notes() -> str:
     )
 
 
-def _parting(series: dict[str, Array]) -> str:
-    t = series["sensitivity: t"]
-    lines = []
+def _parting(rows: pd.DataFrame) -> str:
+    texts = []
     for case in CASES:
-        off = np.max([np.abs(series[f"sensitivity: {case}, {name}"]) for name in PERTURBED[:2]], axis=0)
-        visible = np.flatnonzero(off > 0.01)
-        when = f"exceeds 10 mm first at {t[visible[0]]:.2f} s" if visible.size else "stays within 10 mm"
-        lines.append(f"{case}: a change of E or of g by 0.1 % {when}")
+        runs = rows[(rows["group"] == "sensitivity") & (rows["case"] == case) & rows["solver"].isin(PERTURBED[:2])]
+        first = runs["t_visible"].min()
+        seen = (
+            f"is {1e3 * VISIBLE:g} mm at {first:.2f} s for the first time"
+            if np.isfinite(first)
+            else f"stays below {1e3 * VISIBLE:g} mm"
+        )
+        texts.append(f"{case}: what a change of E or g by 0.1 % does to the tip {seen}")
     return (
-        f"Not by the integrator: {'; '.join(lines)}. The mesh and the assumed start matter more, and from the beginning. The paper's "
-        "very flexible results agree with those that it compares with until 1.2 s and the moderately stiff ones throughout; "
-        "neither can be checked here, as both are lost, but two models of this beam that differ a little must part in this way."
+        f"{'; '.join(texts)}. The mesh and the assumed start matter more, from the beginning on. The paper's very flexible results "
+        f"agree with those that it compares with until {PARTING:g} s, its moderately stiff ones throughout. Neither can be checked, as "
+        "both are lost; but models that differ a little part in this way, whoever integrates them."
     )
 
 
@@ -297,12 +328,12 @@ def _notes() -> str:
         "procedures shorten steps to land on these, others interpolate; the paper's procedure at the paper's tolerance, whose "
         "motion is drawn, lands on ten times as many.",
         "**tol** = rtol = atol; for PaperNewmark err_out, with err_in = 1e-9. PaperIRK has err_in = 1e-9 and err_out = 1e-4 tol, "
-        f"which is 1e-9 at the paper's Atol = Rtol = {PAPER_TOL:g}.",
+        f"which is 1e-9 at the paper's Atol = Rtol = {power(PAPER_TOL)}.",
         f"**{SWEEPS}** and **{BDF}** sweep with this project's tests; “auto” changes between sweeps and Newton's method.",
         f"**{IDA_C_LOOSE}**: the options that let IDA step over vibrations (`references/ida_options.py`). All runs of IDA have "
         "the form stabilised and the exact tangent of the elastic forces.",
         f"**{EXPLICIT}**: SciPy's explicit solver on q'' = a, projected; Python calls it.",
-        f"**{PERTURBED[4]}** in the sensitivity figure: the same beam, integrated with a tolerance of {LOOSER_TOL:g}.",
+        f"**{PERTURBED[4]}** in the sensitivity figure: the same beam, integrated with a tolerance of {power(LOOSER_TOL)}.",
         f"**Many elements**: fixed steps of {FIXED_STEP:g} s, RadauIIA with Newton's method, very flexible beam; dense or with the "
         "band of the matrices known.",
         "**Element**: 4 elements are not a converged mesh in the very flexible case, and the element locks (see "

@@ -19,7 +19,7 @@ from twoloop import Result, RungeKutta, Statistics, Status, paper_newmark, solve
 from twoloop.mechanisms import Problem, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
 from twoloop.methods import Method
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,8 @@ TRUTH_TOL = 1e-8  # of DOP853, the reference; `truth_rows` says how far it agree
 FINER_TOL, CHECK_TOL = 1e-10, 1e-6  # of DOP853 and of Gauss12, that check it
 
 PAPER, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
-NEWTON, NEWTON_GAUSS, AUTO = "RadauIIA5 (Newton)", "Gauss6, Newton", "SunRadau5 (auto)"
+NEWTON, NEWTON_4, NEWTON_5 = "RadauIIA5 (Newton)", "RadauIIA7, Newton", "RadauIIA9, Newton"
+NEWTON_GAUSS, AUTO = "Gauss6, Newton", "SunRadau5 (auto)"
 SWEEPS, OWN_NEWMARK, BDF = "Gauss6 (sweeps)", "Newmark (sweeps)", "BDF (sweeps)"
 IDA_C, IDA_C_LOOSE = "IDA from C", "IDA from C, order <= 2, positions tested"
 IDA, IDA_LOOSE = "IDA, scikit-sundae", "IDA, scikit-sundae, order <= 2, positions tested"
@@ -88,6 +89,8 @@ SOLVERS: dict[str, Run] = {
     NEWMARK: partial(_paper_newmark, 0.5),
     QUARTER: partial(_paper_newmark, 0.25),
     NEWTON: partial(_two_loop, "RadauIIA5"),
+    NEWTON_4: partial(_two_loop, RungeKutta(radau_iia(4), "newton")),
+    NEWTON_5: partial(_two_loop, RungeKutta(radau_iia(5), "newton")),
     NEWTON_GAUSS: partial(_two_loop, RungeKutta(gauss(3), "newton")),
     AUTO: partial(_two_loop, "SunRadau5"),
     SWEEPS: partial(_two_loop, "Gauss6"),

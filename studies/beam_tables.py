@@ -9,6 +9,11 @@ from studies.report import markdown_table, number
 from studies.runs import time_for
 
 
+def power(value: float) -> str:
+    """A tolerance as it is written: 1e-5, 0.1."""
+    return f"{value:g}".replace("e-0", "e-").replace("e+", "e")
+
+
 def cpu_for(rows: pd.DataFrame, case: str, solver: str) -> float:
     """CPU time for a tip error of TARGET, s; NaN where no run is that good."""
     found = for_error(rows, case, solver)
@@ -48,7 +53,7 @@ def cost_table(rows: pd.DataFrame, case: str) -> str:
         ]
         numbers = [number(row["error_tip"]), number(row["cpu_s"]), number(seconds), number(reference / seconds)]
         last = [number(per_step), number(each), number(row["h_median"] * w_max)]
-        lines.append([solver, f"{row['tol']:g}", *numbers, *counts, *last])
+        lines.append([solver, power(row["tol"]), *numbers, *counts, *last])
     return markdown_table(list(COST), lines)
 
 
@@ -112,10 +117,10 @@ def modulus_table(rows: pd.DataFrame) -> str:
     for _, row in rows[rows["group"] == "modulus"].iterrows():
         lines.append(
             [
-                f"{row['modulus']:.0e}",
+                power(row["modulus"]),
                 number(row["w_max"], 3),
                 row["solver"],
-                f"{row['tol']:g}",
+                power(row["tol"]),
                 f"{row['t_end']:g}",
                 number(row["n_steps"], 3),
                 number(row["n_evaluations"] / row["t_end"]),
@@ -132,7 +137,7 @@ def truth_table(rows: pd.DataFrame) -> str:
     """How far the reference agrees with others."""
     header = ["case", "compared with", "tol", "largest difference of the tip's height (m)"]
     lines = [
-        [row["case"], row["solver"], f"{row['tol']:g}", number(row["error_tip"])]
+        [row["case"], row["solver"], power(row["tol"]), number(row["error_tip"])]
         for _, row in rows[rows["group"] == "truth"].iterrows()
     ]
     return markdown_table(header, lines)
@@ -152,5 +157,5 @@ def run_table(rows: pd.DataFrame) -> str:
         if row["status"] != "REACHED_END":
             ended += f" at {number(row['t_reached'], 3)} s"
         some = [number(row["cpu_s"]), number(row["repeats"]), *counts, number(row["h_median"]), ended]
-        lines.append([row["case"], row["solver"], f"{row['tol']:g}", *errors, *some])
+        lines.append([row["case"], row["solver"], power(row["tol"]), *errors, *some])
     return markdown_table(header, lines)

@@ -8,7 +8,7 @@ import pandas as pd
 from rich.progress import track
 
 from studies import claims_algebra as algebra
-from studies import claims_conclusion, claims_four_bar, claims_introduction, claims_method, claims_table3
+from studies import claims_beam, claims_conclusion, claims_four_bar, claims_introduction, claims_method, claims_table3
 from studies import claims_steps as steps
 from studies.claims_report import judged, report, summary
 from studies.claims_verdicts import Claim
@@ -23,10 +23,11 @@ CLAIMS: tuple[Claim, ...] = (
     *claims_introduction.CLAIMS,
     *claims_method.CLAIMS,
     *claims_four_bar.CLAIMS,
-    *claims_table3.CLAIMS,  # those of Sect. 4.2, the beam, go after these
+    *claims_table3.CLAIMS,
+    *claims_beam.CLAIMS,
     *claims_conclusion.CLAIMS,
 )
-SOURCES = ("table3", "motion", "step_size", "violation", "energy")  # studies whose rows are read
+SOURCES = ("table3", "motion", "step_size", "violation", "energy", "beam")  # studies whose rows are read
 PHASES, PHASES_QUICK = 40, 8  # instants of a period from which single steps are taken
 
 
@@ -58,6 +59,7 @@ def own_rows(quick: bool) -> pd.DataFrame:
         yield steps.determinants(first)
         yield steps.values_alone(first)
         yield steps.stiff()
+        yield claims_beam.elastic_force()
 
     return pd.DataFrame([row for rows in track(list(checks()), description="claims") for row in rows])
 

@@ -103,7 +103,7 @@ def report(pairs: Judged, lines: Mapping[str, str], line: str, call: Call) -> No
     (call.out / "claims.md").write_text("\n\n".join(parts) + "\n")
 
 
-NOTE = "Claims of Sect. 4.2, the flexible beam, are not in this table yet."
+NOTE = "In Sect. 4.2, the flexible beam, the start is assumed, and the paper's figures are lost: its prose is judged."
 
 HOW = f"""- **A verdict** is what a function of `studies/claims_*.py` makes of the rows named, by the criterion printed; none is written by hand. Thresholds
   are in the criterion. *Holds with conditions*: the criterion is met in part, and the finding says where. *Cannot be checked*: there are no rows to judge

@@ -13,7 +13,7 @@ from studies.claims import CLAIMS, SOURCES
 from studies.claims_report import judged, summary
 from studies.claims_verdicts import Verdict
 from studies.report import REPORTS, load_rows, save_rows
-from tests.studies.claims_rows import energy, motion, step_size, violation
+from tests.studies.claims_rows import beam, energy, motion, step_size, violation
 
 HOLDS, CONDITIONS, FAILS, UNCHECKED = Verdict
 KEYS = {"group", "solver", "problem", "err_in", "err_out", "h", "tol", "check", "case", "setting"}
@@ -37,6 +37,7 @@ def folder(tmp_path_factory):
         "step_size": step_size(),
         "violation": violation(),
         "energy": energy(),
+        "beam": beam(),
     }.items():
         save_rows(out / f"{name}.csv", rows, "made up")
     (out / "table3.csv").write_text((REPORTS / "table3.csv").read_text())
@@ -175,6 +176,13 @@ CASES = [
     ("stable over long times", "energy", "solver == solver", {"slope": 1e-3}, CONDITIONS, FAILS),
     ("Newmark gives no reasonable", "table3", NEWMARK + " and err_out < 1e-3", {"astray": False}, CONDITIONS, HOLDS),
     ("Newmark gives no reasonable", "table3", NEWMARK, {"lost": False}, CONDITIONS, FAILS),
+    ("order of 1e-3 s", "beam", "case == 'very flexible'", {"h_median": 1e-3}, CONDITIONS, HOLDS),
+    ("order of 1e-3 s", "beam", "case == 'very flexible'", {"h_max": 1e-4}, CONDITIONS, FAILS),
+    ("order of 1e-5 s", "beam", "case == 'moderately stiff'", {"h_median": 4e-5}, HOLDS, FAILS),
+    ("works for the very flexible", "beam", "case == 'very flexible'", {"error_tip": 0.1}, HOLDS, CONDITIONS),
+    ("computation time grows a lot", "beam", "case == 'moderately stiff'", {"cpu_s": 300.0}, FAILS, CONDITIONS),
+    ("implicit method is needed", "beam", "solver == 'DOP853, projected'", {"n_evaluations": 1e4}, CONDITIONS, FAILS),
+    ("implicit method is needed", "beam", "solver == 'DOP853, projected'", {"n_evaluations": 1e9}, CONDITIONS, HOLDS),
     ("new procedure still gives", "table3", "solver == 'PaperIRK'", {"lost": True}, CONDITIONS, FAILS),
 ]
 
