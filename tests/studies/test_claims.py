@@ -180,7 +180,7 @@ CASES = [
     ("order of 1e-3 s", "beam", "case == 'very flexible'", {"h_max": 1e-4}, CONDITIONS, FAILS),
     ("order of 1e-5 s", "beam", "case == 'moderately stiff'", {"h_median": 4e-5}, HOLDS, FAILS),
     ("works for the very flexible", "beam", "case == 'very flexible'", {"error_tip": 0.1}, HOLDS, CONDITIONS),
-    ("computation time grows a lot", "beam", "case == 'moderately stiff'", {"cpu_s": 300.0}, FAILS, CONDITIONS),
+    ("computation time grows a lot", "beam", "case == 'moderately stiff'", {"cpu_s": 4.0}, HOLDS, CONDITIONS),
     ("implicit method is needed", "beam", "solver == 'DOP853, projected'", {"n_evaluations": 1e4}, CONDITIONS, FAILS),
     ("implicit method is needed", "beam", "solver == 'DOP853, projected'", {"n_evaluations": 1e9}, CONDITIONS, HOLDS),
     ("new procedure still gives", "table3", "solver == 'PaperIRK'", {"lost": True}, CONDITIONS, FAILS),
