@@ -299,7 +299,8 @@ def _limit_notes() -> str:
         "beam with no test at all. “As they are here”: the largest fixed step, by bisection, at which the loops of this project "
         f"converge in each of {LIMIT_STEPS} steps of the linearised beam (tolerance of the outer loop {REDUCED:g} of the velocity "
         "of the start): they are given up after 60 sweeps (the paper's after 200), when changes have grown thousandfold, and the "
-        "paper's as soon as changes grow (33). The rate is that of the sweeps counted between two tolerances of the outer loop. "
+        "paper's as soon as changes grow (33). To bring changes down a hundredfold in 60 sweeps takes a rate below 0.93, which on accelerations "
+        "alone is 96 % of the limit. The rate is that of the sweeps counted between two tolerances of the outer loop. "
         "Newton's method has no such limit."
     )
 

@@ -43,7 +43,7 @@ IDA, IDA_LOOSE = "IDA, scikit-sundae", "IDA, scikit-sundae, order <= 2, position
 EXPLICIT = "DOP853, projected"
 LOOSE: dict[str, Any] = {"max_order": 2, "error_test": "positions"}  # what lets IDA step over fast vibrations
 
-Run = Callable[[Problem, float, Array, int], Result]  # (problem, tolerance, instants, repeat)
+Run = Callable[[Problem, float, Array], Result]  # (problem, tolerance, instants)
 
 
 def instants(t_end: float, per_second: int = PER_SECOND) -> Array:
@@ -51,34 +51,34 @@ def instants(t_end: float, per_second: int = PER_SECOND) -> Array:
     return np.linspace(0.0, t_end, round(t_end * per_second) + 1)
 
 
-def _two_loop(method: str | Method, problem: Problem, tol: float, times: Array, k: int) -> Result:
+def _two_loop(method: str | Method, problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
     return solve_dae(problem.system, span, problem.q0, problem.v0, method, tol, tol, t_eval=times)
 
 
-def _paper(problem: Problem, tol: float, times: Array, k: int) -> Result:
+def _paper(problem: Problem, tol: float, times: Array) -> Result:
     """The paper's procedure; err_out shrinks with the tolerance and is 1e-9 at the paper's 1e-5."""
     method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, 1e-4 * tol)
-    return _two_loop(method, problem, tol, times, k)
+    return _two_loop(method, problem, tol, times)
 
 
-def _paper_newmark(beta: float, problem: Problem, err_out: float, times: Array, k: int) -> Result:
-    return _two_loop(paper_newmark(ERR_IN, err_out, beta), problem, PAPER_TOL, times, k)
+def _paper_newmark(beta: float, problem: Problem, err_out: float, times: Array) -> Result:
+    return _two_loop(paper_newmark(ERR_IN, err_out, beta), problem, PAPER_TOL, times)
 
 
-def _ida_c(options: dict[str, Any], problem: Problem, tol: float, times: Array, k: int) -> Result:
+def _ida_c(options: dict[str, Any], problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
     options = {"t_eval": times, "tangent": elastic_tangent, **options}
     return solve_ida_c(problem.system, span, problem.q0, problem.v0, tol, tol, **options)
 
 
-def _ida(options: dict[str, Any], problem: Problem, tol: float, times: Array, k: int) -> Result:
+def _ida(options: dict[str, Any], problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
     options = {"t_eval": times, "tangent": elastic_tangent, **options}
     return solve_ida(problem.system, span, problem.q0, problem.v0, "stabilised", tol, tol, **options)
 
 
-def _explicit(problem: Problem, tol: float, times: Array, k: int) -> Result:
+def _explicit(problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
     start = problem.q0, problem.v0
     return solve_index1(problem.system, span, *start, "DOP853", tol, tol, stabilisation="projection", t_eval=times)
@@ -143,7 +143,7 @@ def truth_rows(truths: dict[str, BeamTruth]) -> Iterable[dict[str, Any]]:
     for case, truth in truths.items():
         problem, t_end = CASES[case](), float(truth.t[-1])
         q, _ = reduced_motion(problem, truth.t, FINER_TOL)
-        result = _two_loop(RungeKutta(gauss(6)), problem, CHECK_TOL, instants(t_end), 0)
+        result = _two_loop(RungeKutta(gauss(6)), problem, CHECK_TOL, instants(t_end))
         for solver, tol, tip, t in (
             ("DOP853, reduced", FINER_TOL, tip_height(q), truth.t),
             ("Gauss12 (sweeps)", CHECK_TOL, tip_height(result.q), result.t),
@@ -187,9 +187,9 @@ def measure(job: BeamJob, result: Result, problem: Problem, truth: BeamTruth) ->
     return row
 
 
-def _attempt(job: BeamJob, problem: Problem, k: int) -> Result:
+def _attempt(job: BeamJob, problem: Problem) -> Result:
     try:
-        return SOLVERS[job.solver](problem, job.tol, job.times, k)
+        return SOLVERS[job.solver](problem, job.tol, job.times)
     except RuntimeError as error:  # a foreign solver that is not there is a row too
         nothing, columns = np.empty(0), np.empty((problem.system.n_q, 0))
         lam, status = np.empty((problem.system.n_c, 0)), Status.SOLVER_FAILED
@@ -199,7 +199,10 @@ def _attempt(job: BeamJob, problem: Problem, k: int) -> Result:
 def collect(
     jobs: Iterable[BeamJob], truths: dict[str, BeamTruth]
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, Array]]]:
-    """Rows of all jobs, in rounds so that a slow minute of the machine falls on all alike, and the curves drawn."""
+    """Rows of all jobs, in rounds so that a slow minute of the machine falls on all alike, and the curves drawn.
+
+    The CPU time of a row is the median of its repeats; all else repeats exactly.
+    """
     jobs = list(jobs)
     problems = {case: make() for case, make in CASES.items()}
     seconds: list[list[float]] = [[] for _ in jobs]
@@ -214,7 +217,7 @@ def collect(
                     continue
                 progress.update(task, description=f"{job.case}, {job.solver} ({job.tol:g})"[:50].ljust(50))
                 problem = problems[job.case]
-                result = _attempt(job, problem, k)
+                result = _attempt(job, problem)
                 seconds[n].append(result.stats.cpu_time)
                 rows[n] = measure(job, result, problem, truths[job.case])
                 if job.drawn:
@@ -257,7 +260,7 @@ def compile_all() -> None:
     problem = very_flexible_beam()
     for solver, run in SOLVERS.items():
         if solver not in (IDA_C, IDA_C_LOOSE, IDA, IDA_LOOSE):  # their time is that of the integration alone
-            run(problem, 1e-3, np.array([0.0, 1e-4]), 0)
+            run(problem, 1e-3, np.array([0.0, 1e-4]))
 
 
 def for_error(rows: pd.DataFrame, case: str, solver: str) -> pd.DataFrame:

@@ -155,7 +155,7 @@ def test_errors_are_those_of_the_tip_and_a_run_that_ends_early_has_none():
 
 
 def test_a_solver_that_is_not_there_is_a_row(monkeypatch):
-    def absent(problem, tol, times, k):
+    def absent(problem, tol, times):
         raise RuntimeError("no such library")
 
     monkeypatch.setitem(beam.collect.__globals__["SOLVERS"], NEWTON, absent)
