@@ -71,7 +71,7 @@ def _works(rows: Rows) -> Judgement:
     runs = [_paper(rows, case) for case in (SOFT, STIFF)]
     good = [bool(run["status"] == "REACHED_END" and run["error_tip"] < FOLLOWS) for run in runs]
     errors = " and ".join(f"{number(run['error_tip'])} m" for run in runs)
-    why = "At its tolerances, against an explicit method of order 8 on the equations without constraints. The start is assumed."
+    why = "At its tolerances, against an explicit method of order 8 on the equations without constraints. The start is this project's choice."
     return Judgement(f"tip errors {errors}", grade(all(good), any(good)), why)
 
 
@@ -132,9 +132,7 @@ def _force(rows: Rows) -> Judgement:
     return Judgement(f"off by {worst:.1g}, relative", grade(worst < ROUNDING), why)
 
 
-_RUN = (
-    "Its procedure at Atol = Rtol = 1e-5, err_in = err_out = 1e-9, for 2 s; start assumed (only the base node moves)."
-)
+_RUN = "Its procedure at Atol = Rtol = 1e-5, err_in = err_out = 1e-9, for 2 s; start chosen here (only the base node moves)."
 _PICKED = f"group = run; solver = {PAPER}; tol = {PAPER_TOL:g}"
 
 CLAIMS: tuple[Claim, ...] = (
