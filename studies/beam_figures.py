@@ -18,7 +18,7 @@ STYLES: dict[str, str] = dict(
         SOLVERS,
         (
             *("C3o-", "C1v-", "C1^--"),  # the paper's
-            *("C0o-", "C0^-", "C0v-", "C9s-", "C0D--"),  # Newton's method
+            *("C0o-", "b^-", "mv-", "C9s-", "C0D--"),  # Newton's method
             *("C2s-", "C8^-", "C4v-"),  # sweeps
             *("ks-", "kD--", "C7s:", "C7D:", "C5x-"),  # other people's
         ),
@@ -37,11 +37,16 @@ def figures(rows: pd.DataFrame, series: dict[str, Array], call: Call) -> None:
 
 def _motion(rows: pd.DataFrame, series: dict[str, Array], call: Call) -> None:
     plot, axes = plt.subplots(3, 2, figsize=(10.5, 8), sharex=True, layout="constrained", height_ratios=(3, 3, 3.4))
+    tolerance = f"{PAPER_TOL:.0e}".replace("e-0", "e-")
     for column, case in enumerate(CASES):
         tip, middle, steps = axes[:, column]
         for name, style, label in (
             (f"{case}, truth", {"color": "0.75", "lw": 4}, "reference"),
-            (f"{case}, {PAPER}", {"color": "tab:red", "lw": 1.4}, f"PaperIRK, Atol = Rtol = {PAPER_TOL:g}"),
+            (
+                f"{case}, {PAPER}",
+                {"color": "tab:red", "lw": 1.4},
+                f"PaperIRK, Atol = Rtol = {tolerance}",
+            ),
             (f"{case}, {NEWTON}", {"color": "tab:blue", "lw": 1.2, "ls": "--"}, "RadauIIA5, Newton's method"),
         ):
             if f"{name}: t" not in series:  # a quick run may not have all

@@ -286,7 +286,8 @@ def _obstacles(rows: pd.DataFrame) -> str:
         "every method has to resolve them (see h w_max in the table below). There the step limit of sweeps costs little, and what "
         "counts is the cost of a step: a multistep method has one stage, a Runge–Kutta step of Newton's method three or more, each evaluated "
         "at every iteration. The stiff beam's vibrations need not be resolved, and Newton's method steps over them; the paper's procedure "
-        "cannot, whatever its tolerance: its loosest run is still far more exact than asked."
+        "cannot, whatever its tolerance: its loosest run is still far more exact than asked. With such steps the Jacobian is soon old, and its "
+        "differences are evaluations, too (their share is above), where IDA is given the exact tangent."
     )
     return "\n\n".join(["Where the time goes:", "\n".join(texts), notes]) if texts else ""
 
