@@ -336,8 +336,8 @@ def _notes() -> str:
         "the form stabilised and the exact tangent of the elastic forces.",
         f"**{EXPLICIT}**: SciPy's explicit solver on q'' = a, projected; Python calls it.",
         f"**{PERTURBED[4]}** in the sensitivity figure: the same beam, integrated with a tolerance of {power(LOOSER_TOL)}.",
-        f"**Many elements**: fixed steps of {FIXED_STEP:g} s, RadauIIA with Newton's method, very flexible beam; dense or with the "
-        "band of the matrices known.",
+        f"**Many elements**: fixed steps of {FIXED_STEP:g} s, RadauIIA with Newton's method, very flexible beam; dense, or “banded”: with "
+        "the band of the matrices known, which is used where it pays, not yet with 4 elements; “over the fewest” is in proportion to these.",
         "**Element**: 4 elements are not a converged mesh in the very flexible case, and the element locks (see "
         "`twoloop.mechanisms.ancf_beam`); both belong to the example.",
     ]
