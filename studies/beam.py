@@ -27,6 +27,7 @@ from studies.beam_runs import (
     PAPER_TOL,
     QUARTER,
     SOFT,
+    SOLVERS,
     STIFF,
     SWEEPS,
     T_END,
@@ -103,7 +104,7 @@ def run(call: Call) -> tuple[pd.DataFrame, dict[str, Array]]:
     """Make all rows, and the curves of the figures."""
     t_end = T_END_QUICK if call.quick else T_END
     say = Console().print
-    compile_all()
+    compile_all(QUICK if call.quick else SOLVERS)
     say("the reference motions")
     truths = {case: true_motion(make(), t_end) for case, make in CASES.items()}
     rows = [*truth_rows(truths)]

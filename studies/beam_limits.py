@@ -231,7 +231,7 @@ def modulus_rows(quick: bool) -> Iterator[Row]:
     for modulus in MODULI_QUICK if quick else MODULI:
         problem = ancf_beam(youngs_modulus=modulus, **motion)
         w_max = float(frequencies(problem)[-1])
-        end = 0.2 if quick else T_END
+        end = 0.1 if quick else T_END
         times = instants(end)
         fine = _run(problem, RungeKutta(radau_iia(FINE_STAGES), "newton"), FINE_TOL, times)
         runs: list[tuple[str, Method, float, Array]] = [

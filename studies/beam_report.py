@@ -54,6 +54,7 @@ ORDER = {SOFT: "1e-3", STIFF: "1e-5"}  # s, its step sizes by order of magnitude
 SECONDS_ASKED = {SOFT: 2.0, STIFF: 60.0}  # CPU time asked of the paper's procedure here
 FACTOR_ASKED = {SOFT: 20.0, STIFF: 200.0}  # times less CPU asked of Newton's method
 GROWTH_ASKED = 24.0  # from 4 to 64 elements
+STIFFEST = 2e10  # N/m^2
 JACOBIAN = 30  # evaluations that the differences of one take: 28 columns, the middle, one for the velocities
 
 
@@ -114,12 +115,8 @@ def goals(rows: pd.DataFrame) -> list[list[str]]:
         asked, f"{_times(value)} to {counts.max():g} elements", value if known else float("nan"), value <= GROWTH_ASKED
     )
     value, text = stiffness_growth(rows)
-    goal(
-        "Newton's method at E = 2e10: about the cost of E = 2e8 (less than twice) at a tip error of 0.1 mm",
-        text,
-        value,
-        value < 2.0,
-    )
+    asked = "Newton's method at E = 2e10: about the cost of E = 2e8 (less than twice) at a tip error of 0.1 mm"
+    goal(asked, text, value if rows["modulus"].max() == STIFFEST else float("nan"), value < 2.0)
     return lines
 
 
