@@ -85,9 +85,10 @@ class RungeKutta:
     partition : {"lasting", "symmetric"}
         "lasting": a partition stays until it is worn. "symmetric": each step has the partition that full pivoting
         finds in the middle of the step, the same forwards and backwards, so that fixed steps with a symmetric tableau
-        (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. For long times at fixed steps
-        `RungeKutta(gauss(3), variables="momenta", partition="symmetric")` keeps the energy of a conservative mechanism
-        without drift; an error estimate, step-size control above all, spoils both properties.
+        (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. On conservative mechanisms that swing
+        back the way they came, `RungeKutta(gauss(3), variables="momenta", partition="symmetric")` with fixed steps then
+        shows no drift of the energy; where motion does not reverse, as of a turning crank, only momenta under one
+        lasting partition do. Step-size control spoils both properties.
 
     Raises
     ------
