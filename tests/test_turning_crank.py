@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import null_space
 
 from studies.energy_drift import drift, windows
-from twoloop import RungeKutta, solve_dae
+from twoloop import BDF, Newmark, RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.tableaux import gauss
 
@@ -43,3 +43,17 @@ def test_gauss_drifts_on_velocities_and_not_on_momenta(variables, drifts):
     slope, uncertain = drift(seen["t"], seen["mean"])
     assert (abs(slope) > 10.0 * uncertain) == drifts
     assert (abs(slope) > 1e-8) == drifts  # J/s
+
+
+METHODS = [RungeKutta(gauss(3)), RungeKutta(gauss(3), variables="momenta"), Newmark(), BDF()]
+
+
+@pytest.mark.parametrize("turns", [0, 10_000])
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_fixed_steps_converge_after_many_turns(method, turns):
+    # the rounding of a large angle keeps the sweeps from converging as far as they do near zero
+    problem, v0 = crank()
+    q0 = problem.q0.copy()
+    q0[8] += 2.0 * math.pi * turns
+    run = solve_dae(problem.system, (0.0, 1.0), q0, v0, method, step_size=2e-3)
+    assert run.success, run.message

@@ -280,10 +280,10 @@ class BDF:
     -----
     Sect. 5 of the paper proposes BDF as further work and leaves its form open; all of it is chosen here. Modified
     divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
-    Numerical Solution of Initial-Value Problems in DAEs (1996), Sect. 5.2. Unlike the backward differences on an
+    Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
     equidistant history of Shampine and Reichelt (1997) they need no interpolation when a step is shortened to an
     output time. The order is that of the largest next step, as in VODE. Stability and error constants: Hairer,
-    Norsett and Wanner, Solving ODEs I (1993), Sects. III.1, III.3.
+    Norsett and Wanner, Solving ODEs I (1993), chapter III.
     """
 
     max_order: int = 5
