@@ -209,7 +209,7 @@ def report(rows: pd.DataFrame, line: str, call: Call) -> None:
         "\n".join(f"- {text}" for text in summary(rows)),
         "## Over 2 s (Fig. 2)",
         "![y3 over 2 s](motion_short.png)",
-        "Height of bar 3's centre and, below, its largest error so far. Black: the true motion. Orders 4 and 6 of the stand-in "
+        "Height of bar 3's centre and, below, its largest error so far. Broad grey line: the true motion. Orders 4 and 6 of the stand-in "
         "are in the tables. “GSTIFF stand-in”: fixed-step BDF on the index-3 equations, not ADAMS.",
         f"The stand-in over 2 s; **more than {1e3 * VISIBLE:g} mm**, visible in a figure:",
         markdown_table(*grid(rows, "error_y3_short")),
