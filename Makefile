@@ -47,8 +47,8 @@ table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes secon
 reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
 
-test: install ## the tests; ARGS="-m ''" takes the slow ones too
-	$(RUN) -m pytest $(ARGS)
+test: install ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
+	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: install ## ruff and mypy
 	$(RUN) -m ruff check .

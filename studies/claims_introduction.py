@@ -92,7 +92,7 @@ def _projection(rows: Rows) -> Judgement:
     dearer = [ratio > DEARER for ratio in ratios]
     why = (
         f"Cost at equal error (of {', '.join(f'{e:g}' for e in TARGETS)} where both reach it): {'; '.join(parts)}. A run without projection has "
-        "to be more accurate for an equal error. The linkage is small; for large systems the rows say nothing."
+        "to be more accurate for an equal error. So much for this linkage; for large systems, and for projection against state space with one and the same method, the rows say nothing."
     )
     return Judgement(f"cost × {span(ratios)}", grade(all(dearer), any(dearer)), why)
 
@@ -117,7 +117,8 @@ def _newmark_symplectic(rows: Rows) -> Judgement:
     why = (
         f"Symplectic in (q, v): {'; '.join(cases[symplectic]) or 'none'}. Not: {'; '.join(cases[~symplectic]) or 'none'} "
         f"(|det − 1| {span(found['value'][~symplectic]) if (~symplectic).any() else '–'} at h = 0.2). The paper does not name "
-        "its circumstances; its β = γ = 1/2 is the third of the cases run."
+        "its circumstances; its β = γ = 1/2 is the third of the cases run. With γ = 1/2 any β is symplectic in changed variables (for M = 1: q − β h² a(q) moves by "
+        "the scheme of Störmer and Verlet), so its energy need not drift either."
     )
     return Judgement(
         f"{int(symplectic.sum())} of {len(found)} (β, γ)", grade(bool(symplectic.any() and not symplectic.all())), why
@@ -189,7 +190,7 @@ def _levels(rows: Rows) -> Judgement:
     why = (
         f"At err_in = 1e-9 the largest violations of the three levels are {', '.join(number(w) for w in worst)} (m, m/s, m/s²). "
         f"Positions over err_in, at the worst err_out: {'; '.join(f'{e:.0e}: {number(x)} m' for e, x in by_err_in.items())}. What "
-        "err_in leaves is the square of the last correction; it is below "
+        "err_in leaves goes as the square of the last correction; it is below "
         f"{TIGHT:g} m for err_in = {', '.join(f'{e:.0e}' for e in good.index) or 'none'}."
     )
     return Judgement(
@@ -404,7 +405,7 @@ CLAIMS = (
     ),
     Claim(
         "2.3, 4.1",
-        "(12) with β = γ = 1/2 stands for Newmark's method in the comparison.",
+        "(12) with β = γ = 1/2 stands for Newmark's method in the comparison (not said, but done).",
         "Newmark with fixed steps of 1 ms to 1 s, and PaperNewmark at err_out = 1e-9, with β = 1/2 and β = 1/4.",
         {
             "claims": ("check = fixed steps to 1 s; case begins with Newmark", (*VALUE, "setting")),

@@ -89,7 +89,12 @@ def summary(rows: pd.DataFrame) -> list[str]:
             f"{1e3 * VISIBLE:g} mm, visible in a figure, at the orders {', '.join(off) or '(none)'}. The paper, which "
             f"does not tell the order: Gstiff {said}."
         )
-    both_hold = [f"{order}" for order in GEAR_ORDERS if _as_in_the_paper(rows, order)]
+    both_hold = [
+        f"{order} (for any limit of what is visible from {number(1e3 * low)} to {number(1e3 * high)} mm)"
+        for order in GEAR_ORDERS
+        for low, high in _limits(rows, order)
+        if low <= VISIBLE < high
+    ]
     lines.append(
         f"Both of these statements of the paper hold with the stand-in of order {', '.join(both_hold) or '(none)'}."
     )
@@ -130,12 +135,12 @@ def summary(rows: pd.DataFrame) -> list[str]:
     return lines
 
 
-def _as_in_the_paper(rows: pd.DataFrame, order: int) -> bool:
-    """Whether the stand-in is visibly off within 2 s at h = 0.02 s, and not at 0.01 s."""
-    long, short = (_gear(rows, order, "accurate", step) for step in (0.02, 0.01))
+def _limits(rows: pd.DataFrame, order: int) -> list[tuple[float, float]]:
+    """Errors within 2 s at h = 0.01 and 0.02 s, m, if known: for a limit between them the stand-in does as Gstiff did."""
+    short, long = (_gear(rows, order, "accurate", step) for step in (0.01, 0.02))
     if long is None or short is None:
-        return False
-    return bool(long["error_y3_short"] > VISIBLE >= short["error_y3_short"])
+        return []
+    return [(short["error_y3_short"], long["error_y3_short"])]
 
 
 def _sign(rows: pd.DataFrame, order: int) -> float:
@@ -204,7 +209,7 @@ def report(rows: pd.DataFrame, line: str, call: Call) -> None:
         "\n".join(f"- {text}" for text in summary(rows)),
         "## Over 2 s (Fig. 2)",
         "![y3 over 2 s](motion_short.png)",
-        "Height of bar 3's centre and, below, its largest error so far. Black: the true motion. Orders 4 and 6 of the stand-in "
+        "Height of bar 3's centre and, below, its largest error so far. Broad grey line: the true motion. Orders 4 and 6 of the stand-in "
         "are in the tables. “GSTIFF stand-in”: fixed-step BDF on the index-3 equations, not ADAMS.",
         f"The stand-in over 2 s; **more than {1e3 * VISIBLE:g} mm**, visible in a figure:",
         markdown_table(*grid(rows, "error_y3_short")),

@@ -180,8 +180,9 @@ def _others(rows: pd.DataFrame, series: dict[str, Array], call: Call) -> None:
         panel.set_title(f"{row['solver']}, {_setting(row)}: error {number(row['error_q'])}", fontsize=8.5)
     for panel in list(axes.flat)[len(shown) :]:
         panel.set_visible(False)
-    for panel in axes[-1]:
+    for panel in list(axes.flat)[: len(shown)][-3:]:  # the lowest of each column
         panel.set_xlabel("t (s)")
+        panel.tick_params(labelbottom=True)
     for panel in axes[:, 0]:
         panel.set_ylabel("step size (s)")
     axes[0, 0].set_ylim(1e-4, 0.4)

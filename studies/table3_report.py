@@ -151,6 +151,8 @@ def figure(rows: pd.DataFrame, call: Call) -> None:
         for solver, (color, style) in SHOWN.items():
             part = rows[(rows["problem"] == problem) & (rows["solver"] == solver) & rows["error_q"].notna()]
             part = part[part["err_in"].isna() | (part["err_in"] == TOLERANCES[-1])].sort_values("error_q")
+            if part.empty:  # rows of before a solver was there, or all of them failed
+                continue
             panel.loglog(part["error_q"], part["cpu_s"], style, color=color, ms=4, lw=1.1, label=solver)
             bad = part[part["lost"] | part["astray"]]
             panel.loglog(bad["error_q"], bad["cpu_s"], style[0], color=color, ms=5, mfc="white", zorder=5)

@@ -72,6 +72,44 @@ def order_defect(tableau, n):
     return max(abs(tableau.b @ stage_weights(tree, tableau.A) - 1.0 / density(tree)) for tree in trees(n))
 
 
+def pruned(tree):
+    """The trees that are left when one leaf is taken off, one for each leaf."""
+    found = []
+    for k, branch in enumerate(tree):
+        rest = tree[:k] + tree[k + 1 :]
+        found += [tuple(sorted((*rest, one)) if one is not None else rest) for one in (pruned(branch) or [None])]
+    return found
+
+
+def defect_up_to_conjugacy(tableau, p):
+    """Least violation of the conditions of order p + 1 by chi o Phi o chi^-1, with chi = identity + O(h^p) a B-series.
+
+    For a method of order p conjugation by the B-series beta changes the coefficient of a tree by the sum of beta over
+    the tree less a leaf, and, where it has one branch only, by minus the beta of that branch.
+    """
+    place = {tree: k for k, tree in enumerate(trees(p))}
+    change = np.zeros((len(trees(p + 1)), len(place)))
+    defect = np.zeros(len(change))
+    for k, tree in enumerate(trees(p + 1)):
+        defect[k] = tableau.b @ stage_weights(tree, tableau.A) - 1.0 / density(tree)
+        for rest in pruned(tree):
+            change[k, place[rest]] += 1.0
+        if len(tree) == 1:
+            change[k, place[tree[0]]] -= 1.0
+    beta = np.linalg.lstsq(change, defect, rcond=None)[0]
+    return np.abs(change @ beta - defect).max()
+
+
+@pytest.mark.parametrize("s", [2, 3, 4])
+def test_sun_is_conjugate_to_a_method_of_one_order_more_and_radau_iia_is_not(s):
+    # why Sun's error of order h^(2s-1) does not add up while its variables stay the same
+    p = 2 * s - 1
+    for tableau in (sun_radau_iib(s), radau_iia(s)):
+        assert order_defect(tableau, p) < 1e-14 < 1e-5 < order_defect(tableau, p + 1)
+    assert defect_up_to_conjugacy(sun_radau_iib(s), p) < 1e-14
+    assert defect_up_to_conjugacy(radau_iia(s), p) > 1e-6
+
+
 def test_the_trees_are_all_there():
     assert [len(trees(n)) for n in range(1, 11)] == [1, 1, 2, 4, 9, 20, 48, 115, 286, 719]  # OEIS A000081
 

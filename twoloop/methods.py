@@ -92,9 +92,10 @@ class RungeKutta:
     partition : {"lasting", "symmetric"}
         "lasting": a partition stays until it is worn. "symmetric": each step has the partition that full pivoting
         finds in the middle of the step, the same forwards and backwards, so that fixed steps with a symmetric tableau
-        (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. For long times at fixed steps
-        `RungeKutta(gauss(3), variables="momenta", partition="symmetric")` keeps the energy of a conservative mechanism
-        without drift; an error estimate, step-size control above all, spoils both properties.
+        (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. On conservative mechanisms that swing
+        back the way they came, `RungeKutta(gauss(3), variables="momenta", partition="symmetric")` with fixed steps then
+        shows no drift of the energy; where motion does not reverse, as of a turning crank, only momenta under one
+        lasting partition do. Step-size control spoils both properties.
 
     Raises
     ------
@@ -301,10 +302,10 @@ class BDF:
     -----
     Sect. 5 of the paper proposes BDF as further work and leaves its form open; all of it is chosen here. Modified
     divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
-    Numerical Solution of Initial-Value Problems in DAEs (1996), Sect. 5.2. Unlike the backward differences on an
+    Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
     equidistant history of Shampine and Reichelt (1997) they need no interpolation when a step is shortened to an
     output time. The order is that of the largest next step, as in VODE. Stability and error constants: Hairer,
-    Norsett and Wanner, Solving ODEs I (1993), Sects. III.1, III.3.
+    Norsett and Wanner, Solving ODEs I (1993), chapter III.
     """
 
     max_order: int = 5

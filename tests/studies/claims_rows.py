@@ -45,7 +45,15 @@ def step_size() -> pd.DataFrame:
         ],
         columns=columns,
     )
-    return rows.assign(group="paper", share_steps=0.999, share_time=0.9999, status="REACHED_END", t_end=T_END)
+    return rows.assign(
+        group="paper",
+        share_steps=0.999,
+        share_time=0.9999,
+        status="REACHED_END",
+        t_end=T_END,
+        n_evaluations=1e6,
+        error_q=0.02,
+    )
 
 
 def violation() -> pd.DataFrame:

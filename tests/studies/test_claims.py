@@ -174,6 +174,7 @@ CASES = [
     ("above 0.02 s", "step_size", "solver == 'PaperIRK'", {"share_time": 0.4}, HOLDS, FAILS),
     ("stable over long times", "energy", "solver == solver", {"slope": 0.0}, CONDITIONS, HOLDS),
     ("stable over long times", "energy", "solver == solver", {"slope": 1e-3}, CONDITIONS, FAILS),
+    ("stable over long times", "energy", "variables == 'momenta'", {"slope": 1e-3}, CONDITIONS, FAILS),
     ("Newmark gives no reasonable", "table3", NEWMARK + " and err_out < 1e-3", {"astray": False}, CONDITIONS, HOLDS),
     ("Newmark gives no reasonable", "table3", NEWMARK, {"lost": False}, CONDITIONS, FAILS),
     ("order of 1e-3 s", "beam", "case == 'very flexible'", {"h_median": 1e-3}, CONDITIONS, HOLDS),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, inlined, kernel
-from twoloop.kernels.inner import accelerations, evaluate
+from twoloop.kernels.inner import accelerations, evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.runge_kutta import options_array as gauss_options
 from twoloop.kernels.runge_kutta import sweep_accelerations
@@ -19,7 +19,6 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
 MAX_SWEEPS = 60
-ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinking has converged
 SAFETY = 0.9  # of advance(): the next step is SAFETY over the returned error times this one
 BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
 NEIGHBOUR = 1.4  # ... and that of another order once more times this, lest the order flutter
@@ -169,7 +168,7 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
         # the first sweep evaluates the prediction, never to be accepted: extrapolation alone is unstable
-        if sweep > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= ROUNDING_FLOOR)):
+        if sweep > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
             return DONE
         if not change <= before:
             return OUTER_DIVERGED
@@ -196,7 +195,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = _norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps also the interpolation of the history has an error; the larger counts (Brenan et al., 5.2)
+    # with unequal steps also the interpolation of the history has an error; the larger counts (as in DASSL)
     interpolation = spans[0] / spans[k]
     for j in range(k):
         interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)

@@ -28,6 +28,7 @@ MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
 ROUNDING = 1e-13  # relative to the largest coordinate: corrections of this size no longer shrink
 DIFFERENCE = 2e-4  # see difference_step
+ROUNDING, ROUNDING_OF_Q = 1e-12, 2e-14  # see rounding_floor; the latter is a hundred roundings
 
 
 @compiled
@@ -138,6 +139,15 @@ def difference_step(q, v):
         size = max(size, abs(q[j]))
         speed = max(speed, abs(v[j]))
     return DIFFERENCE * size / speed if speed > size else DIFFERENCE
+
+
+@inlined
+def rounding_floor(q):
+    """Relative change below which a sweep that stops shrinking has converged: rounding of q moves accelerations."""
+    size = 0.0
+    for j in range(q.size):
+        size = max(size, abs(q[j]))
+    return max(ROUNDING, ROUNDING_OF_Q * size)
 
 
 @inlined

@@ -34,6 +34,7 @@ from twoloop.kernels.inner import (
     dependent_positions,
     difference_step,
     factor_dependent,
+    rounding_floor,
 )
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_solve
 from twoloop.kernels.partition import CHANGED, partition_of_midpoint
@@ -44,7 +45,6 @@ from twoloop.kernels.runge_kutta import (
     MAX_SWEEPS,
     OUTER_TOL,
     PATIENCE,
-    ROUNDING_FLOOR,
     SYMMETRIC,
     conclude,
     interpolate,
@@ -263,7 +263,7 @@ def _sweep(f, w, options, memory, t, h, q, p, V_stage, R_stage, q1, p1, v1):
         elif not change <= GROWTH * first:
             return OUTER_DIVERGED
         elif change >= earlier:  # two sweeps back: errors go from q to p in one sweep and back in the next
-            if change <= ROUNDING_FLOOR:
+            if change <= rounding_floor(q):
                 converged = True
                 break
             if sweep >= PATIENCE:

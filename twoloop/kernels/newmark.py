@@ -3,11 +3,10 @@
 import numpy as np
 
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, kernel
-from twoloop.kernels.inner import evaluate
+from twoloop.kernels.inner import evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
 
 MAX_SWEEPS = 60
-ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinking has converged
 
 # places in `options`
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
@@ -55,7 +54,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             change = max(change, gamma * difference / max(abs(v1[m]), 1.0))
             change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        if change <= options[OUTER_TOL] or (change >= before and change <= ROUNDING_FLOOR):
+        if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
             error = _error(options, tolerances, h, q, a, a1) if tolerances[ESTIMATE] == 1.0 else 0.0
             return DONE, error
         if not change <= before:

@@ -21,7 +21,7 @@ from twoloop.kernels.common import (
     inlined,
     kernel,
 )
-from twoloop.kernels.inner import accelerations, evaluate, restore
+from twoloop.kernels.inner import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.partition import CHANGED, partition_of_midpoint
 
@@ -29,7 +29,6 @@ MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
 GROWTH = 1e3  # the differences may first grow (the sweep is not normal), but not by more than this
 PATIENCE = 8  # sweeps after which a difference that grows again means divergence
-ROUNDING_FLOOR = 1e-12  # below this relative change a sweep that stops shrinking has converged
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
@@ -150,7 +149,7 @@ def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1
         elif not change <= GROWTH * first:
             return OUTER_DIVERGED
         elif change >= before:
-            if change <= ROUNDING_FLOOR:
+            if change <= rounding_floor(q):
                 converged = True
                 break
             if sweep >= PATIENCE:
