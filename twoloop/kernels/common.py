@@ -71,9 +71,9 @@ class Work(NamedTuple):
     Cq: Any  # (n_c, n_q) constraint Jacobian at the last position
     Cqd: Any  # (n_c, n_c) LU factors of its dependent columns
     S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its factors
-    W: Any  # (n_q, n_c) Cq^T; where M is banded M^-1 Cq^T, column after column
+    W: Any  # (n_q, n_c) Cq^T with a diagonal M; else M^-1 Cq^T, column after column
     Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences); scratch for full pivoting
-    Cq_of_S: Any  # (n_c, n_q) the Cq that S and W belong to, where M is banded; NaN: none
+    Cq_of_S: Any  # (n_c, n_q) the Cq that S and W belong to, where M is constant, not diagonal; NaN: none
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     C: Any  # (n_c) constraint, and corrections

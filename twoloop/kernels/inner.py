@@ -208,22 +208,10 @@ def _schur_complement(f, w):
     """Upper triangle of S = C_q M^-1 C_q^T into w.S."""
     n_c, n_q = w.Cq.shape
     w.S[:, :] = 0.0
-    if banded_mass(f):
-        solved = inverse_mass_border(w)
-        for i in range(n_c):
-            copy(w.Cq[i], solved[i])
-        solve_banded_mass(f, w, n_c, w.W)
-        for i in range(n_c):
-            for k in range(i, n_c):
-                total = 0.0
-                for j in range(n_q):
-                    total += w.Cq[i, j] * solved[k, j]
-                w.S[i, k] = total
-        return
-    for j in range(n_q):
-        for i in range(n_c):
-            w.W[j, i] = w.Cq[i, j]
     if f.flags[DIAGONAL_MASS] == 1:
+        for j in range(n_q):
+            for i in range(n_c):
+                w.W[j, i] = w.Cq[i, j]
         for j in range(n_q):
             for i in range(n_c):
                 if w.W[j, i] != 0.0:
@@ -231,20 +219,27 @@ def _schur_complement(f, w):
                     for k in range(i, n_c):
                         w.S[i, k] += factor * w.W[j, k]
         return
+    solved = inverse_mass_border(w)
     for i in range(n_c):
-        copy(w.Cq[i], w.x)
-        ldl_solve(w.L, w.x)
-        for j in range(n_q):
-            if w.x[j] != 0.0:
-                for k in range(i, n_c):
-                    w.S[i, k] += w.x[j] * w.W[j, k]
+        copy(w.Cq[i], solved[i])
+    if banded_mass(f):
+        solve_banded_mass(f, w, n_c, w.W)
+    else:
+        for i in range(n_c):
+            ldl_solve(w.L, solved[i])
+    for i in range(n_c):
+        for k in range(i, n_c):
+            total = 0.0
+            for j in range(n_q):
+                total += w.Cq[i, j] * solved[k, j]
+            w.S[i, k] = total
 
 
 @inlined
 def _factor_schur_complement(f, w):
-    """S and its factors; where M is banded only if C_q has changed, as that of linear constraints never does."""
-    banded = banded_mass(f)
-    if banded:
+    """S and its factors; with a constant M only if C_q has changed, as that of linear constraints never does."""
+    keep = f.flags[CONSTANT_MASS] == 1 and f.flags[DIAGONAL_MASS] == 0
+    if keep:
         if _equal(w.Cq, w.Cq_of_S):
             return DONE
         w.Cq_of_S[0, 0] = np.nan
@@ -252,7 +247,7 @@ def _factor_schur_complement(f, w):
     w.counters[N_FACTORIZATIONS] += 1
     if not ldl_factor(w.S):
         return SINGULAR if _finite(w.S) else NOT_FINITE
-    if banded:
+    if keep:
         for i in range(w.C.size):
             copy(w.Cq[i], w.Cq_of_S[i])
     return DONE
@@ -282,7 +277,7 @@ def _accelerations(f, w, t, q, v, a, lam):
             total += w.Cq[i, j] * w.x[j]
         lam[i] = total
     ldl_solve(w.S, lam)  # (7)
-    if banded_mass(f):
+    if f.flags[DIAGONAL_MASS] == 0:
         # (8) with M^-1 Q and M^-1 Cq^T as they stand
         copy(w.x, a)
         solved = inverse_mass_border(w)
