@@ -5,6 +5,8 @@ from collections.abc import Iterator
 import pandas as pd
 from rich.console import Console
 
+from studies.beam_anderson import anderson_rows
+from studies.beam_checks import check_rows
 from studies.beam_figures import figures
 from studies.beam_limits import element_rows, limit_rows, modulus_rows, sensitivity, sensitivity_rows
 from studies.beam_report import headline, report
@@ -115,6 +117,9 @@ def run(call: Call) -> tuple[pd.DataFrame, dict[str, Array]]:
     say("sensitivity")
     curves["sensitivity"] = sensitivity(call.quick)
     rows += sensitivity_rows(curves["sensitivity"])
+    if not call.quick:
+        say("other people's beams, Anderson's acceleration")
+        rows += [*check_rows(), *anderson_rows()]
     for case, truth in truths.items():
         curves[f"{case}, {NEWTON}"] = free_motion(CASES[case](), NEWTON_DRAWN[case], t_end)
         curves[f"{case}, truth"] = {"t": truth.t, "tip": truth.tip, "middle": truth.middle}

@@ -1,5 +1,6 @@
 """The tables of the beam study, and what its runs cost at equal error."""
 
+import numpy as np
 import pandas as pd
 
 from studies.beam_figures import TARGET
@@ -141,6 +142,41 @@ def truth_table(rows: pd.DataFrame) -> str:
         for _, row in rows[rows["group"] == "truth"].iterrows()
     ]
     return markdown_table(header, lines)
+
+
+def check_table(rows: pd.DataFrame) -> str:
+    """IDA's digits, and the distance from Exudyn's cable."""
+    checks = rows[rows["group"] == "check"]
+    if checks.empty:
+        return ""
+    lines = []
+    for _, row in checks.iterrows():
+        if pd.notna(row["tol"]):
+            lines.append(
+                [
+                    f"{row['case']}, {row['solver']}, tol {power(row['tol'])}",
+                    f"at {row['t_end']:g} s",
+                    number(row["error_tip"]),
+                ]
+            )
+        else:
+            ours = f"{row['n_elements']:.0f} elements, Poisson's ratio {row['poisson']:g}"
+            theirs = f"{row['case']}, {row['stiffness']:.4g} × E"
+            lines.append([f"{theirs}, from our {ours}", f"0 to {row['t_end']:g} s", number(row["error_tip"])])
+    return markdown_table(["check", "when", "difference of the tip's height (m)"], lines)
+
+
+def anderson_table(rows: pd.DataFrame) -> str:
+    """Sweeps by depth."""
+    trials = rows[rows["group"] == "anderson"]
+    if trials.empty:
+        return ""
+    depths = sorted(trials["depth"].unique())
+    lines = []
+    for (case, h), group in trials.groupby(["case", "h"], sort=False):
+        counts = group.set_index("depth")["sweeps"]
+        lines.append([case, f"{h:g}", *("–" if np.isinf(counts[d]) else f"{counts[d]:.0f}" for d in depths)])
+    return markdown_table(["problem", "h (s)", "plain sweeps", *(f"depth {d:.0f}" for d in depths[1:])], lines)
 
 
 def run_table(rows: pd.DataFrame) -> str:
