@@ -7,7 +7,6 @@ from studies.beam_anderson import TABLEAU, TOLERANCE, sweeps
 from twoloop import RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
 
-
 pytestmark = pytest.mark.slow  # half a minute to compile
 
 
