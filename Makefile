@@ -35,7 +35,7 @@ install: $(STAMP) ## make .venv; runs by itself when it must
 
 $(STAMP): requirements.lock pyproject.toml
 	@$(FIND_PYTHON); \
-	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for half a minute."; \
+	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for a minute or two."; \
 	"$$python" -m venv --clear .venv
 	@$(RUN) $(PIP) install -r requirements.lock
 	@$(RUN) $(PIP) install --no-deps --no-build-isolation --editable .
