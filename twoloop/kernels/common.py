@@ -139,7 +139,7 @@ def _say(text: str) -> None:
 def _announce(index: str) -> None:
     """Say, once a process, why the first run ever takes so long."""
     if not Path(index).exists():
-        _say("twoloop: compiling the integrator, about a minute; later processes read it from the disk")
+        _say("twoloop: compiling the integrator, two or three minutes; later processes read it from the disk")
 
 
 def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
