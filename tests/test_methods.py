@@ -70,7 +70,7 @@ def test_names_are_different():
         (lambda: RungeKutta(gauss), TypeError, "tableau"),
         (lambda: RungeKutta(gauss(2), outer="n"), ValueError, "outer must be 'auto', 'fixed-point', 'newton' or.*'n'"),
         (lambda: RungeKutta(gauss(2), outer="newton", variables="momenta"), ValueError, "outer='newton' goes with"),
-        (lambda: RungeKutta(gauss(2), outer="auto", partition="symmetric"), ValueError, "outer='auto' goes with"),
+        (lambda: RungeKutta(gauss(2), outer="auto", variables="momenta"), ValueError, "outer='auto' goes with"),
         (lambda: RungeKutta(gauss(2), variables="p"), ValueError, "variables must be.*velocities.*momenta.*'p'"),
         (lambda: RungeKutta(gauss(2), partition="no"), ValueError, "partition must be.*lasting.*symmetric.*'no'"),
         (lambda: RungeKutta(gauss(2), outer="paper", variables="momenta"), ValueError, "outer='paper'.*'momenta'"),

@@ -35,6 +35,8 @@ class Plan:
     limit_start: float = np.inf
     limit_factor: float = 0.7
     limit_memory: int = 10
+    symmetric: bool = False
+    predictive: bool = False
 
 
 class Method(Protocol):
@@ -122,10 +124,11 @@ class RungeKutta:
             raise ValueError(f"variables must be 'velocities' or 'momenta'; given {self.variables!r}")
         if self.partition not in ("lasting", "symmetric"):
             raise ValueError(f"partition must be 'lasting' or 'symmetric'; given {self.partition!r}")
-        if self.outer != "fixed-point" and (self.variables, self.partition) != ("velocities", "lasting"):
+        if self.outer != "fixed-point" and self.variables != "velocities":
+            raise ValueError(f"outer={self.outer!r} goes with variables='velocities' only; given {self.variables!r}")
+        if self.outer == "paper" and self.partition != "lasting":
             raise ValueError(
-                f"outer={self.outer!r} goes with variables='velocities' and partition='lasting' only; given "
-                f"{self.variables!r} and {self.partition!r}. Take outer='fixed-point'"
+                f"outer='paper' is the paper's procedure, which has partition='lasting'; given {self.partition!r}"
             )
         if self.error not in ("richardson", "richardson-paper"):
             raise ValueError(f"error must be 'richardson' or 'richardson-paper'; given {self.error!r}")
@@ -154,9 +157,9 @@ class RungeKutta:
             INNER_TOL if self.inner_tol is None else self.inner_tol,
             outer_tol,
             1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
-            self.partition == "symmetric",
         )
         exponent = 1.0 / (tableau.order + 1)
+        symmetric = self.partition == "symmetric"
         if self.outer in ("auto", "newton"):
             from twoloop.kernels import automatic, newton, newton_memory
 
@@ -166,10 +169,11 @@ class RungeKutta:
             size = newton_memory.memory_size(n_eigen, tableau.stages, n_q)
             newton_exponent = 1.0 / (tableau.stages + 1)
             if self.outer == "newton":
-                return Plan(newton.newton_step, options, np.zeros(size), newton_exponent)
+                memory = np.zeros(size)
+                return Plan(newton.newton_step, options, memory, newton_exponent, symmetric=symmetric, predictive=True)
             sweeps = kernels.memory_size(tableau.stages, n_q)
             memory = automatic.automatic_memory(sweeps, size, exponent, newton_exponent)
-            return Plan(automatic.automatic_step, options, memory, exponent=1.0)
+            return Plan(automatic.automatic_step, options, memory, exponent=1.0, symmetric=symmetric)
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         step = kernels.STEPS[self.outer]
         if self.variables == "momenta":
@@ -187,7 +191,7 @@ class RungeKutta:
                 limit_factor=1.0,
                 limit_memory=0,
             )
-        return Plan(step, options, memory, exponent)
+        return Plan(step, options, memory, exponent, symmetric=symmetric)
 
 
 @dataclass(frozen=True)

@@ -174,6 +174,8 @@ class _Run:
         self.control[advance.LIMIT_START] = plan.limit_start
         self.control[advance.LIMIT_FACTOR] = plan.limit_factor
         self.control[advance.LIMIT_MEMORY] = plan.limit_memory
+        self.control[advance.SYMMETRIC] = plan.symmetric
+        self.control[advance.PREDICTIVE] = plan.predictive
         self.control[advance.MAX_STEPS] = np.inf
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0

@@ -27,11 +27,12 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.inner import accelerations, factor_dependent, factor_mass
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.partition import partition, partition_is_worn
+from twoloop.kernels.partition import CHANGED, partition, partition_is_worn, partition_of_midpoint
 
 # what advance() returns
 ALL_OUTPUT_DONE, BUFFER_FULL, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
 
+LEAST_ERROR = 1e-2  # what an error below it counts as where the trend is followed (Hairer & Wanner II, IV.8)
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run
@@ -47,14 +48,29 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     LIMIT_MEMORY,  # ... for this many accepted steps
     MAX_STEPS,  # accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
+    SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is worn
+    PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson)
     N_CONTROL,
-) = range(12)
+) = range(14)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far
 H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
 
 # places in `clock`, carried from call to call
-T, H_NEXT, H_LIMIT, LIMIT_AGE, NEXT_OUTPUT, T_START, N_FIXED, FAILURE_CODE, H_FAILED, N_CLOCK = range(10)
+(
+    T,
+    H_NEXT,
+    H_LIMIT,
+    LIMIT_AGE,
+    NEXT_OUTPUT,
+    T_START,
+    N_FIXED,
+    FAILURE_CODE,
+    H_FAILED,
+    H_BEFORE,  # size and error of the last accepted step
+    ERROR_BEFORE,
+    N_CLOCK,
+) = range(12)
 
 
 @kernel(i8(*FUNCTIONS, WORK, f8, VECTOR))
@@ -146,6 +162,11 @@ def advance(
         if size <= near:
             return STEP_TOO_SMALL
         code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
+        if code == DONE and control[SYMMETRIC] == 1.0:
+            code = partition_of_midpoint(f, w, t + 0.5 * size, state, new_state)
+            if code == CHANGED:
+                memory[0] = 0.0  # what the step keeps is of one that is not taken
+                code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and not np.isfinite(error):
             code = NOT_FINITE
         accepted = code == DONE and error <= 1.0
@@ -170,7 +191,11 @@ def advance(
             continue
         factor = control[FACTOR_MAX]
         if error > 0.0:
-            factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
+            factor = control[SAFETY] * error ** -control[EXPONENT]
+            if accepted and control[PREDICTIVE] == 1.0 and clock[ERROR_BEFORE] > 0.0:
+                trend = size / clock[H_BEFORE] * (clock[ERROR_BEFORE] / error) ** control[EXPONENT]
+                factor = min(factor, factor * trend)
+            factor = min(control[FACTOR_MAX], max(control[FACTOR_MIN], factor))
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1
@@ -178,6 +203,7 @@ def advance(
             clock[H_NEXT] = proposal
             continue
         w.counters[N_ACCEPTED] += 1
+        clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, LEAST_ERROR)
         clock[FAILURE_CODE] = DONE
         clock[N_FIXED] += 1.0
         if lands:
@@ -204,5 +230,5 @@ def advance(
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
-        if partition_is_worn(w) and partition(f, w, clock[T], state[:n]) != DONE:
+        if control[SYMMETRIC] == 0.0 and partition_is_worn(w) and partition(f, w, clock[T], state[:n]) != DONE:
             return RANK_LOST

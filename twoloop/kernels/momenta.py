@@ -37,7 +37,6 @@ from twoloop.kernels.inner import (
     rounding_floor,
 )
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_solve
-from twoloop.kernels.partition import CHANGED, partition_of_midpoint
 from twoloop.kernels.runge_kutta import (
     FARTHEST,
     GROWTH,
@@ -45,7 +44,6 @@ from twoloop.kernels.runge_kutta import (
     MAX_SWEEPS,
     OUTER_TOL,
     PATIENCE,
-    SYMMETRIC,
     conclude,
     interpolate,
     tableau_of,
@@ -290,9 +288,9 @@ def _sweep(f, w, options, memory, t, h, q, p, V_stage, R_stage, q1, p1, v1):
     return code
 
 
-@compiled
-def _attempt(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt under the partition as it stands."""
+@kernel(STEP)
+def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt by sweeps on (q_i, p_i); error and extrapolation as in `runge_kutta_step`."""
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
     n_dof = w.independent.size
@@ -359,16 +357,4 @@ def _attempt(f, w, options, memory, t, h, tolerances, state, new_state):
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
-    return code, error
-
-
-@kernel(STEP)
-def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt; with SYMMETRIC once more under the partition of its midpoint, if that is another one."""
-    code, error = _attempt(f, w, options, memory, t, h, tolerances, state, new_state)
-    if code == DONE and options[SYMMETRIC] == 1.0:
-        code = partition_of_midpoint(f, w, t + 0.5 * h, state, new_state)
-        if code == CHANGED:
-            memory[LAST_ACCEPTED] = 0.0  # the stages just found are of a step that is not taken
-            return _attempt(f, w, options, memory, t, h, tolerances, state, new_state)
     return code, error

@@ -11,6 +11,7 @@ from twoloop.kernels.newton_memory import (
     FILTER,
     GAMMA0,
     N_EIGEN_SCALARS,
+    N_REAL,
     Q_MOVED,
     V_MOVED,
     count_eigenvalues,
@@ -82,12 +83,13 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def factor(w, options, memory, s, h):
-    """Factors of I - (h l)^2 J_q - h l J_v for every eigenvalue l, and for gamma0."""
+    """Factors of I - (h l)^2 J_q - h l J_v for gamma0, real, and for the other eigenvalues l, complex."""
     n = w.Q.size
     m = w.independent.size
     Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
+    n_real = int(options[place + N_REAL])
     damped = memory[DAMPED] == 1.0
     filter_matrix = _square(space(memory, s, n, FILTER), m)
     hl = h * options[place + GAMMA0]
@@ -104,6 +106,8 @@ def factor(w, options, memory, s, h):
     for k in range(n_eigen):
         z = h * complex(options[place], options[place + 1])
         place += 2 + 4 * s
+        if k == 0 and n_real > 0:  # the eigenvalue is gamma0
+            continue
         matrix = _square(system_space(memory, s, n, k), m)
         for i in range(m):
             for j in range(m):
@@ -121,9 +125,17 @@ def factor(w, options, memory, s, h):
 def solve(w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; x (n_dof) is overwritten."""
     n = w.Q.size
+    m = x.size
     n_eigen = count_eigenvalues(options, s)
-    matrix = _square(system_space(memory, s, n, k), x.size)
-    lu_solve(matrix, pivots_of(memory, s, n, n_eigen, 1 + k), x)
+    if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
+        real = vector(memory, s, n, V_MOVED)[:m]
+        for i in range(m):
+            real[i] = x[i].real
+        lu_solve(_square(space(memory, s, n, FILTER), m), pivots_of(memory, s, n, n_eigen, 0), real)
+        for i in range(m):
+            x[i] = real[i]
+    else:
+        lu_solve(_square(system_space(memory, s, n, k), m), pivots_of(memory, s, n, n_eigen, 1 + k), x)
 
 
 @compiled

@@ -23,7 +23,6 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.inner import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.partition import CHANGED, partition_of_midpoint
 
 MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
@@ -32,7 +31,7 @@ PATIENCE = 8  # sweeps after which a difference that grows again means divergenc
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
-STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, SYMMETRIC, N_SCALARS = range(6)
+STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, N_SCALARS = range(5)
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
@@ -46,11 +45,10 @@ def options_array(
     inner_tol: float,
     outer_tol: float,
     extrapolation: float,
-    symmetric: bool = False,
 ) -> NDArray[np.float64]:
     """The parameter block that the steps of this file read."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
-    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, float(symmetric)])
+    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation])
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
 
 
@@ -263,8 +261,8 @@ def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
     return restore(f, w, t, q1, v1, options[INNER_TOL]), error
 
 
-@compiled
-def _attempt(f, w, options, memory, t, h, tolerances, state, new_state):
+@kernel(STEP)
+def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by sweeps on the accelerations; where the error is estimated, a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
@@ -318,18 +316,6 @@ def _attempt(f, w, options, memory, t, h, tolerances, state, new_state):
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
-    return code, error
-
-
-@kernel(STEP)
-def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt; with SYMMETRIC once more under the partition of its midpoint, if that is another one."""
-    code, error = _attempt(f, w, options, memory, t, h, tolerances, state, new_state)
-    if code == DONE and options[SYMMETRIC] == 1.0:
-        code = partition_of_midpoint(f, w, t + 0.5 * h, state, new_state)
-        if code == CHANGED:
-            memory[LAST_ACCEPTED] = 0.0  # the stages just found are of a step that is not taken
-            return _attempt(f, w, options, memory, t, h, tolerances, state, new_state)
     return code, error
 
 
