@@ -345,6 +345,9 @@ def _integrate(  # type: ignore[no-untyped-def]
     jacobian,
     constraint_rate,
     gamma,
+    force_by_q,
+    force_by_v,
+    reaction_by_q,
     p,
     flags,
     n,
@@ -360,7 +363,9 @@ def _integrate(  # type: ignore[no-untyped-def]
     counters,
 ):
     """All steps; `given` and `rows` hold states [q v a lam], `keep` the numbers of the steps to store."""
-    f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
+    f = Functions(
+        mass, force, constraint, jacobian, constraint_rate, gamma, force_by_q, force_by_v, reaction_by_q, p, flags
+    )
     m = given.shape[1] - 3 * n
     w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))
     r, there, J, pivots = np.zeros(n + m), np.zeros(n + m), np.zeros((n + m, n + m)), np.zeros(n + m, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The six callbacks of a mechanism: the decorator for compiled ones, and the door for plain Python functions."""
+"""The callbacks of a mechanism: the decorator for compiled ones, and the door for plain Python functions."""
 
 import hashlib
 import inspect
@@ -13,7 +13,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
-from twoloop.kernels.common import CONSTRAINT_CALLBACK, FORCE_CALLBACK, MATRIX_CALLBACK
+from twoloop.kernels.common import CONSTRAINT_CALLBACK, FORCE_CALLBACK, MATRIX_CALLBACK, TANGENT_CALLBACK
 
 Array = NDArray[np.float64]
 
@@ -25,14 +25,17 @@ KINDS: dict[str, tuple[tuple[str, ...], Any]] = {
     "jacobian": (("t", "q", "p", "Cq"), MATRIX_CALLBACK),
     "constraint_rate": (("t", "q", "p", "Ct"), CONSTRAINT_CALLBACK),
     "gamma": (("t", "q", "v", "p", "Qd"), FORCE_CALLBACK),
+    "force_by_q": (("t", "q", "v", "p", "K"), TANGENT_CALLBACK),
+    "force_by_v": (("t", "q", "v", "p", "D"), TANGENT_CALLBACK),
+    "reaction_by_q": (("t", "q", "lam", "p", "R"), TANGENT_CALLBACK),
 }
 
 
 def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     """Compile one callback of a mechanism with the signature that its kind has.
 
-    The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,), the
-    parameters `p`, and the array to fill, which arrives full of zeros::
+    The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,) or the
+    multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
@@ -43,7 +46,8 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     ----------
     kind : str
         "mass" (t, q, p, M), "force" (t, q, v, p, Q), "constraint" (t, q, p, C), "jacobian" (t, q, p, Cq),
-        "constraint_rate" (t, q, p, Ct) or "gamma" (t, q, v, p, Qd).
+        "constraint_rate" (t, q, p, Ct), "gamma" (t, q, v, p, Qd), "force_by_q" (t, q, v, p, K), "force_by_v"
+        (t, q, v, p, D) or "reaction_by_q" (t, q, lam, p, R).
 
     Raises
     ------
@@ -147,48 +151,66 @@ def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
     out[...] = array
 
 
-def _call_with_q(kind: str, t: float, q: Array, p: Array, out: Array) -> None:
+def _call_with_two(kind: str, t: float, q: Array, p: Array, out: Array) -> None:
     PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy()), out)
 
 
-def _call_with_q_v(kind: str, t: float, q: Array, v: Array, p: Array, out: Array) -> None:
-    PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy(), v.copy()), out)
+def _call_with_three(kind: str, t: float, q: Array, x: Array, p: Array, out: Array) -> None:
+    PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy(), x.copy()), out)
 
 
 @callback("mass")
 def python_mass(t, q, p, M):
     with objmode():
-        _call_with_q("mass", t, q, p, M)
+        _call_with_two("mass", t, q, p, M)
 
 
 @callback("force")
 def python_force(t, q, v, p, Q):
     with objmode():
-        _call_with_q_v("force", t, q, v, p, Q)
+        _call_with_three("force", t, q, v, p, Q)
 
 
 @callback("constraint")
 def python_constraint(t, q, p, C):
     with objmode():
-        _call_with_q("constraint", t, q, p, C)
+        _call_with_two("constraint", t, q, p, C)
 
 
 @callback("jacobian")
 def python_jacobian(t, q, p, Cq):
     with objmode():
-        _call_with_q("jacobian", t, q, p, Cq)
+        _call_with_two("jacobian", t, q, p, Cq)
 
 
 @callback("constraint_rate")
 def python_constraint_rate(t, q, p, Ct):
     with objmode():
-        _call_with_q("constraint_rate", t, q, p, Ct)
+        _call_with_two("constraint_rate", t, q, p, Ct)
 
 
 @callback("gamma")
 def python_gamma(t, q, v, p, Qd):
     with objmode():
-        _call_with_q_v("gamma", t, q, v, p, Qd)
+        _call_with_three("gamma", t, q, v, p, Qd)
+
+
+@callback("force_by_q")
+def python_force_by_q(t, q, v, p, K):
+    with objmode():
+        _call_with_three("force_by_q", t, q, v, p, K)
+
+
+@callback("force_by_v")
+def python_force_by_v(t, q, v, p, D):
+    with objmode():
+        _call_with_three("force_by_v", t, q, v, p, D)
+
+
+@callback("reaction_by_q")
+def python_reaction_by_q(t, q, lam, p, R):
+    with objmode():
+        _call_with_three("reaction_by_q", t, q, lam, p, R)
 
 
 @callback("constraint_rate")
@@ -201,9 +223,14 @@ def no_gamma(t, q, v, p, Qd):
     """Stands where gamma is differenced; never called."""
 
 
+@callback("force_by_q")
+def no_tangent(t, q, v, p, K):
+    """Stands where a tangent is not given; never called."""
+
+
 def check_arguments(kind: str, function: Callable[..., Any]) -> None:
     """Raise if a function that returns its array names its arguments t, q, v, but in another order."""
-    wanted = ("t", "q", "v") if "v" in KINDS[kind][0] else ("t", "q")
+    wanted = KINDS[kind][0][:-2]
     try:
         given = tuple(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # built-in functions have none to look at
@@ -220,19 +247,19 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
     user = function if isinstance(function, Dispatcher) else njit(function)
     message = f"{kind} returned an array of the wrong shape"
 
-    def with_v(t, q, v, p, out):
-        value = user(t, q, v)
+    def with_three(t, q, x, p, out):
+        value = user(t, q, x)
         if value.shape != out.shape:
             raise ValueError(message)
         out[:] = value
 
-    def without_v(t, q, p, out):
+    def with_two(t, q, p, out):
         value = user(t, q)
         if value.shape != out.shape:
             raise ValueError(message)
         out[:] = value
 
-    in_place = with_v if "v" in arguments else without_v
+    in_place = with_three if len(arguments) == 5 else with_two
     try:
         return njit(signature, error_model="numpy")(in_place)
     except Exception as error:  # numba lets some of its own assertions through

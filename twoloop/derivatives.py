@@ -1,4 +1,4 @@
-"""Is what a system says about itself true? C_q, C_t and Q_d against differences of C, a constant M, the bandwidth.
+"""Is what a system says about itself true? C_q, C_t, Q_d and tangents against differences, constant M, bandwidth.
 
 A wrong sign in one of them often runs to the end and looks like a motion. Each system is looked at once.
 """
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.callbacks import KINDS
-from twoloop.kernels.common import GAMMA_GIVEN
+from twoloop.kernels.common import FORCE_BY_Q_GIVEN, GAMMA_GIVEN, REACTION_BY_Q_GIVEN
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -37,12 +37,7 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     level = ROUNDING * max(float(np.abs(jacobian).max()), 1e-300) * size
 
     def in_q(e: float) -> Array:
-        columns = []
-        for j in range(system.n_q):
-            shift = np.zeros(system.n_q)
-            shift[j] = e * size
-            columns.append((system.constraint(t, q + shift) - system.constraint(t, q - shift)) / (2.0 * e * size))
-        return np.column_stack(columns)
+        return _by_columns(lambda shift: system.constraint(t, q + shift), system.n_q, e * size)
 
     # times only forward: nobody promised that the callbacks work before the start
     def in_t(e: float) -> Array:
@@ -55,6 +50,7 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     _compare(system, "constraint_rate", t, system.constraint_rate(t, q), in_t, level)
     if system.functions.flags[GAMMA_GIVEN] == 1:
         _compare(system, "gamma", t, system.gamma(t, q, v), along, level)
+    _check_tangents(system, t, q, v, size)
     if system.constant_mass:
         there = system.mass(t + 1.0, q + 0.1 * v)
         if np.isfinite(there).all() and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
@@ -62,6 +58,39 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     if system.bandwidth is not None:
         _check_bandwidth(system, system.bandwidth, t, q + 1e-3 * v, v, 1e-3 * size)
     system.checked = True
+
+
+def _check_tangents(system: ConstrainedSystem, t: float, q: Array, v: Array, size: float) -> None:
+    """Compare those that are given, a little off the start, where symmetry may hide a term."""
+    n = system.n_q
+    q = q + 1e-3 * v
+    if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
+        return
+
+    def force_in_q(e: float) -> Array:
+        return _by_columns(lambda shift: system.force(t, q + shift, v), n, e * size)
+
+    def force_in_v(e: float) -> Array:
+        return _by_columns(lambda shift: system.force(t, q, v + shift), n, e * size)
+
+    level = ROUNDING * float(np.abs(system.force(t, q, v)).max()) / size
+    _compare(system, "force_by_q", t, system.force_by_q(t, q, v), force_in_q, level)
+    _compare(system, "force_by_v", t, system.force_by_v(t, q, v), force_in_v, level)
+    if system.functions.flags[REACTION_BY_Q_GIVEN] == 0:
+        return
+    lam = np.linspace(1.0, 2.0, system.n_c)
+
+    def reaction_in_q(e: float) -> Array:
+        return _by_columns(lambda shift: lam @ system.jacobian(t, q + shift), n, e * size)
+
+    level = ROUNDING * float(np.abs(lam @ system.jacobian(t, q)).max()) / size
+    _compare(system, "reaction_by_q", t, system.reaction_by_q(t, q, lam), reaction_in_q, level)
+
+
+def _by_columns(function: Callable[[Array], Array], n: int, shift: float) -> Array:
+    """Central differences of a vector, a column for each displaced coordinate."""
+    shifts = shift * np.eye(n)
+    return np.column_stack([(function(each) - function(-each)) / (2.0 * shift) for each in shifts])
 
 
 def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array, v: Array, shift: float) -> None:
@@ -130,12 +159,18 @@ def _compare(
         "jacobian": "the derivative of constraint with respect to q",
         "constraint_rate": "the derivative of constraint with respect to t",
         "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right side of C_q a = gamma",
+        "force_by_q": "the derivative of force with respect to q",
+        "force_by_v": "the derivative of force with respect to v",
+        "reaction_by_q": "the derivative of C_q^T lam with respect to q",
     }[kind]
+    hint = {
+        "constraint_rate": ", or give constraint_rate: the constraints depend on time",
+        "force_by_v": ", or give force_by_v: beside force_by_q the force may depend on v only with it",
+        "jacobian": "",
+    }.get(kind, f", or leave {kind} out to have it differenced")
     raise ValueError(
         f"{kind} of {system.name!r} is not {what}: entry {entry} is {values[0]:.6g}, by differences it is "
-        f"{values[1]:.6g} (t = {t:g}, near the start, velocities chosen at random). Mend its formula"
-        + (", or leave gamma out to have it differenced" if kind == "gamma" else "")
-        + (", or give constraint_rate: the constraints depend on time" if kind == "constraint_rate" else "")
+        f"{values[1]:.6g} (t = {t:g}, near the start, velocities chosen at random). Mend its formula{hint}"
     )
 
 
@@ -143,10 +178,10 @@ def _check_bounds(system: ConstrainedSystem, t: float, q: Array) -> None:
     """Run compiled callbacks once in Python, where an index out of bounds is an error and not another's memory."""
     if system.called_in_python:
         return
-    shapes = {"mass": (system.n_q, system.n_q), "force": (system.n_q,), "jacobian": (system.n_c, system.n_q)}
     for kind, (arguments, _) in KINDS.items():
-        state = (q.copy(), np.zeros(system.n_q)) if "v" in arguments else (q.copy(),)
-        out = np.zeros(shapes.get(kind, (system.n_c,)))
+        known = {"q": q.copy(), "v": np.zeros(system.n_q), "lam": np.zeros(system.n_c)}
+        state = [known[name] for name in arguments[1:-2]]
+        out = np.zeros(system.shape_of(kind))
         try:
             getattr(system.functions, kind).py_func(t, *state, system.parameters.copy(), out)
         except IndexError as error:

@@ -14,16 +14,29 @@ from twoloop.callbacks import (
     compile_returning,
     no_gamma,
     no_rate,
+    no_tangent,
     python_constraint,
     python_constraint_rate,
     python_force,
+    python_force_by_q,
+    python_force_by_v,
     python_gamma,
     python_jacobian,
     python_mass,
+    python_reaction_by_q,
     store,
 )
 from twoloop.checks import check_real, check_size
-from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GAMMA_GIVEN, N_FLAGS, Functions
+from twoloop.kernels.common import (
+    BANDWIDTH,
+    CONSTANT_MASS,
+    FORCE_BY_Q_GIVEN,
+    FORCE_BY_V_GIVEN,
+    GAMMA_GIVEN,
+    N_FLAGS,
+    REACTION_BY_Q_GIVEN,
+    Functions,
+)
 
 Array = NDArray[np.float64]
 
@@ -34,7 +47,11 @@ _THROUGH_PYTHON = {
     "jacobian": python_jacobian,
     "constraint_rate": python_constraint_rate,
     "gamma": python_gamma,
+    "force_by_q": python_force_by_q,
+    "force_by_v": python_force_by_v,
+    "reaction_by_q": python_reaction_by_q,
 }
+_OPTIONAL = ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q")
 
 
 class ConstrainedSystem:
@@ -51,6 +68,10 @@ class ConstrainedSystem:
         C_t (n_c,). None: the constraints do not depend on time.
     gamma : compiled callback, optional
         Q_d (n_c,) of C_q a = Q_d, that is -((C_q v)_q v + 2 C_qt v + C_tt). None: by differences of C_q and C_t.
+    force_by_q, force_by_v, reaction_by_q : compiled callbacks, optional
+        Tangents for Newton's method as the outer loop, each (n_q, n_q): dQ/dq, dQ/dv, and d(C_q^T lam)/dq with lam
+        held. With force_by_q the force is not differenced; it must not depend on v then unless force_by_v is given too.
+        reaction_by_q None: by differences of C_q, none where C_q does not change. force_by_q None: all by differences.
     parameters : array_like, optional
         The vector `p` that every callback gets.
     constant_mass : bool
@@ -79,6 +100,9 @@ class ConstrainedSystem:
         jacobian: Dispatcher,
         constraint_rate: Dispatcher | None = None,
         gamma: Dispatcher | None = None,
+        force_by_q: Dispatcher | None = None,
+        force_by_v: Dispatcher | None = None,
+        reaction_by_q: Dispatcher | None = None,
         parameters: ArrayLike = (),
         constant_mass: bool = False,
         bandwidth: int | None = None,
@@ -107,7 +131,12 @@ class ConstrainedSystem:
             "jacobian": jacobian,
             "constraint_rate": no_rate if constraint_rate is None else constraint_rate,
             "gamma": no_gamma if gamma is None else gamma,
+            "force_by_q": no_tangent if force_by_q is None else force_by_q,
+            "force_by_v": no_tangent if force_by_v is None else force_by_v,
+            "reaction_by_q": no_tangent if reaction_by_q is None else reaction_by_q,
         }
+        if force_by_q is None and not (force_by_v is None and reaction_by_q is None):
+            raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
         for kind, function in callbacks.items():
             arguments, signature = KINDS[kind]
             if not isinstance(function, Dispatcher) or signature.args not in function.overloads:
@@ -119,6 +148,9 @@ class ConstrainedSystem:
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[GAMMA_GIVEN] = gamma is not None
+        flags[FORCE_BY_Q_GIVEN] = force_by_q is not None
+        flags[FORCE_BY_V_GIVEN] = force_by_v is not None
+        flags[REACTION_BY_Q_GIVEN] = reaction_by_q is not None
         flags[BANDWIDTH] = -1  # a run decides by the size
         self.functions = Functions(**callbacks, p=self.parameters, flags=flags)
         self._python: PythonFunctions | None = None
@@ -140,6 +172,9 @@ class ConstrainedSystem:
         jacobian: Callable[[float, Array], ArrayLike],
         constraint_rate: Callable[[float, Array], ArrayLike] | None = None,
         gamma: Callable[[float, Array, Array], ArrayLike] | None = None,
+        force_by_q: Callable[[float, Array, Array], ArrayLike] | None = None,
+        force_by_v: Callable[[float, Array, Array], ArrayLike] | None = None,
+        reaction_by_q: Callable[[float, Array, Array], ArrayLike] | None = None,
         compile: bool = False,
         bandwidth: int | None = None,
         name: str = "system",
@@ -162,6 +197,8 @@ class ConstrainedSystem:
             gamma(t, q, v) -> (n_c,), the right side of C_q a = Q_d. None: by differences of C_q and C_t along the
             motion, over 2e-4 of the largest coordinate and at most 2e-4 s (before t too): good to about 1e-11 unless
             coordinates of very different scale, or a driving motion of kilohertz, ask for the formula.
+        force_by_q, force_by_v, reaction_by_q : callable, optional
+            As for the class: force_by_q(t, q, v), force_by_v(t, q, v), reaction_by_q(t, q, lam) -> (n_q, n_q).
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
@@ -191,9 +228,12 @@ class ConstrainedSystem:
             "jacobian": jacobian,
             "constraint_rate": constraint_rate,
             "gamma": gamma,
+            "force_by_q": force_by_q,
+            "force_by_v": force_by_v,
+            "reaction_by_q": reaction_by_q,
         }
         for kind, function in given.items():
-            if not callable(function) and not (function is None and kind in ("constraint_rate", "gamma")):
+            if not callable(function) and not (function is None and kind in _OPTIONAL):
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
         functions = {kind: function for kind, function in given.items() if function is not None}
         for kind, function in functions.items():
@@ -253,17 +293,36 @@ class ConstrainedSystem:
             raise ValueError(f"{self.name!r} was given no gamma")
         return self._call(self.functions.gamma, (self.n_c,), t, q, v)
 
+    def force_by_q(self, t: float, q: Array, v: Array) -> Array:
+        """dQ/dq, (n_q, n_q); zero where the system was given none, as for the two that follow."""
+        return self._call(self.functions.force_by_q, (self.n_q, self.n_q), t, q, v)
+
+    def force_by_v(self, t: float, q: Array, v: Array) -> Array:
+        """dQ/dv, (n_q, n_q)."""
+        return self._call(self.functions.force_by_v, (self.n_q, self.n_q), t, q, v)
+
+    def reaction_by_q(self, t: float, q: Array, lam: Array) -> Array:
+        """d(C_q^T lam)/dq with lam held, (n_q, n_q)."""
+        return self._call(self.functions.reaction_by_q, (self.n_q, self.n_q), t, q, lam)
+
+    def shape_of(self, kind: str) -> tuple[int, ...]:
+        """Shape of the array that a kind of callback fills."""
+        vectors = {"force": (self.n_q,), "jacobian": (self.n_c, self.n_q)}
+        if kind in ("constraint", "constraint_rate", "gamma"):
+            return (self.n_c,)
+        return vectors.get(kind, (self.n_q, self.n_q))
+
     def check_returned(self, t: float, q: Array, v: Array) -> None:
         """Say what is wrong with the arrays that functions given with `compile=True` return at (t, q, v).
 
         Machine code can only say that a shape is wrong, not which.
         """
         for kind, function in self._returning.items():
-            arguments = (t, q, v) if "v" in KINDS[kind][0] else (t, q)
-            shapes = {"mass": (self.n_q, self.n_q), "force": (self.n_q,), "jacobian": (self.n_c, self.n_q)}
-            copies = [np.array(argument) for argument in arguments[1:]]
-            store(kind, self.name, t, function(t, *copies), np.zeros(shapes.get(kind, (self.n_c,))))
-            if any((copy != argument).any() for copy, argument in zip(copies, arguments[1:], strict=True)):
+            known = {"q": q, "v": v, "lam": np.ones(self.n_c)}
+            arguments = [known[name] for name in KINDS[kind][0][1:-2]]
+            copies = [np.array(argument) for argument in arguments]
+            store(kind, self.name, t, function(t, *copies), np.zeros(self.shape_of(kind)))
+            if any((copy != argument).any() for copy, argument in zip(copies, arguments, strict=True)):
                 raise ValueError(
                     f"{kind} of {self.name!r} must not change the arrays that it is given; copy them first"
                 )

@@ -32,6 +32,7 @@ from twoloop.kernels.partition import CHANGED, partition, partition_is_worn, par
 # what advance() returns
 ALL_OUTPUT_DONE, BUFFER_FULL, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
 
+KEPT = 1.2  # factors from 1 to this leave the step as it is where a change costs factorizations (Radau5's way)
 LEAST_ERROR = 1e-2  # what an error below it counts as where the trend is followed (Hairer & Wanner II, IV.8)
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
@@ -74,9 +75,26 @@ H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
 
 
 @kernel(i8(*FUNCTIONS, WORK, f8, VECTOR))
-def start(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags, w, t, state):
+def start(
+    mass,
+    force,
+    constraint,
+    jacobian,
+    constraint_rate,
+    gamma,
+    force_by_q,
+    force_by_v,
+    reaction_by_q,
+    p,
+    flags,
+    w,
+    t,
+    state,
+):
     """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
-    f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
+    f = Functions(
+        mass, force, constraint, jacobian, constraint_rate, gamma, force_by_q, force_by_v, reaction_by_q, p, flags
+    )
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     code = factor_mass(f, w, t, q)
@@ -108,6 +126,9 @@ def advance(
     jacobian,
     constraint_rate,
     gamma,
+    force_by_q,
+    force_by_v,
+    reaction_by_q,
     p,
     flags,
     w,
@@ -130,7 +151,9 @@ def advance(
     Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
     out_t / out_state and those of out_steps, every accepted step, that this call wrote.
     """
-    f = Functions(mass, force, constraint, jacobian, constraint_rate, gamma, p, flags)
+    f = Functions(
+        mass, force, constraint, jacobian, constraint_rate, gamma, force_by_q, force_by_v, reaction_by_q, p, flags
+    )
     fixed = control[FIXED_STEP] > 0.0
     n = w.Q.size
     retried = np.inf  # where a step of fixed size was tried again with a new partition
@@ -196,6 +219,8 @@ def advance(
                 trend = size / clock[H_BEFORE] * (clock[ERROR_BEFORE] / error) ** control[EXPONENT]
                 factor = min(factor, factor * trend)
             factor = min(control[FACTOR_MAX], max(control[FACTOR_MIN], factor))
+            if accepted and control[PREDICTIVE] == 1.0 and 1.0 <= factor <= KEPT:
+                factor = 1.0
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1

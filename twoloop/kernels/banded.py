@@ -46,11 +46,11 @@ def factor_banded_mass(f, w):
 
 
 @inlined
-def solve_banded_mass(f, w, count, x):
-    """`count` vectors (n_q), one after another in x, become M^-1 times themselves."""
+def solve_banded_mass(f, w, x):
+    """x becomes M^-1 x."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    call(w.lapack[DPBTRS], (UPPER, n, b, count, _mass_band(w, b), b + 1, x, n))
+    call(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
 
 
 @inlined

@@ -22,18 +22,20 @@ VECTOR = types.float64[::1]
 MATRIX = types.float64[:, ::1]
 INTEGERS = types.int64[::1]
 
-# (t, q, p, M), (t, q, v, p, Q), (t, q, p, C): the three shapes that the six callbacks have
+# (t, q, p, M), (t, q, v, p, Q), (t, q, p, C), (t, q, v, p, K): the four shapes that the callbacks have
 MATRIX_CALLBACK = types.void(f8, VECTOR, VECTOR, MATRIX)
 FORCE_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR, VECTOR)
 CONSTRAINT_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR)
+TANGENT_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR, MATRIX)
 
 MatrixFunction = types.FunctionType(MATRIX_CALLBACK)
 ForceFunction = types.FunctionType(FORCE_CALLBACK)
 ConstraintFunction = types.FunctionType(CONSTRAINT_CALLBACK)
+TangentFunction = types.FunctionType(TANGENT_CALLBACK)
 
 
 class Functions(NamedTuple):
-    """The six callbacks of a mechanism, its parameters and its flags, as the kernels see them."""
+    """The callbacks of a mechanism, its parameters and its flags, as the kernels see them."""
 
     mass: Any
     force: Any
@@ -41,12 +43,24 @@ class Functions(NamedTuple):
     jacobian: Any
     constraint_rate: Any
     gamma: Any
+    force_by_q: Any
+    force_by_v: Any
+    reaction_by_q: Any
     p: Any
     flags: Any
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense
-CONSTANT_MASS, DIAGONAL_MASS, GAMMA_GIVEN, BANDWIDTH, N_FLAGS = range(5)
+(
+    CONSTANT_MASS,
+    DIAGONAL_MASS,
+    GAMMA_GIVEN,
+    BANDWIDTH,
+    FORCE_BY_Q_GIVEN,
+    FORCE_BY_V_GIVEN,
+    REACTION_BY_Q_GIVEN,
+    N_FLAGS,
+) = range(8)
 
 FUNCTIONS = types.NamedTuple(
     [
@@ -56,6 +70,9 @@ FUNCTIONS = types.NamedTuple(
         MatrixFunction,
         ConstraintFunction,
         ForceFunction,
+        TangentFunction,
+        TangentFunction,
+        TangentFunction,
         VECTOR,
         INTEGERS,
     ],
@@ -67,7 +84,7 @@ class Work(NamedTuple):
     """Arrays that an evaluation writes; made once a run. Sizes: n_q coordinates, n_c constraints."""
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) its factors, see ldl_factor; or its banded ones, see banded.py
+    L: Any  # (n_q, n_q) of a constant M the inverse, else its factors, see ldl_factor; or banded ones, see banded.py
     Cq: Any  # (n_c, n_q) constraint Jacobian at the last position
     Cqd: Any  # (n_c, n_c) LU factors of its dependent columns
     S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its factors

@@ -21,7 +21,7 @@ from twoloop.kernels.common import (
     compiled,
     inlined,
 )
-from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
+from twoloop.kernels.linalg import copy, invert_definite, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.partition import RANK_TOLERANCE
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
@@ -177,7 +177,7 @@ def acceleration_constraint(f, w, t, q, v):
 
 @inlined
 def factor_mass(f, w, t, q):
-    """M(t, q) and its factors; of a constant diagonal M the inverse diagonal."""
+    """M(t, q), and of a constant M its inverse, which is quicker to apply; else its factors."""
     w.M[:, :] = 0.0
     f.mass(t, q, f.p, w.M)
     if banded_mass(f):
@@ -185,22 +185,32 @@ def factor_mass(f, w, t, q):
     else:
         for i in range(w.Q.size):
             copy(w.M[i], w.L[i])
-        code = DONE if ldl_factor(w.L) else MASS_NOT_DEFINITE
+        definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
+        code = DONE if definite else MASS_NOT_DEFINITE
     if code == DONE:
         return DONE
     return MASS_NOT_DEFINITE if _finite(w.M) else NOT_FINITE
 
 
 @inlined
-def _times_inverse_mass(f, w, x):
-    """x becomes M^-1 x."""
+def _times_inverse_mass(f, w, x, y):
+    """y = M^-1 x; they may be one array unless M is constant, dense and not diagonal."""
+    n = x.size
     if f.flags[DIAGONAL_MASS] == 1:
-        for j in range(x.size):
-            x[j] *= w.L[j, j]
-    elif banded_mass(f):
-        solve_banded_mass(f, w, 1, x)
+        for i in range(n):
+            y[i] = x[i] * w.L[i, i]
+    elif f.flags[CONSTANT_MASS] == 1 and not banded_mass(f):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += w.L[i, j] * x[j]
+            y[i] = total
     else:
-        ldl_solve(w.L, x)
+        copy(x, y)
+        if banded_mass(f):
+            solve_banded_mass(f, w, y)
+        else:
+            ldl_solve(w.L, y)
 
 
 @inlined
@@ -221,12 +231,7 @@ def _schur_complement(f, w):
         return
     solved = inverse_mass_border(w)
     for i in range(n_c):
-        copy(w.Cq[i], solved[i])
-    if banded_mass(f):
-        solve_banded_mass(f, w, n_c, w.W)
-    else:
-        for i in range(n_c):
-            ldl_solve(w.L, solved[i])
+        _times_inverse_mass(f, w, w.Cq[i], solved[i])
     for i in range(n_c):
         for k in range(i, n_c):
             total = 0.0
@@ -269,8 +274,7 @@ def _accelerations(f, w, t, q, v, a, lam):
     code = _factor_schur_complement(f, w)
     if code != DONE:
         return code
-    copy(w.Q, w.x)
-    _times_inverse_mass(f, w, w.x)
+    _times_inverse_mass(f, w, w.Q, w.x)
     for i in range(n_c):
         total = -w.Qd[i]
         for j in range(n_q):
@@ -289,7 +293,7 @@ def _accelerations(f, w, t, q, v, a, lam):
         for i in range(n_c):
             for j in range(n_q):
                 a[j] -= w.Cq[i, j] * lam[i]
-        _times_inverse_mass(f, w, a)  # (8)
+        _times_inverse_mass(f, w, a, a)  # (8)
     for j in range(n_q):
         if not np.isfinite(a[j]):
             return NOT_FINITE

@@ -89,6 +89,29 @@ def ldl_factor(A):
 
 
 @inlined
+def invert_definite(A):
+    """A symmetric positive definite A becomes its inverse, by Gauss and Jordan's elimination.
+
+    Returns False if A is not positive definite or has values that are not finite.
+    """
+    n = A.shape[0]
+    for k in range(n):
+        if not A[k, k] > 0.0:
+            return False
+        inverse = 1.0 / A[k, k]
+        A[k, k] = 1.0
+        for j in range(n):
+            A[k, j] *= inverse
+        for i in range(n):
+            if i != k and A[i, k] != 0.0:
+                factor = A[i, k]
+                A[i, k] = 0.0
+                for j in range(n):
+                    A[i, j] -= factor * A[k, j]
+    return True
+
+
+@inlined
 def ldl_solve(A, x):
     """Solve with the factors of `ldl_factor`; x is overwritten."""
     n = A.shape[0]
@@ -102,3 +125,22 @@ def ldl_solve(A, x):
         for j in range(k + 1, n):
             total -= A[k, j] * x[j]
         x[k] = total * A[k, k]
+
+
+@inlined
+def ldl_solve_rows(A, B):
+    """Solve with the factors of `ldl_factor` for every column of B at once; B is overwritten."""
+    n, m = B.shape
+    for k in range(n):
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                factor = A[k, i] * A[k, k]
+                for j in range(m):
+                    B[i, j] -= factor * B[k, j]
+    for k in range(n - 1, -1, -1):
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                for j in range(m):
+                    B[k, j] -= A[k, i] * B[i, j]
+        for j in range(m):
+            B[k, j] *= A[k, k]

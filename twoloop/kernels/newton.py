@@ -180,13 +180,13 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         w.counters[N_OUTER] += 1
         for j in range(s):
             for m in range(n):
-                in_q = 0.0
-                in_v = 0.0
-                for k in range(s):
-                    in_q += A2[j, k] * A_stage[k, m]
-                    in_v += A[j, k] * A_stage[k, m]
-                Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * in_q
-                V_stage[j, m] = v[m] + h * in_v
+                Q_stage[j, m] = q[m] + c[j] * h * v[m]
+                V_stage[j, m] = v[m]
+            for k in range(s):
+                in_q, in_v = h * h * A2[j, k], h * A[j, k]
+                for m in range(n):
+                    Q_stage[j, m] += in_q * A_stage[k, m]
+                    V_stage[j, m] += in_v * A_stage[k, m]
         for j in range(s):
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], options[INNER_TOL], a_new, w.lam)
             if code != DONE:
@@ -204,13 +204,16 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 scale_v = max(scale_v, abs(V_stage[j, m]))
         _correct(f, w, options, memory, s, residual, A_stage)
         for j in range(s):
+            in_q, in_v = Q_stage[j], V_stage[j]  # their numbers are not needed any more
+            for m in range(n):
+                in_q[m] = 0.0
+                in_v[m] = 0.0
+            for k in range(s):
+                for m in range(n):
+                    in_q[m] += A2[j, k] * residual[k, m]
+                    in_v[m] += A[j, k] * residual[k, m]
             for m in w.independent:
-                in_q = 0.0
-                in_v = 0.0
-                for k in range(s):
-                    in_q += A2[j, k] * residual[k, m]
-                    in_v += A[j, k] * residual[k, m]
-                change = max(change, h * abs(in_v) / scale_v, h * h * abs(in_q) / scale_q)
+                change = max(change, h * abs(in_v[m]) / scale_v, h * h * abs(in_q[m]) / scale_q)
         if not np.isfinite(change):
             return OUTER_DIVERGED
         if iteration > 0:

@@ -12,8 +12,8 @@ solution of a banded matrix with a border,
 
     [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
 
-K and D are differenced in groups of columns that share no row, 2 b + 1 of them for every n_q (Curtis, Powell & Reid
-1974, doi 10.1093/imamat/13.1.117).
+K and D come from the system's tangents, or are differenced in groups of columns that share no row, 2 b + 1 of them for
+every n_q (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
 import numpy as np
@@ -22,6 +22,8 @@ from twoloop.kernels.banded import add_banded_mass_times, factor_bordered, lu_ba
 from twoloop.kernels.common import (
     BANDWIDTH,
     DONE,
+    FORCE_BY_Q_GIVEN,
+    FORCE_BY_V_GIVEN,
     N_EVALUATIONS,
     N_FACTORIZATIONS,
     N_JACOBIANS,
@@ -31,7 +33,6 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.lapack import DGBTRF, DGBTRS, ZGBTRF, ZGBTRS
 from twoloop.kernels.linalg import copy, lu_solve
-from twoloop.kernels.newton_dense import DIFFERENCE
 from twoloop.kernels.newton_memory import (
     A_NEW,
     BY_Q,
@@ -42,6 +43,7 @@ from twoloop.kernels.newton_memory import (
     N_EIGEN_SCALARS,
     N_REAL,
     Q_MOVED,
+    SYSTEMS,
     V_MOVED,
     complex_vector,
     count_eigenvalues,
@@ -51,6 +53,7 @@ from twoloop.kernels.newton_memory import (
     system_space,
     vector,
 )
+from twoloop.kernels.newton_tangents import DIFFERENCE, tangent_by_q, tangent_by_v
 
 
 @inlined
@@ -107,6 +110,29 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
 
 
 @compiled
+def _copy_band(A, b, band):
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(max(0, i - b), min(n, i + b + 1)):
+            band[i, b + j - i] = A[i, j]
+
+
+@compiled
+def _from_tangents(f, w, memory, s, t, q, v, b):
+    n = q.size
+    K, R = space(memory, s, n, FILTER).reshape((n, n)), space(memory, s, n, SYSTEMS).reshape((n, n))
+    code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
+    if code != DONE:
+        return code
+    _copy_band(K, b, _band(space(memory, s, n, BY_Q), n, b))
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    code = tangent_by_v(f, t, q, v, b, K)
+    if memory[DAMPED] == 1.0:
+        _copy_band(K, b, _band(space(memory, s, n, BY_V), n, b))
+    return code
+
+
+@compiled
 def derivatives(f, w, memory, s, t, q, v):
     """K and D at a state that was evaluated just before."""
     n = q.size
@@ -118,6 +144,8 @@ def derivatives(f, w, memory, s, t, q, v):
         copy(w.Cq[i], Cq[i])
         copy(w.Cqd[i], Cqd[i])
     copy(w.pivots, pivots)
+    if f.flags[FORCE_BY_Q_GIVEN] == 1:
+        return _from_tangents(f, w, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _unbalanced(f, w, t, q, v)
     copy(w.Q, base)

@@ -1,8 +1,22 @@
-"""The linear algebra of newton.py for systems of any structure: (n_dof, n_dof) matrices, J_q and J_v by differences."""
+"""The linear algebra of newton.py for systems of any structure: (n_dof, n_dof) matrices.
 
-from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_JACOBIANS, SINGULAR, compiled, inlined
+J_q and J_v come by differences of the two-loop right side. Where the system gives the tangents K and D (see
+newton_tangents.py), (T^T M T) J_q = T^T K T with T = [I; -Cqd^-1 Cqi], and J_v likewise: as in newton_banded.py that
+leaves out how T and M change with the position, in which there is no stiffness.
+"""
+
+from twoloop.kernels.common import (
+    DONE,
+    FORCE_BY_Q_GIVEN,
+    FORCE_BY_V_GIVEN,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    SINGULAR,
+    compiled,
+    inlined,
+)
 from twoloop.kernels.inner import evaluate
-from twoloop.kernels.linalg import copy, lu_factor, lu_solve
+from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.newton_memory import (
     A_NEW,
     BY_Q,
@@ -13,6 +27,7 @@ from twoloop.kernels.newton_memory import (
     N_EIGEN_SCALARS,
     N_REAL,
     Q_MOVED,
+    SYSTEMS,
     V_MOVED,
     count_eigenvalues,
     eigen_place,
@@ -21,9 +36,8 @@ from twoloop.kernels.newton_memory import (
     system_space,
     vector,
 )
+from twoloop.kernels.newton_tangents import DIFFERENCE, tangent_by_q, tangent_by_v
 from twoloop.kernels.runge_kutta import INNER_TOL
-
-DIFFERENCE = 1e-7  # displacement for the derivatives, relative to max(1, |value|)
 
 
 @inlined
@@ -32,8 +46,67 @@ def _square(numbers, m):
 
 
 @compiled
+def _sandwich(w, X, A, AT, B):
+    """B = T^T A T with T = [I; X]; AT (n_q, n_dof) is scratch."""
+    n, m = AT.shape
+    for i in range(n):
+        for k in range(m):
+            AT[i, k] = A[i, w.independent[k]]
+        for c in range(w.C.size):
+            factor = A[i, w.dependent[c]]
+            if factor != 0.0:
+                for k in range(m):
+                    AT[i, k] += factor * X[c, k]
+    for l in range(m):
+        copy(AT[w.independent[l]], B[l])
+        for c in range(w.C.size):
+            factor = X[c, l]
+            if factor != 0.0:
+                row = AT[w.dependent[c]]
+                for k in range(m):
+                    B[l, k] += factor * row[k]
+
+
+@compiled
+def _from_tangents(f, w, memory, s, t, q, v):
+    """J_q and J_v from the tangents that the system gives, at a state that was evaluated just before."""
+    n = q.size
+    m, n_c = w.independent.size, w.C.size
+    w.counters[N_JACOBIANS] += 1
+    # factors are not needed any more: their spaces hold K or D, then T^T M T, X and T^T A
+    K, R = _square(space(memory, s, n, FILTER), n), _square(space(memory, s, n, SYSTEMS), n)
+    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
+    if code != DONE:
+        return code
+    numbers = space(memory, s, n, SYSTEMS + 1)
+    X, AT = numbers[: n_c * m].reshape((n_c, m)), numbers[n_c * m : (n_c + n) * m].reshape((n, m))
+    column = vector(memory, s, n, V_MOVED)[:n_c]
+    for k in range(m):
+        for c in range(n_c):
+            column[c] = -w.Cq[c, w.independent[k]]
+        lu_solve(w.Cqd, w.pivots, column)
+        for c in range(n_c):
+            X[c, k] = column[c]
+    Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
+    N = _square(space(memory, s, n, SYSTEMS), m)
+    _sandwich(w, X, w.M, AT, N)
+    if not ldl_factor(N):
+        return SINGULAR
+    _sandwich(w, X, K, AT, Jq)
+    ldl_solve_rows(N, Jq)
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    code = tangent_by_v(f, t, q, v, n - 1, K)
+    if code == DONE and memory[DAMPED] == 1.0:
+        _sandwich(w, X, K, AT, Jv)
+        ldl_solve_rows(N, Jv)
+    return code
+
+
+@compiled
 def derivatives(f, w, options, memory, s, t, q, v, a):
-    """J_q and J_v at (t, q, v) by differences of the two-loop right side, whose value there is a."""
+    """J_q and J_v at (t, q, v), where the value of the two-loop right side, evaluated just before, is a."""
+    if f.flags[FORCE_BY_Q_GIVEN] == 1:
+        return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
     Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)

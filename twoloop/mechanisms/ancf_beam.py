@@ -116,7 +116,7 @@ def ancf_beam(
     Returns
     -------
     Problem
-        `system` has a constant mass matrix; the tangent of its force is `elastic_tangent` of this module.
+        `system` has a constant mass matrix and the exact tangent of its force, `elastic_tangent` of this module.
 
     Raises
     ------
@@ -172,6 +172,7 @@ def ancf_beam(
         jacobian=jacobian,
         constraint_rate=constraint_rate,
         gamma=gamma,
+        force_by_q=elastic_tangent,
         parameters=p,
         constant_mass=True,
         bandwidth=11,  # a node's neighbours

@@ -16,10 +16,9 @@ that the numbers are those of the usual 5 x 3 points.
 from typing import Any
 
 import numpy as np
-from numba import njit, types
 
 from twoloop.callbacks import callback
-from twoloop.kernels.common import MATRIX, VECTOR, compiled
+from twoloop.kernels.common import compiled
 from twoloop.mechanisms.problem import Array
 
 # places in p: length of an element; lambda + 2 mu, lambda and mu times the area of the cross-section, N; means of y^2
@@ -214,7 +213,7 @@ def force(t, q, v, p, Q):
         element_force(q[first : first + 12], p, Q[first : first + 12])
 
 
-@njit(types.void(types.float64, VECTOR, VECTOR, VECTOR, MATRIX), cache=True, error_model="numpy")
+@callback("force_by_q")
 def elastic_tangent(t, q, v, p, K):
     """Derivative dQ/dq of `force`, into K (n_q, n_q) full of zeros: symmetric, and only neighbouring nodes couple."""
     for first in range(0, q.size - 6, 6):
