@@ -69,9 +69,10 @@ class RungeKutta:
     outer : {"auto", "fixed-point", "newton", "paper"}
         "fixed-point": sweeps on the stage accelerations, predicted from the step before, with a growth test.
         "newton": simplified Newton on the stage accelerations, its linear algebra in the eigenvectors of the tableau's
-        A, with derivatives of the two-loop right side by differences, kept while it converges fast. For stiff problems,
-        where sweeps need h w_max below a constant. Its error estimate is an embedded one of order s, filtered (Hairer &
-        Wanner II, IV.8); `error` has no effect.
+        A, with derivatives from the tangents that the system gives, else by differences of the two-loop right side,
+        kept while it converges fast. For stiff problems, where sweeps need h w_max below a constant. Its error estimate
+        is an embedded one of order s, filtered, and the step follows its trend (Hairer & Wanner II, IV.8); `error` has
+        no effect.
         "auto": "fixed-point" until sweeps converge slowly and Newton's method, on trial, takes three times fewer
         evaluations for a second of motion; and back again.
         "paper": sweeps on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
+from twoloop.kernels.linalg import (
+    copy,
+    invert_definite,
+    ldl_factor,
+    ldl_solve,
+    ldl_solve_rows,
+    lu_factor,
+    lu_solve,
+)
 
 sizes = st.integers(1, 12)
 seeds = st.integers(0, 2**32 - 1)
@@ -53,6 +61,29 @@ def test_lu_ratio_measures_the_pivots():
 )
 def test_ldl_refuses_what_is_not_positive_definite(A):
     assert not ldl_factor(np.array(A))
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_invert_definite(n):
+    B = np.random.default_rng(n).normal(size=(n, n))
+    A = B @ B.T + np.eye(n)
+    inverse = A.copy()
+    assert invert_definite(inverse)
+    assert np.abs(inverse @ A - np.eye(n)).max() < 1e-12
+    A[0, 0] = np.nan
+    assert not invert_definite(A)
+    assert not invert_definite(-np.eye(n))
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (4, 3), (7, 7)])
+def test_ldl_solve_rows(n, m):
+    generator = np.random.default_rng(n)
+    B, right = generator.normal(size=(n, n)), generator.normal(size=(n, m))
+    A = B @ B.T + np.eye(n)
+    factors, x = A.copy(), right.copy()
+    assert ldl_factor(factors)
+    ldl_solve_rows(factors, x)
+    assert np.abs(A @ x - right).max() < 1e-12
 
 
 def test_copy_copies():

@@ -80,7 +80,9 @@ def newton_options(A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np
     """
     values, T = np.linalg.eig(A)
     if np.linalg.cond(T) > 1e8:
-        raise ValueError("tableau has no basis of eigenvectors, as outer='newton' needs")
+        raise ValueError(
+            "A of the tableau must have a basis of eigenvectors for Newton's method. Take outer='fixed-point'"
+        )
     inverse = np.linalg.inv(T)
     real = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]

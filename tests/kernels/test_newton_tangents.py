@@ -1,0 +1,181 @@
+"""Tangents that a system gives: Newton's method takes them in place of differences, for the same steps."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.problems import worst
+from twoloop import ConstrainedSystem, RungeKutta, solve_dae
+from twoloop import solve as solve_module
+from twoloop.kernels import common
+from twoloop.mechanisms import moderately_stiff_beam, very_flexible_beam
+from twoloop.tableaux import gauss, radau_iia
+
+NEWTON = RungeKutta(radau_iia(3), outer="newton")
+STIFFNESS, DAMPING = 1e4, 30.0
+START = (np.array([1.0, 0.0, 2.0, 0.0]), np.array([0.0, 3.0, 0.0, -2.0]))
+
+
+def _of_spring(q, v):
+    d, u = q[2:] - q[:2], v[2:] - v[:2]
+    length = np.sqrt(d @ d)
+    return d / length, u, length, np.eye(2) - np.outer(d, d) / length**2
+
+
+def spring_force(t, q, v):
+    """A mass on a rigid rod, a second one on a damped spring from the first."""
+    n, u, length, _ = _of_spring(q, v)
+    pull = (STIFFNESS * (length - 1.0) + DAMPING * (n @ u)) * n
+    return np.concatenate([pull - [0.0, 9.81], -pull - [0.0, 9.81]])
+
+
+def spring_by_q(t, q, v):
+    n, u, length, across = _of_spring(q, v)
+    stretched = STIFFNESS * (np.outer(n, n) + (length - 1.0) / length * across)
+    turned = DAMPING * (np.outer(n, across @ u) + (n @ u) * across) / length
+    return np.kron(np.array([[-1.0, 1.0], [1.0, -1.0]]), stretched + turned)
+
+
+def spring_by_v(t, q, v):
+    n, _, _, _ = _of_spring(q, v)
+    return np.kron(np.array([[-1.0, 1.0], [1.0, -1.0]]), DAMPING * np.outer(n, n))
+
+
+def rod_by_q(t, q, lam):
+    return np.diag([lam[0], lam[0], 0.0, 0.0])
+
+
+TANGENTS = {"force_by_q": spring_by_q, "force_by_v": spring_by_v}
+
+
+def spring(calls=None, **given):
+    """The system with the tangents given, and in `calls` how often each of its functions was called."""
+    calls = {} if calls is None else calls
+
+    def counted(kind, function):
+        def call(*arguments):
+            calls[kind] = calls.get(kind, 0) + 1
+            return function(*arguments)
+
+        return call
+
+    functions = {
+        "force": spring_force,
+        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+        "jacobian": lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
+        "gamma": lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])]),
+        **given,
+    }
+    counting = {kind: counted(kind, function) for kind, function in functions.items()}
+    return ConstrainedSystem.from_python(n_q=4, n_c=1, mass=np.eye(4), bandwidth=3, name="spring", **counting)
+
+
+def without_tangent(problem):
+    problem.system.functions.flags[common.FORCE_BY_Q_GIVEN] = 0
+    return problem
+
+
+@pytest.mark.parametrize("banded", [False, True])
+@pytest.mark.parametrize("reaction", [{}, {"reaction_by_q": rod_by_q}], ids=["rod differenced", "rod given"])
+def test_tangents_replace_differences(monkeypatch, banded, reaction):
+    monkeypatch.setattr(solve_module, "banded_pays", lambda *sizes: banded)
+    calls = {"differences": {}, "tangents": {}}
+    runs = {
+        "differences": solve_dae(spring(calls["differences"]), (0.0, 0.5), *START, NEWTON, step_size=5e-3),
+        "tangents": solve_dae(
+            spring(calls["tangents"], **TANGENTS, **reaction), (0.0, 0.5), *START, NEWTON, step_size=5e-3
+        ),
+    }
+    assert all(run.success for run in runs.values()), [run.message for run in runs.values()]
+    assert worst(runs["tangents"].q, runs["differences"].q) < 1e-10
+    counts = {name: run.stats for name, run in runs.items()}
+    assert counts["tangents"].n_jacobians > 10
+    assert calls["tangents"]["force_by_q"] >= counts["tangents"].n_jacobians
+    assert calls["tangents"]["force_by_v"] >= counts["tangents"].n_jacobians
+    assert counts["tangents"].n_outer < 1.2 * counts["differences"].n_outer
+    # no evaluation goes into derivatives: 3 an iteration, 1 at the midpoint for every Jacobian, 1 a step
+    spent = 3 * counts["tangents"].n_outer + counts["tangents"].n_jacobians + counts["tangents"].n_accepted
+    assert counts["tangents"].n_evaluations <= spent + 1
+    assert calls["tangents"]["force"] < 0.9 * calls["differences"]["force"]
+
+
+def test_compiled_tangents_are_the_same(monkeypatch):
+    def by_q(t, q, v):
+        return np.array([[-1.0, 1.0], [1.0, -1.0]]) * 1e6
+
+    def system(compile):
+        return ConstrainedSystem.from_python(
+            n_q=2,
+            n_c=1,
+            mass=np.eye(2),
+            force=lambda t, q, v: 1e6 * np.array([q[1] - q[0], q[0] - q[1]]),
+            constraint=lambda t, q: np.array([q[0] - np.sin(t)]),
+            jacobian=lambda t, q: np.array([[1.0, 0.0]]),
+            constraint_rate=lambda t, q: np.array([-np.cos(t)]),
+            force_by_q=by_q,
+            compile=compile,
+        )
+
+    runs = [solve_dae(system(c), (0.0, 1.0), [0.0, 0.0], [1.0, 0.0], NEWTON, 1e-6, 1e-6) for c in (False, True)]
+    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-9
+    assert runs[0].stats.n_evaluations == runs[1].stats.n_evaluations
+
+
+@pytest.mark.parametrize("n_elements", [4, 16])
+def test_beam_with_its_tangent_makes_the_steps_it_makes_without(n_elements):
+    runs = [
+        solve_dae(problem.system, (0.0, 0.02), problem.q0, problem.v0, NEWTON, step_size=1e-3)
+        for problem in (very_flexible_beam(n_elements), without_tangent(very_flexible_beam(n_elements)))
+    ]
+    assert all(run.success for run in runs)
+    assert worst(runs[0].q, runs[1].q) < 1e-9
+    assert runs[0].stats.n_outer <= 1.05 * runs[1].stats.n_outer
+
+
+def test_tangent_saves_a_third_of_the_stiff_beam():
+    spent = [
+        solve_dae(p.system, (0.0, 0.5), p.q0, p.v0, RungeKutta(radau_iia(4), outer="newton"), 1e-2, 1e-2).stats
+        for p in (moderately_stiff_beam(), without_tangent(moderately_stiff_beam()))
+    ]
+    assert spent[0].n_evaluations < 0.67 * spent[1].n_evaluations
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({**TANGENTS, "force_by_q": lambda t, q, v: -spring_by_q(t, q, v)}, r"force_by_q of 'spring' is not the deri"),
+        ({**TANGENTS, "force_by_v": lambda t, q, v: 2.0 * spring_by_v(t, q, v)}, "force_by_v of 'spring' is not the d"),
+        ({"force_by_q": spring_by_q}, "force_by_v of 'spring' is not.*or give force_by_v: beside force_by_q the force"),
+        ({**TANGENTS, "reaction_by_q": lambda t, q, lam: -rod_by_q(t, q, lam)}, "reaction_by_q of 'spring' is not"),
+        ({"force_by_v": spring_by_v}, "force_by_v and reaction_by_q go with force_by_q, which is not given"),
+        (
+            {**TANGENTS, "force_by_q": lambda t, q, v: np.eye(3)},
+            r"force_by_q .* shape \(4, 4\).*returned shape \(3, 3\)",
+        ),
+    ],
+    ids=["sign", "twice", "forgotten", "sign of the reaction", "alone", "shape"],
+)
+def test_wrong_tangents_are_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        solve_dae(spring(**given), (0.0, 0.1), *START, NEWTON)
+
+
+def test_memory_of_the_controller_saves_rejections(monkeypatch):
+    problem = very_flexible_beam()
+    rejected = {}
+    plan = RungeKutta.plan
+    for predictive in (True, False):
+        monkeypatch.setattr(
+            RungeKutta, "plan", lambda self, *a, p=predictive: dataclasses.replace(plan(self, *a), predictive=p)
+        )
+        result = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, NEWTON, 1e-3, 1e-3)
+        rejected[predictive] = result.stats.n_rejected_error
+    assert rejected[True] < 0.8 * rejected[False]
+
+
+def test_steps_stay_where_little_would_be_gained():
+    problem = very_flexible_beam()
+    method = RungeKutta(gauss(4), outer="newton")
+    h = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, method, 1e-3, 1e-3).h
+    assert np.mean(h[1:] == h[:-1]) > 0.3
