@@ -1,6 +1,6 @@
 """What a user chooses: RungeKutta(...), Newmark(...), BDF(...) and the presets. Frozen options, no state."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -160,8 +160,16 @@ class RungeKutta:
             1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
         )
         exponent = 1.0 / (tableau.order + 1)
-        symmetric = self.partition == "symmetric"
-        if self.outer in ("auto", "newton"):
+        memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
+        if self.outer == "paper":
+            plan = Plan(kernels.paper_step, options, memory, exponent)
+            return replace(plan, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0)
+        step = kernels.runge_kutta_step
+        if self.variables == "momenta":
+            from twoloop.kernels import momenta
+
+            memory, step = np.zeros(momenta.memory_size(tableau.stages, n_q)), momenta.momenta_step
+        elif self.outer in ("auto", "newton"):
             from twoloop.kernels import automatic, newton, newton_memory
 
             extra = newton.newton_options(tableau.A, tableau.b, tableau.c)
@@ -170,29 +178,11 @@ class RungeKutta:
             size = newton_memory.memory_size(n_eigen, tableau.stages, n_q)
             newton_exponent = 1.0 / (tableau.stages + 1)
             if self.outer == "newton":
-                memory = np.zeros(size)
-                return Plan(newton.newton_step, options, memory, newton_exponent, symmetric=symmetric, predictive=True)
-            sweeps = kernels.memory_size(tableau.stages, n_q)
-            memory = automatic.automatic_memory(sweeps, size, exponent, newton_exponent)
-            return Plan(automatic.automatic_step, options, memory, exponent=1.0, symmetric=symmetric)
-        memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
-        step = kernels.STEPS[self.outer]
-        if self.variables == "momenta":
-            from twoloop.kernels import momenta
-
-            memory, step = np.zeros(momenta.memory_size(tableau.stages, n_q)), momenta.momenta_step
-        if self.outer == "paper":
-            return Plan(
-                step,
-                options,
-                memory,
-                exponent,
-                factor_min=0.5,
-                limit_start=1.0,
-                limit_factor=1.0,
-                limit_memory=0,
-            )
-        return Plan(step, options, memory, exponent, symmetric=symmetric)
+                memory, step, exponent = np.zeros(size), newton.newton_step, newton_exponent
+            else:
+                memory = automatic.automatic_memory(memory.size, size, exponent, newton_exponent)
+                step, exponent = automatic.automatic_step, 1.0
+        return Plan(step, options, memory, exponent, symmetric=self.partition == "symmetric", predictive=True)
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,6 @@ Two outer loops are available: `sweep_accelerations` iterates on the stage accel
 twice to q'' = a), `sweep_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -355,6 +353,3 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     return code, error
-
-
-STEPS: dict[str, Any] = {"fixed-point": runge_kutta_step, "paper": paper_step}
