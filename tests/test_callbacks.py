@@ -89,7 +89,7 @@ def test_a_constant_mass_is_factored_once():
 
 
 def test_unknown_kind_lists_the_known():
-    with pytest.raises(ValueError, match=r"kind must be one of mass, force.*gamma; given 'stiffness'"):
+    with pytest.raises(ValueError, match=r"kind must be one of mass, force.*reaction_by_q; given 'stiffness'"):
         callback("stiffness")
 
 

@@ -153,8 +153,7 @@ class _Run:
         if system.constant_mass:
             mass = system.mass(t0, q0)
             flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
-        diagonal = bool(flags[common.DIAGONAL_MASS])
-        if system.bandwidth is not None and banded_pays(system.n_q, system.n_c, system.bandwidth, diagonal):
+        if system.bandwidth is not None and banded_pays(system.n_q, system.n_c, system.bandwidth):
             flags[common.BANDWIDTH] = system.bandwidth
             self.work.lapack[:] = addresses()
         self.functions = system.functions._replace(flags=flags)

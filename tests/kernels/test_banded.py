@@ -165,13 +165,13 @@ def test_chosen_by_size():
         run = solve_module._Run(system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, 1e-6, 1e-3)
         return int(run.functions.flags[common.BANDWIDTH])
 
-    for n_elements, bandwidth in ((4, -1), (16, 11)):
+    for n_elements, bandwidth in ((4, -1), (8, -1), (16, 11)):
         problem = very_flexible_beam(n_elements)
         assert chosen(problem.system, problem.q0, problem.v0) == bandwidth
-    assert chosen(*chain(12)) == 3
-    assert chosen(*chain(12, lumped=True)) == -1
-    assert chosen(*chain(24, lumped=True)) == 3
-    assert chosen(*chain(24, bandwidth=None)) == -1
+    assert chosen(*chain(20)) == -1
+    assert chosen(*chain(28)) == 3
+    assert chosen(*chain(28, lumped=True)) == 3
+    assert chosen(*chain(28, bandwidth=None)) == -1
 
 
 def test_beam_gives_the_same_run_as_dense(monkeypatch):

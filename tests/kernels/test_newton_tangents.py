@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from tests.problems import worst
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
@@ -14,7 +15,8 @@ from twoloop.tableaux import gauss, radau_iia
 
 NEWTON = RungeKutta(radau_iia(3), outer="newton")
 STIFFNESS, DAMPING = 1e4, 30.0
-START = (np.array([1.0, 0.0, 2.0, 0.0]), np.array([0.0, 3.0, 0.0, -2.0]))
+COPIES = 6  # of the mechanism in one system: the least that banded algebra has room for
+START = (np.tile([1.0, 0.0, 2.0, 0.0], COPIES), np.tile([0.0, 3.0, 0.0, -2.0], COPIES))
 
 
 def _of_spring(q, v):
@@ -50,13 +52,14 @@ TANGENTS = {"force_by_q": spring_by_q, "force_by_v": spring_by_v}
 
 
 def spring(calls=None, **given):
-    """The system with the tangents given, and in `calls` how often each of its functions was called."""
+    """COPIES of the mechanism with the tangents given, and in `calls` how often each of its functions was called."""
     calls = {} if calls is None else calls
 
     def counted(kind, function):
-        def call(*arguments):
+        def call(t, *arrays):
             calls[kind] = calls.get(kind, 0) + 1
-            return function(*arguments)
+            parts = [function(t, *each) for each in zip(*(np.split(array, COPIES) for array in arrays), strict=True)]
+            return block_diag(*parts) if parts[0].ndim == 2 else np.concatenate(parts)
 
         return call
 
@@ -68,7 +71,9 @@ def spring(calls=None, **given):
         **given,
     }
     counting = {kind: counted(kind, function) for kind, function in functions.items()}
-    return ConstrainedSystem.from_python(n_q=4, n_c=1, mass=np.eye(4), bandwidth=3, name="spring", **counting)
+    sizes = {"n_q": 4 * COPIES, "n_c": COPIES, "bandwidth": 3}
+    mass = np.kron(np.eye(COPIES), np.eye(4) + 0.1)
+    return ConstrainedSystem.from_python(mass=mass, name="spring", **sizes, **counting)
 
 
 def without_tangent(problem):
@@ -90,17 +95,17 @@ def test_tangents_replace_differences(monkeypatch, banded, reaction):
     assert all(run.success for run in runs.values()), [run.message for run in runs.values()]
     assert worst(runs["tangents"].q, runs["differences"].q) < 1e-10
     counts = {name: run.stats for name, run in runs.items()}
-    assert counts["tangents"].n_jacobians > 10
+    assert counts["tangents"].n_jacobians > 1
     assert calls["tangents"]["force_by_q"] >= counts["tangents"].n_jacobians
     assert calls["tangents"]["force_by_v"] >= counts["tangents"].n_jacobians
     assert counts["tangents"].n_outer < 1.2 * counts["differences"].n_outer
     # no evaluation goes into derivatives: 3 an iteration, 1 at the midpoint for every Jacobian, 1 a step
     spent = 3 * counts["tangents"].n_outer + counts["tangents"].n_jacobians + counts["tangents"].n_accepted
     assert counts["tangents"].n_evaluations <= spent + 1
-    assert calls["tangents"]["force"] < 0.9 * calls["differences"]["force"]
+    assert counts["tangents"].n_evaluations < counts["differences"].n_evaluations
 
 
-def test_compiled_tangents_are_the_same(monkeypatch):
+def test_compiled_tangents_are_the_same():
     def by_q(t, q, v):
         return np.array([[-1.0, 1.0], [1.0, -1.0]]) * 1e6
 
@@ -133,12 +138,13 @@ def test_beam_with_its_tangent_makes_the_steps_it_makes_without(n_elements):
     assert runs[0].stats.n_outer <= 1.05 * runs[1].stats.n_outer
 
 
-def test_tangent_saves_a_third_of_the_stiff_beam():
+def test_tangent_saves_half_of_the_stiff_beam():
+    # with steps so long that every other one needs a new Jacobian
     spent = [
-        solve_dae(p.system, (0.0, 0.5), p.q0, p.v0, RungeKutta(radau_iia(4), outer="newton"), 1e-2, 1e-2).stats
+        solve_dae(p.system, (0.0, 0.5), p.q0, p.v0, RungeKutta(radau_iia(4), outer="newton"), 1e-1, 1e-1).stats
         for p in (moderately_stiff_beam(), without_tangent(moderately_stiff_beam()))
     ]
-    assert spent[0].n_evaluations < 0.67 * spent[1].n_evaluations
+    assert spent[0].n_evaluations < 0.5 * spent[1].n_evaluations
 
 
 @pytest.mark.parametrize(
@@ -151,7 +157,7 @@ def test_tangent_saves_a_third_of_the_stiff_beam():
         ({"force_by_v": spring_by_v}, "force_by_v and reaction_by_q go with force_by_q, which is not given"),
         (
             {**TANGENTS, "force_by_q": lambda t, q, v: np.eye(3)},
-            r"force_by_q .* shape \(4, 4\).*returned shape \(3, 3\)",
+            r"force_by_q .* shape \(24, 24\).*returned shape \(18, 18\)",
         ),
     ],
     ids=["sign", "twice", "forgotten", "sign of the reaction", "alone", "shape"],
@@ -176,6 +182,6 @@ def test_memory_of_the_controller_saves_rejections(monkeypatch):
 
 def test_steps_stay_where_little_would_be_gained():
     problem = very_flexible_beam()
-    method = RungeKutta(gauss(4), outer="newton")
+    method = RungeKutta(gauss(5), outer="newton")
     h = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, method, 1e-3, 1e-3).h
-    assert np.mean(h[1:] == h[:-1]) > 0.3
+    assert np.mean(h[1:] == h[:-1]) > 0.5

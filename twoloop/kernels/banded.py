@@ -10,15 +10,14 @@ from twoloop.kernels.common import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFI
 from twoloop.kernels.lapack import DPBTRF, DPBTRS, NO_TRANSPOSE, UPPER, call
 from twoloop.kernels.linalg import lu_factor, lu_solve
 
-# From so many coordinates on banded algebra is the faster one; measured on chains of bandwidth 1 to 20, whatever it is
-BANDED_FROM = 16
-BANDED_FROM_DIAGONAL = 48  # of M, with which dense algebra costs little
+# From so many coordinates on a Newton step by banded algebra is the faster one: measured 36 to 75, on chains of
+# bandwidth 1 to 11 and on beams
+BANDED_FROM = 56
 
 
-def banded_pays(n_q: int, n_c: int, bandwidth: int, diagonal: bool) -> bool:
+def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
     """Whether banded linear algebra is faster than dense, and fits into the memory that is there for the dense."""
-    fits = n_q >= 3 * bandwidth + 1 + 2 * n_c
-    return fits and n_q >= (BANDED_FROM_DIAGONAL if diagonal else BANDED_FROM)
+    return n_q >= max(BANDED_FROM, 3 * bandwidth + 1 + 2 * n_c)
 
 
 @inlined
@@ -33,15 +32,26 @@ def _mass_band(w, b):
     return w.L.reshape(n * n)[: n * (b + 1)].reshape((n, b + 1))
 
 
+@inlined
+def _mass_diagonals(w, b):
+    """Entry (i, i + k) of M at [k, i]; behind the factor."""
+    n = w.Q.size
+    return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
+
+
 @compiled
 def factor_banded_mass(f, w):
-    """The Cholesky factor of w.M, kept in the memory of w.L."""
+    """The Cholesky factor of w.M and its diagonals, kept in the memory of w.L."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     band = _mass_band(w, b)
     for j in range(n):
         for i in range(max(0, j - b), j + 1):
             band[j, b + i - j] = w.M[j, i]
+    diagonals = _mass_diagonals(w, b)
+    for k in range(b + 1):
+        for i in range(n - k):
+            diagonals[k, i] = w.M[i, i + k]
     return DONE if call(w.lapack[DPBTRF], (UPPER, n, b, band, b + 1)) == 0 else MASS_NOT_DEFINITE
 
 
@@ -61,12 +71,20 @@ def inverse_mass_border(w):
 
 
 @compiled
-def add_banded_mass_times(w, b, x, y):
-    """y += M x, by the band of w.M only."""
+def add_banded_mass_times(f, w, x, y):
+    """y += M x, along the diagonals: rows of a band are too short to be fast."""
     n = w.Q.size
     for i in range(n):
-        for j in range(max(0, i - b), min(n, i + b + 1)):
-            y[i] += w.M[i, j] * x[j]
+        y[i] += w.M[i, i] * x[i]
+    if f.flags[DIAGONAL_MASS] == 1:
+        return
+    b = f.flags[BANDWIDTH]
+    diagonals = _mass_diagonals(w, b)
+    for k in range(1, b + 1):
+        for i in range(n - k):
+            y[i] += diagonals[k, i] * x[i + k]
+        for i in range(n - k):
+            y[i + k] += diagonals[k, i] * x[i]
 
 
 # The system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], B of bandwidth b, is solved by mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r. Its

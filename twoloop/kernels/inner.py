@@ -27,7 +27,7 @@ from twoloop.kernels.partition import RANK_TOLERANCE
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
 ROUNDING = 1e-13  # relative to the largest coordinate: corrections of this size no longer shrink
-DIFFERENCE = 2e-4  # see difference_step
+DIFFERENCE, SHORTEST = 2e-4, 1e-4  # see difference_step
 ROUNDING, ROUNDING_OF_Q = 1e-12, 2e-14  # see rounding_floor; the latter is a hundred roundings
 
 
@@ -132,12 +132,16 @@ def _velocity_constraint(f, w, t, q, v, g):
 
 @inlined
 def difference_step(q, v):
-    """Seconds over which to difference along the motion: DIFFERENCE, or until q moves by DIFFERENCE max|q|."""
+    """Seconds over which to difference along the motion: DIFFERENCE, or until q moves by DIFFERENCE max|q|.
+
+    But at least DIFFERENCE SHORTEST.
+    """
     size = 0.0
     speed = 0.0
     for j in range(v.size):
         size = max(size, abs(q[j]))
         speed = max(speed, abs(v[j]))
+    size = max(size, SHORTEST * speed)  # where all coordinates pass through zero
     return DIFFERENCE * size / speed if speed > size else DIFFERENCE
 
 

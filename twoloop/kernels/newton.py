@@ -175,6 +175,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     Q_stage, V_stage = block(memory, s, n, Q_STAGE), block(memory, s, n, V_STAGE)
     a_new = vector(memory, s, n, A_NEW)
     before = 0.0
+    scale_q, scale_v = 1.0, 1.0
     floor = STAGNATION_FIXED
     if tolerances[ESTIMATE] == 1.0:
         floor = STAGNATION * min(tolerances[ATOL], tolerances[RTOL])
@@ -195,15 +196,14 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
+            for m in w.dependent:
                 A_stage[j, m] = a_new[m]
-            for m in w.independent:
-                A_stage[j, m] -= residual[j, m]
         change = 0.0
-        scale_q, scale_v = 1.0, 1.0
-        for j in range(s):
-            for m in w.independent:
-                scale_q = max(scale_q, abs(Q_stage[j, m]))
-                scale_v = max(scale_v, abs(V_stage[j, m]))
+        if iteration == 0:
+            for j in range(s):
+                for m in w.independent:
+                    scale_q = max(scale_q, abs(Q_stage[j, m]))
+                    scale_v = max(scale_v, abs(V_stage[j, m]))
         _correct(f, w, options, memory, s, residual, A_stage)
         for j in range(s):
             in_q, in_v = Q_stage[j], V_stage[j]  # their numbers are not needed any more

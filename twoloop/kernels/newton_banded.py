@@ -245,7 +245,7 @@ def solve(f, w, options, memory, s, k, x):
             real[i] = x[i].real
         _all_coordinates(w, memory, s, b, real, X)
         real[:] = 0.0
-        add_banded_mass_times(w, b, X, real)
+        add_banded_mass_times(f, w, X, real)
         pivots = pivots_of(memory, s, n, n_eigen, 0)
         _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, real)
         for i in range(n):
@@ -254,7 +254,7 @@ def solve(f, w, options, memory, s, k, x):
         X = complex_vector(memory, s, n, n_eigen, 1)
         _all_coordinates(w, memory, s, b, x, X)
         x[:] = 0.0
-        add_banded_mass_times(w, b, X, x)
+        add_banded_mass_times(f, w, X, x)
         _solve_for_independents(w, memory, s, b, system_space(memory, s, n, k), pivots, ZGBTRS, x)
 
 
@@ -267,7 +267,7 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     K, X = _band(space(memory, s, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
     _all_coordinates(w, memory, s, b, e_v, X)
     e_v[:] = 0.0
-    add_banded_mass_times(w, b, X, e_v)
+    add_banded_mass_times(f, w, X, e_v)
     _all_coordinates(w, memory, s, b, e_q, X)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
