@@ -14,7 +14,7 @@ from twoloop.kernels.linalg import copy
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, N_SCALARS = range(3)
 # vectors (n_q) in `memory` after memory[0], which is advance()'s; then V and A of the stages (s, n_q each)
-Q_STAGE, FINE, COARSE, N_VECTORS = range(4)
+Q_STAGE, ESTIMATED, N_VECTORS = range(3)
 
 
 def options_array(
@@ -79,20 +79,13 @@ def _move(y, h, weights, slopes, y1):
 
 
 @compiled
-def _error(tolerances, h, fine, coarse, y, y1, slopes, in_fine, in_coarse):
-    """Largest component of e^2 / sqrt(e^2 + d^2) over atol + rtol |y|; e is the finer estimate, d the coarser one.
-
-    The quotient is of a higher order than either, and e where d happens to vanish.
-    """
-    _weighted(fine, slopes, in_fine)
-    _weighted(coarse, slopes, in_coarse)
+def _largest(tolerances, h, weights, y, y1, slopes, estimate):
+    """Largest component of h times the weighted sum of the slopes, over atol + rtol |y|."""
+    _weighted(weights, slopes, estimate)
     largest = 0.0
     for m in range(y.size):
-        square = in_fine[m] * in_fine[m]
-        total = square + in_coarse[m] * in_coarse[m]
-        if total > 0.0:
-            scale = tolerances[ATOL] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
-            largest = max(largest, h * square / (np.sqrt(total) * scale))
+        scale = tolerances[ATOL] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
+        largest = max(largest, abs(h * estimate[m]) / scale)
     return largest
 
 
@@ -103,7 +96,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    q_stage, in_fine, in_coarse = _vector(memory, n, Q_STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
+    q_stage, estimate = _vector(memory, n, Q_STAGE), _vector(memory, n, ESTIMATED)
     V_stage, A_stage = _stages(memory, s, n)
     w.counters[N_OUTER] += 1
     copy(v, V_stage[0])
@@ -119,10 +112,14 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _move(v, h, b, A_stage, v1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = max(
-            _error(tolerances, h, fine, coarse, q, q1, V_stage, in_fine, in_coarse),
-            _error(tolerances, h, fine, coarse, v, v1, A_stage, in_fine, in_coarse),
+        e = max(
+            _largest(tolerances, h, fine, q, q1, V_stage, estimate), _largest(tolerances, h, fine, v, v1, A_stage, estimate)
         )
+        d = max(
+            _largest(tolerances, h, coarse, q, q1, V_stage, estimate), _largest(tolerances, h, coarse, v, v1, A_stage, estimate)
+        )
+        if e > 0.0:
+            error = e * e / np.hypot(e, d)
         if not error <= 1.0:
             return DONE, error
     code = restore(f, w, t + h, q1, v1, options[INNER_TOL])
