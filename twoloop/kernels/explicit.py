@@ -80,13 +80,28 @@ def _move(y, h, weights, slopes, y1):
 
 @compiled
 def _largest(tolerances, h, weights, y, y1, slopes, estimate):
-    """Largest component of h times the weighted sum of the slopes, over atol + rtol |y|."""
+    """Largest component of h times the weighted sum of the slopes over atol + rtol |y|."""
     _weighted(weights, slopes, estimate)
     largest = 0.0
     for m in range(y.size):
         scale = tolerances[ATOL] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
         largest = max(largest, abs(h * estimate[m]) / scale)
     return largest
+
+
+@compiled
+def _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, estimate):
+    """e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
+
+    Taken component by component it would be e, of low order, where d passes through zero: up to 30 % more evaluations.
+    """
+    n = estimate.size
+    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
+    e = _largest(tolerances, h, fine, q, q1, V_stage, estimate)
+    e = max(e, _largest(tolerances, h, fine, v, v1, A_stage, estimate))
+    d = _largest(tolerances, h, coarse, q, q1, V_stage, estimate)
+    d = max(d, _largest(tolerances, h, coarse, v, v1, A_stage, estimate))
+    return e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
 
 @kernel(STEP)
@@ -112,14 +127,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _move(v, h, b, A_stage, v1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        e = max(
-            _largest(tolerances, h, fine, q, q1, V_stage, estimate), _largest(tolerances, h, fine, v, v1, A_stage, estimate)
-        )
-        d = max(
-            _largest(tolerances, h, coarse, q, q1, V_stage, estimate), _largest(tolerances, h, coarse, v, v1, A_stage, estimate)
-        )
-        if e > 0.0:
-            error = e * e / np.hypot(e, d)
+        error = _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, estimate)
         if not error <= 1.0:
             return DONE, error
     code = restore(f, w, t + h, q1, v1, options[INNER_TOL])
