@@ -1,4 +1,4 @@
-"""What a user chooses: RungeKutta(...), Newmark(...), BDF(...), DOP853() and the presets. Frozen options, no state."""
+"""What a user chooses: RungeKutta(...), Newmark(...), BDF(...), DOP853(...) and presets. Frozen options, no state."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
