@@ -190,11 +190,12 @@ def _explicit_text(rows: pd.DataFrame) -> list[str]:
         row = cheapest(rows, case, OWN_EXPLICIT)
         if row is None:
             continue
-        (ours, newton), (other, ida) = least(rows, case, NEWTONS), least(rows, case, IDAS)
+        others = [least(rows, case, solvers) for solvers in (NEWTONS, IDAS)]
+        implicit = " and ".join(f"{number(seconds)} s ({name})" for name, seconds in others if np.isfinite(seconds))
         lines.append(
             f"No outer loop at all, {case} beam: {OWN_EXPLICIT} takes {number(cpu_for(rows, case, OWN_EXPLICIT))} s of CPU for a tip "
             f"error of {1e3 * TARGET:g} mm ({number(row['n_evaluations'])} evaluations at tol {power(row['tol'])}, error "
-            f"{number(row['error_tip'])} m); the cheapest implicit ones {number(newton)} s ({ours}) and {number(ida)} s ({other})."
+            f"{number(row['error_tip'])} m); the cheapest implicit ones {implicit or 'are not in these rows'}."
         )
     return lines
 
