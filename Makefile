@@ -51,7 +51,7 @@ reports: install ## all studies into reports/
 compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "import twoloop.kernels.runge_kutta"
 	@$(RUN) -c "import twoloop.kernels.automatic, twoloop.kernels.advance" & \
-	$(RUN) -c "import twoloop.kernels.momenta, twoloop.kernels.bdf, twoloop.kernels.newmark" && wait $$!
+	$(RUN) -c "import twoloop.kernels.momenta, twoloop.kernels.bdf, twoloop.kernels.newmark, twoloop.kernels.explicit" && wait $$!
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)

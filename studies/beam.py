@@ -42,6 +42,7 @@ from studies.beam_runs import (
 )
 from studies.index import put_in_index
 from studies.report import Array, Call, load_rows, load_series, parse, save_rows, save_series, stamp
+from studies.solvers import OWN_EXPLICIT
 
 T_END_QUICK = 0.1  # s
 NEWTON_DRAWN = {SOFT: 1e-3, STIFF: 1e-2}  # tolerance of the motion in the figures, beside the paper's at its own
@@ -58,6 +59,7 @@ TOLERANCES: dict[str, dict[str, tuple[float, ...]]] = {
         SWEEPS: (1e-1, 1e-2, 1e-4, 1e-6),
         OWN_NEWMARK: (1e-4, 1e-6, 1e-8),
         BDF: (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6),
+        OWN_EXPLICIT: (1e-1, 1e-2, 1e-3, 1e-4, 1e-5),
         IDA_C: (1e-3, 1e-4, 1e-5, 1e-6, 1e-7),
         IDA_C_LOOSE: (1e-4, 1e-5, 1e-6, 1e-7, 1e-8),
         IDA: (1e-4, 1e-5),
@@ -76,6 +78,7 @@ TOLERANCES: dict[str, dict[str, tuple[float, ...]]] = {
         SWEEPS: (1e-1, 1e-2, 1e-4),
         OWN_NEWMARK: (1e-2, 1e-4, 1e-6),
         BDF: (1e-1, 1e-2, 1e-3, 1e-4),
+        OWN_EXPLICIT: (1e-1, 1e-2, 1e-3, 1e-4, 1e-5),
         IDA_C: (1e-1, 1e-2, 1e-3, 1e-5),
         IDA_C_LOOSE: (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 3e-8, 1e-8),
         IDA: (1e-3,),
@@ -83,10 +86,11 @@ TOLERANCES: dict[str, dict[str, tuple[float, ...]]] = {
         EXPLICIT: (1e-2, 1e-4),
     },
 }
-SHORT = (NEWTON, NEWTON_4, NEWTON_5, NEWTON_GAUSS, AUTO, IDA_C_LOOSE)  # short runs, of which the median of three counts
+# short runs, of which the median of three counts
+SHORT = (NEWTON, NEWTON_4, NEWTON_5, NEWTON_GAUSS, AUTO, OWN_EXPLICIT, IDA_C_LOOSE)
 SHORT_SOFT = (PAPER, BDF, SWEEPS, IDA_C)  # in the very flexible case
 REPEATS = 3
-QUICK = (PAPER, QUARTER, NEWTON, AUTO, SWEEPS, BDF)  # IDA takes seconds to compile
+QUICK = (PAPER, QUARTER, NEWTON, AUTO, SWEEPS, BDF, OWN_EXPLICIT)  # IDA takes seconds to compile
 
 
 def jobs(quick: bool) -> Iterator[BeamJob]:

@@ -14,7 +14,7 @@ from references.beam_reduced import reduced_motion
 from references.ida import solve_ida
 from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
-from studies.solvers import ERR_IN
+from studies.solvers import ERR_IN, OWN_EXPLICIT
 from twoloop import Result, RungeKutta, Statistics, Status, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
@@ -96,6 +96,7 @@ SOLVERS: dict[str, Run] = {
     SWEEPS: partial(_two_loop, "Gauss6"),
     OWN_NEWMARK: partial(_two_loop, "Newmark"),
     BDF: partial(_two_loop, "BDF"),
+    OWN_EXPLICIT: partial(_two_loop, "DOP853"),
     IDA_C: partial(_ida_c, {}),
     IDA_C_LOOSE: partial(_ida_c, LOOSE),
     IDA: partial(_ida, {}),

@@ -20,7 +20,7 @@ from studies.claims_verdicts import (
 from studies.energy_drift import GAUSS, GAUSS_12, NEWMARK_QUARTER, RADAU, SUN
 from studies.report import number
 from studies.runs import ASTRAY, LOST
-from studies.solvers import IRK, IRK_LINE, NEWMARK, PRESETS, QUARTER
+from studies.solvers import IMPLICIT, IRK, IRK_LINE, NEWMARK, QUARTER
 
 AGREE = 1e-10  # m or rad
 ORDERS = {IRK_LINE: 5, NEWMARK: 2, QUARTER: 2}
@@ -81,7 +81,7 @@ def _because_of_order(rows: Rows) -> Judgement:
 
 def _any_method(rows: Rows) -> Judgement:
     parts = (
-        pick(rows, "motion", solver=PRESETS, group="line-up"),
+        pick(rows, "motion", solver=IMPLICIT, group="line-up"),
         pick(rows, "energy", variables="velocities", partition="lasting"),
     )
     runs = pd.concat([part[["solver", "h", "t_end", "status"]] for part in parts])
@@ -144,7 +144,7 @@ CLAIMS = (
         "Any implicit method for first-order equations fits into the two loops.",
         "Gauss, Radau IIA, Sun's and Lobatto IIIE tableaux, Newmark and BDF, all by sweeps.",
         {
-            "motion": ("group = line-up; solver = presets of twoloop", ("status",)),
+            "motion": ("group = line-up; solver = implicit presets of twoloop", ("status",)),
             "energy": ("variables = velocities; partition = lasting", ("solver", "status")),
         },
         "Holds if every method reaches the end of one run or more, with conditions if some do. The step limit of sweeps (see stiff systems) applies to all.",

@@ -28,7 +28,9 @@ IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, 
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C = "IDA from C, stabilised"
 CANONICAL = "Gauss6, momenta, symmetric"
-PRESETS = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", "BDF")  # of twoloop, with their own options
+OWN_EXPLICIT = "DOP853 (two-loop)"  # the preset "DOP853"; the other lines of this name are SciPy's
+IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", "BDF")
+PRESETS = (*IMPLICIT, OWN_EXPLICIT)  # of twoloop, with their own options
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 
@@ -148,7 +150,8 @@ def _all() -> Iterator[Solver]:
     for name, beta in ((NEWMARK, 0.5), (QUARTER, 0.25)):
         yield Solver(name, "err_out", partial(_paper_newmark, beta), {"err_in": ERR_IN}, two_loop=True)
     for preset in PRESETS:
-        yield Solver(preset, "tol", partial(two_loop, preset), two_loop=True)
+        method = "DOP853" if preset == OWN_EXPLICIT else preset
+        yield Solver(preset, "tol", partial(two_loop, method), two_loop=True)
     yield Solver(CANONICAL, "h", _canonical, two_loop=True)
     for form in ida.FORMS:
         yield Solver(f"IDA, {form}", "tol", partial(_ida, form), own_a=True)

@@ -117,7 +117,7 @@ def _notes(rows: pd.DataFrame) -> str:
         "**Settings**: `err_out` with err_in = 1e-9, and Atol = Rtol = 1e-5 for PaperIRK; `tol` = rtol = atol. Steps at one "
         "tolerance are not steps at one error: see “error q”, the largest position error over the run.",
         "**A step of Runge–Kutta** here is the h of one large and two half steps (Richardson), as in the paper; each of the three "
-        "has three stages (six with Gauss12). A step of Newmark or IDA has one. Cost is in the evaluations, not in the steps.",
+        "has three stages (six with Gauss12). A step of DOP853 has twelve, none of Richardson's; of Newmark or IDA one. Cost is in the evaluations, not in the steps.",
         "**Rejected attempts and switches** are recorded by the run itself, before each accepted step "
         "(`Result.rejected_error`, `.rejected_convergence`, `.partitioned`). “Steps retried” is the share of accepted steps before "
         "which an attempt was rejected; “at a switch” the same among the steps before which other coordinates became "

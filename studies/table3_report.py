@@ -7,7 +7,7 @@ import pandas as pd
 from references import exudyn_four_bar, ida, ida_c
 from studies.report import Call, markdown_table, number
 from studies.runs import ASTRAY, CHECKED, LOST, time_for
-from studies.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
+from studies.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, OWN_EXPLICIT, QUARTER
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9)
 
@@ -21,7 +21,7 @@ PAPER_NEWMARK = (
 )
 
 FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
-PRESETS_SHOWN = ("SunRadau5", "Gauss6", "Gauss12", "BDF")
+PRESETS_SHOWN = ("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT)
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2")
 EXPLICIT = ("LSODA, index 1", "DOP853, index 1", "DOP853, projected")
 TWO_LOOP = (IRK, NEWMARK, QUARTER, IRK_LINE, *PRESETS_SHOWN)
@@ -134,6 +134,7 @@ SHOWN = {  # the lines of the figure: ours solid, others dashed
     "SunRadau5": ("tab:purple", "v-"),
     "Gauss12": ("tab:blue", "o-"),
     "BDF": ("tab:pink", "X-"),
+    OWN_EXPLICIT: ("tab:brown", "H-"),
     "IDA, stabilised": ("tab:olive", "<--"),
     IDA_C: ("tab:green", ">--"),
     "Exudyn, TrapezoidalIndex2": ("tab:cyan", "D--"),
@@ -347,7 +348,8 @@ def _notes(rows: pd.DataFrame) -> str:
         "**Exudyn**: "
         + "; ".join(f"`{solver}` is {exudyn_four_bar.SOLVERS[solver]}" for solver in EXUDYN)
         + ". Its own bodies and joints; only lengths, masses, gravity and the initial angles are shared.",
-        "**LSODA, DOP853**: SciPy's, on the index-1 equations with a compiled right side (`references/index1.py`); plain "
+        f"**{OWN_EXPLICIT}**: an explicit method in the two loops, without an outer one; every stage is an evaluation.",
+        "**LSODA; DOP853, index 1; DOP853, projected**: SciPy's, on the index-1 equations with a compiled right side (`references/index1.py`); plain "
         "they drift off the constraints, projected they do not.",
     ]
     return "\n".join(f"- {note}" for note in notes)

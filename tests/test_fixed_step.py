@@ -31,7 +31,7 @@ def test_fixed_steps_store_at_multiples_and_at_the_end():
     assert len(result.h) == 53
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Newmark", "BDF", "PaperIRK"])
+@pytest.mark.parametrize("method", ["SunRadau5", "Newmark", "BDF", "DOP853", "PaperIRK"])
 def test_a_fixed_step_that_cannot_converge_says_so_and_does_not_change(default_four_bar, method):
     result = run(default_four_bar, step_size=2.0, method=method)
     assert result.status == Status.NOT_CONVERGED

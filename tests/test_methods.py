@@ -5,14 +5,14 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from twoloop import BDF, Newmark, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods import PRESETS
 from twoloop.tableaux import gauss, sun_radau_iib
 
 
 def test_presets_are_those_promised():
     gausses = {f"Gauss{order}" for order in range(4, 17, 2)}
-    assert set(PRESETS) >= {"SunRadau5", "RadauIIA5", "Newmark", "BDF", "PaperIRK", "PaperNewmark"} | gausses
+    assert set(PRESETS) >= {"SunRadau5", "RadauIIA5", "Newmark", "BDF", "DOP853", "PaperIRK", "PaperNewmark"} | gausses
 
 
 @pytest.mark.parametrize("order", range(4, 17, 2))
@@ -34,6 +34,8 @@ def test_methods_are_frozen():
         Newmark().beta = 1.0
     with pytest.raises(FrozenInstanceError):
         BDF().max_order = 1
+    with pytest.raises(FrozenInstanceError):
+        DOP853().inner_tol = 1.0
 
 
 def test_papers_newmark_has_beta_as_printed_and_takes_another():
@@ -91,6 +93,8 @@ def test_names_are_different():
         (lambda: BDF(max_order=2.0), TypeError, "max_order must be an int; given 2.0"),
         (lambda: BDF(inner_tol=0.0), ValueError, "inner_tol must be positive"),
         (lambda: BDF(outer_tol="1"), TypeError, "outer_tol must be a number"),
+        (lambda: DOP853(inner_tol=-1.0), ValueError, "inner_tol must be positive"),
+        (lambda: DOP853(inner_tol="1"), TypeError, "inner_tol must be a number"),
     ],
 )
 def test_wrong_options_are_named(make, error, words):

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import null_space
 
 from studies.energy_drift import drift, windows
-from twoloop import BDF, Newmark, RungeKutta, solve_dae
+from twoloop import BDF, DOP853, Newmark, RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.tableaux import gauss
 
@@ -45,7 +45,7 @@ def test_gauss_drifts_on_velocities_and_not_on_momenta(variables, drifts):
     assert (abs(slope) > 1e-8) == drifts  # J/s
 
 
-METHODS = [RungeKutta(gauss(3)), RungeKutta(gauss(3), variables="momenta"), Newmark(), BDF()]
+METHODS = [RungeKutta(gauss(3)), RungeKutta(gauss(3), variables="momenta"), Newmark(), BDF(), DOP853()]
 
 
 @pytest.mark.parametrize("turns", [0, 10_000])

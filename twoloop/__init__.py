@@ -2,7 +2,7 @@
 
 from twoloop.callbacks import callback
 from twoloop.consistency import consistent_state
-from twoloop.methods import BDF, Newmark, RungeKutta, paper_irk, paper_newmark
+from twoloop.methods import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
 from twoloop.system import ConstrainedSystem
@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BDF",
+    "DOP853",
     "ConstrainedSystem",
     "Newmark",
     "Result",

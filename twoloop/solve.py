@@ -53,12 +53,12 @@ def solve_dae(
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities (see `consistent_state`).
     method : str or method object
-        "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "BDF", "PaperIRK", "PaperNewmark",
-        or an object: `RungeKutta(...)`, `Newmark(...)`, `BDF(...)`.
+        "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "BDF", "DOP853", "PaperIRK",
+        "PaperNewmark", or an object: `RungeKutta(...)`, `Newmark(...)`, `BDF(...)`, `DOP853(...)`.
     rtol, atol : float
         A step is accepted when its estimated error over atol + rtol |value| is at most 1: the largest component of
-        positions and velocities for `RungeKutta` (the root mean square with error="richardson-paper") and `BDF`, the
-        root mean square of the positions for `Newmark`, unless it has `error_tol`, its own test.
+        positions and velocities for `RungeKutta` (the root mean square with error="richardson-paper"), `BDF` and
+        `DOP853`, the root mean square of the positions for `Newmark`, unless it has `error_tol`, its own test.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution; steps are shortened to land on them. None: every
         accepted step is stored.
