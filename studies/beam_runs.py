@@ -15,7 +15,7 @@ from references.ida import solve_ida
 from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
 from studies.solvers import ERR_IN, OWN_EXPLICIT
-from twoloop import Result, RungeKutta, Statistics, Status, paper_newmark, solve_dae
+from twoloop import ConstrainedSystem, Result, RungeKutta, Statistics, Status, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
 from twoloop.methods import Method
@@ -37,6 +37,7 @@ FINER_TOL, CHECK_TOL = 1e-10, 1e-6  # of DOP853 and of Gauss12, that check it
 PAPER, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 NEWTON, NEWTON_4, NEWTON_5 = "RadauIIA5 (Newton)", "RadauIIA7, Newton", "RadauIIA9, Newton"
 NEWTON_GAUSS, AUTO = "Gauss6, Newton", "SunRadau5 (auto)"
+DIFFERENCES = "RadauIIA7, Newton, by differences"
 SWEEPS, OWN_NEWMARK, BDF = "Gauss6 (sweeps)", "Newmark (sweeps)", "BDF (sweeps)"
 IDA_C, IDA_C_LOOSE = "IDA from C", "IDA from C, order <= 2, positions tested"
 IDA, IDA_LOOSE = "IDA, scikit-sundae", "IDA, scikit-sundae, order <= 2, positions tested"
@@ -54,6 +55,30 @@ def instants(t_end: float, per_second: int = PER_SECOND) -> Array:
 def _two_loop(method: str | Method, problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
     return solve_dae(problem.system, span, problem.q0, problem.v0, method, tol, tol, t_eval=times)
+
+
+def with_less_known(problem: Problem, tangent: bool = False, bandwidth: bool = False) -> ConstrainedSystem:
+    """The same system without the tangent of its force, or the bandwidth of its matrices, or both."""
+    system = problem.system
+    f = system.functions._asdict()
+    f.pop("p"), f.pop("flags"), f.pop("force_by_v"), f.pop("reaction_by_q")
+    if not tangent:
+        f.pop("force_by_q")
+    return ConstrainedSystem(
+        n_q=system.n_q,
+        n_c=system.n_c,
+        **f,
+        parameters=system.parameters,
+        constant_mass=True,
+        bandwidth=system.bandwidth if bandwidth else None,
+        name=problem.name,
+    )
+
+
+def _by_differences(problem: Problem, tol: float, times: Array) -> Result:
+    span = (0.0, float(times[-1]))
+    system, method = with_less_known(problem), RungeKutta(radau_iia(4), "newton")
+    return solve_dae(system, span, problem.q0, problem.v0, method, tol, tol, t_eval=times)
 
 
 def _paper(problem: Problem, tol: float, times: Array) -> Result:
@@ -91,6 +116,7 @@ SOLVERS: dict[str, Run] = {
     NEWTON: partial(_two_loop, "RadauIIA5"),
     NEWTON_4: partial(_two_loop, RungeKutta(radau_iia(4), "newton")),
     NEWTON_5: partial(_two_loop, RungeKutta(radau_iia(5), "newton")),
+    DIFFERENCES: _by_differences,
     NEWTON_GAUSS: partial(_two_loop, RungeKutta(gauss(3), "newton")),
     AUTO: partial(_two_loop, "SunRadau5"),
     SWEEPS: partial(_two_loop, "Gauss6"),
@@ -133,7 +159,10 @@ class BeamTruth:
 
 
 def true_motion(problem: Problem, t_end: float) -> BeamTruth:
-    """By DOP853 on the equations without constraints, which shares nothing with the solvers judged but the forces."""
+    """By SciPy's DOP853 on the equations without constraints, which shares the forces with the solvers judged.
+
+    And with OWN_EXPLICIT, at looser tolerances, the tableau; `truth_rows` has another method for that.
+    """
     t = instants(t_end, DRAWN_PER_SECOND)
     q, v = reduced_motion(problem, t, TRUTH_TOL)
     return BeamTruth(t, tip_height(q), midpoint_deflection(q), problem.energy(t, q, v))
