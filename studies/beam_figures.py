@@ -18,7 +18,7 @@ STYLES: dict[str, str] = dict(
         SOLVERS,
         (
             *("C3o-", "C1v-", "C1^--"),  # the paper's
-            *("C0o-", "b^-", "mv-", "C9s-", "C0D--"),  # Newton's method
+            *("C0o-", "b^-", "mv-", "b2:", "C9s-", "C0D--"),  # Newton's method
             *("C2s-", "C8^-", "C4v-"),  # sweeps
             "C6P-",  # explicit
             *("ks-", "kD--", "C7s:", "C7D:", "C5x-"),  # other people's

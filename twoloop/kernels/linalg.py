@@ -14,8 +14,14 @@ def copy(source, target):
 
 
 @inlined
+def _size(x):
+    """|x|, or of a complex number the sum of its parts' as LAPACK has it: no square root."""
+    return abs(x.real) + abs(x.imag)
+
+
+@inlined
 def lu_factor(A, pivots):
-    """LU factors of A with row exchanges, in place, 1/u_kk on the diagonal.
+    """LU factors of A, real or complex, with row exchanges, in place, 1/u_kk on the diagonal.
 
     Returns min|u_kk| / max|u_kk|; 0 for a singular matrix or one with values that are not finite.
     """
@@ -24,10 +30,11 @@ def lu_factor(A, pivots):
     largest = 0.0
     for k in range(n):
         p = k
-        top = abs(A[k, k])
+        top = _size(A[k, k])
         for i in range(k + 1, n):
-            if abs(A[i, k]) > top:
-                top = abs(A[i, k])
+            size = _size(A[i, k])
+            if size > top:
+                top = size
                 p = i
         pivots[k] = p
         if not top > 0.0:  # also true for NaN

@@ -198,13 +198,13 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 residual[j, m] = a_new[m] - A_stage[j, m]
             for m in w.dependent:
                 A_stage[j, m] = a_new[m]
-        change = 0.0
         if iteration == 0:
             for j in range(s):
                 for m in w.independent:
                     scale_q = max(scale_q, abs(Q_stage[j, m]))
                     scale_v = max(scale_v, abs(V_stage[j, m]))
         _correct(f, w, options, memory, s, residual, A_stage)
+        largest_q, largest_v = 0.0, 0.0
         for j in range(s):
             in_q, in_v = Q_stage[j], V_stage[j]  # their numbers are not needed any more
             for m in range(n):
@@ -215,7 +215,9 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                     in_q[m] += A2[j, k] * residual[k, m]
                     in_v[m] += A[j, k] * residual[k, m]
             for m in w.independent:
-                change = max(change, h * abs(in_v[m]) / scale_v, h * h * abs(in_q[m]) / scale_q)
+                largest_q = max(largest_q, abs(in_q[m]))
+                largest_v = max(largest_v, abs(in_v[m]))
+        change = max(h * largest_v / scale_v, h * h * largest_q / scale_q)
         if not np.isfinite(change):
             return OUTER_DIVERGED
         if iteration > 0:
