@@ -24,7 +24,7 @@ from studies.solvers import ERR_IN
 from twoloop import Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, ancf_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, tip_height
-from twoloop.methods import Method
+from twoloop.plan import Method
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]

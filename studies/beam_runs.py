@@ -18,7 +18,7 @@ from studies.solvers import ERR_IN, OWN_EXPLICIT
 from twoloop import ConstrainedSystem, Result, RungeKutta, Statistics, Status, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
-from twoloop.methods import Method
+from twoloop.plan import Method
 from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from studies.claims_algebra import Row, motion, row
 from studies.claims_sweeps import Step
 from twoloop import ConstrainedSystem, Newmark, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem
-from twoloop.methods import Method
+from twoloop.plan import Method
 from twoloop.tableaux import sun_radau_iib
 
 Array = NDArray[np.float64]

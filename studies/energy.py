@@ -43,7 +43,7 @@ from studies.report import Call, load_rows, parse, save_rows, stamp
 from studies.runs import Truth
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, four_bar
-from twoloop.methods import Method
+from twoloop.plan import Method
 from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from references.index1 import solve_index1
 from studies.runs import Job
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem
-from twoloop.methods import Method
+from twoloop.plan import Method
 from twoloop.tableaux import gauss, sun_radau_iib
 
 ERR_IN = 1e-9  # err_in and ...

@@ -34,7 +34,7 @@ from studies.table3_report import (
 )
 from twoloop import paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, four_bar
-from twoloop.methods import Method
+from twoloop.plan import Method
 
 SECOND = {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}
 

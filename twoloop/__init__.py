@@ -1,8 +1,10 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0."""
 
+from twoloop.bdf import BDF
 from twoloop.callbacks import callback
 from twoloop.consistency import consistent_state
-from twoloop.methods import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark
+from twoloop.dop853 import DOP853
+from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
 from twoloop.system import ConstrainedSystem

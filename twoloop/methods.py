@@ -1,63 +1,19 @@
-"""What a user chooses: RungeKutta(...), Newmark(...), BDF(...), DOP853(...) and presets. Frozen options, no state."""
+"""What a user chooses: RungeKutta(...), Newmark(...), the paper's two, and presets. Frozen options, no state."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks import check_number, check_positive, check_size
+from twoloop.bdf import BDF
+from twoloop.checks import check_number
+from twoloop.dop853 import DOP853
+from twoloop.plan import INNER_TOL, OUTER_SHARE, OUTER_TOL_FIXED, Method, Plan, check_tolerances
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
-Array = NDArray[np.float64]
-
-# Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
-INNER_TOL = 1e-8
-OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
-OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
 NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
-BDF_HIGHEST = 5  # order; the formula of order 6 is next to unstable, those beyond are
-COARSE_SHARE = 0.1  # of DOP853's estimate of order 3 beside that of order 5
-EXPLICIT_SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
 NEWMARK_OUTER_SHARE = 1e-3  # of err_out; Newmark sweeps converge so fast that this costs next to nothing
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
-
-    step: Any
-    options: Array
-    memory: Array
-    exponent: float
-    safety: float = 0.9
-    factor_min: float = 0.2
-    factor_max: float = 5.0
-    limit_start: float = np.inf
-    limit_factor: float = 0.7
-    limit_memory: int = 10
-    symmetric: bool = False
-    predictive: bool = False
-
-
-class Method(Protocol):
-    """What solve_dae needs of a method."""
-
-    @property
-    def name(self) -> str:
-        """Shown in messages and tables."""
-        ...
-
-    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
-        ...
-
-
-def _check_tolerances(method: "RungeKutta | Newmark | BDF | DOP853", *names: str) -> None:
-    for name in names:
-        if getattr(method, name) is not None:
-            check_positive(name, getattr(method, name))
 
 
 @dataclass(frozen=True)
@@ -135,7 +91,7 @@ class RungeKutta:
             )
         if self.error not in ("richardson", "richardson-paper"):
             raise ValueError(f"error must be 'richardson' or 'richardson-paper'; given {self.error!r}")
-        _check_tolerances(self, "inner_tol", "outer_tol")
+        check_tolerances(self, "inner_tol", "outer_tol")
 
     @property
     def name(self) -> str:
@@ -222,7 +178,7 @@ class Newmark:
             value = check_number(name, getattr(self, name))
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be between 0 and 1; given {value!r}")
-        _check_tolerances(self, "error_tol", "inner_tol", "outer_tol")
+        check_tolerances(self, "error_tol", "inner_tol", "outer_tol")
 
     @property
     def name(self) -> str:
@@ -260,145 +216,6 @@ class Newmark:
             exponent=1.0 / 3.0,
             factor_min=0.5,
             limit_start=1.0 if self.error_tol is not None else np.inf,
-        )
-
-
-@dataclass(frozen=True)
-class BDF:
-    """Two-loop procedure with backward differentiation formulas of variable step and order (the paper's outlook).
-
-    Of y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'), where p extrapolates the last k + 1 points and
-    c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
-    evaluation has the inner loop within it. Two to three evaluations make a step. At equal tolerance errors are larger
-    than those of `RungeKutta`: compare at equal error.
-
-    With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
-    the estimated local error of q and v, dependents too, is within the tolerance. Fixed steps have the order
-    max_order from the first on; 3-stage Gauss steps make the history that it needs.
-
-    What to expect of undamped motion: small oscillations lose energy with orders 1, 2 and 5 and gain it with 3 and 4,
-    at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
-    the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
-
-    Parameters
-    ----------
-    max_order : int
-        Highest order, 1 to 5.
-    inner_tol : float, optional
-        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
-    outer_tol : float, optional
-        The outer loop stops when no independent velocity or position would change by more than this, relative to
-        max(|value|, 1), but not before one correction. None: 0.01 min(rtol, atol); with fixed steps 1e-14.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If max_order is not an int from 1 to 5, or a tolerance is not positive.
-
-    Notes
-    -----
-    Sect. 5 of the paper proposes BDF as further work and leaves its form open; all of it is chosen here. Modified
-    divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
-    Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
-    equidistant history of Shampine and Reichelt (1997) they need no interpolation when a step is shortened to an
-    output time. The order is that of the largest next step, as in VODE. Stability and error constants: Hairer,
-    Norsett and Wanner, Solving ODEs I (1993), chapter III.
-    """
-
-    max_order: int = 5
-    inner_tol: float | None = None
-    outer_tol: float | None = None
-
-    def __post_init__(self) -> None:
-        check_size("max_order", self.max_order, 1)
-        if self.max_order > BDF_HIGHEST:
-            raise ValueError(f"max_order must be at most {BDF_HIGHEST}; given {self.max_order!r}")
-        _check_tolerances(self, "inner_tol", "outer_tol")
-
-    @property
-    def name(self) -> str:
-        """Shown in messages and tables."""
-        return f"BDF(max_order={self.max_order})"
-
-    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
-        from twoloop.kernels import bdf as kernels
-
-        inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
-        outer_tol = self.outer_tol
-        if outer_tol is None:
-            outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * min(rtol, atol)
-        return Plan(
-            kernels.bdf_step,
-            kernels.options_array(self.max_order, inner_tol, outer_tol),
-            np.zeros(kernels.memory_size(n_q)),
-            exponent=1.0,  # the step returns the root of its error that belongs to its order
-            safety=kernels.SAFETY,
-        )
-
-
-@dataclass(frozen=True)
-class DOP853:
-    """Two-loop procedure with an explicit Runge-Kutta method: Dormand and Prince's, of order 8, with 12 stages.
-
-    No outer loop: every stage is one evaluation, with the inner loop within it, so that a step costs 12 (one that is
-    refused 11) and never drifts off the constraints. For smooth motion that is not stiff. Stability, not accuracy,
-    limits h where the motion is slower than what could vibrate or decay: h w_max to 5.96 for undamped vibrations, and
-    h times the largest rate of decay to 6.39. What little of a vibration such steps do not resolve they damp: of the
-    amplitude 0.15 % a step at h w_max = 3. Then take `RungeKutta(..., outer="newton")`.
-
-    A step is accepted when the largest component of the estimated local error of q and v, dependents too, is within
-    the tolerance. Fixed steps estimate nothing.
-
-    Parameters
-    ----------
-    inner_tol : float, optional
-        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If inner_tol is not a positive number.
-
-    Notes
-    -----
-    Tableau and error estimate, e5^2 / sqrt(e5^2 + 0.01 e3^2) of embedded estimates of orders 5 and 3: Hairer, Norsett
-    and Wanner, Solving ODEs I (1993), II.5 and II.10; e5 and e3 are largest components here, not root mean squares.
-    The numbers are those of `scipy.integrate.DOP853`. The stability limits are those of the method's polynomial R(z):
-    |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
-    """
-
-    inner_tol: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_tolerances(self, "inner_tol")
-
-    @property
-    def name(self) -> str:
-        """Shown in messages and tables."""
-        return "DOP853"
-
-    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
-        import scipy.integrate
-
-        from twoloop.kernels import explicit as kernels
-
-        source = scipy.integrate.DOP853
-        s = len(source.B)
-        return Plan(
-            kernels.explicit_step,
-            kernels.options_array(
-                source.A,
-                source.B,
-                source.C,
-                source.E5[:s],  # the last weight, of the slope at the end, is 0 in both
-                COARSE_SHARE * source.E3[:s],
-                INNER_TOL if self.inner_tol is None else self.inner_tol,
-            ),
-            np.zeros(kernels.memory_size(s, n_q)),
-            exponent=1.0 / 8.0,
-            safety=EXPLICIT_SAFETY,
         )
 
 

@@ -13,7 +13,8 @@ from twoloop.consistency import check_start, dependent_rows, not_finite
 from twoloop.kernels import common
 from twoloop.kernels.banded import banded_pays
 from twoloop.kernels.lapack import addresses
-from twoloop.methods import PRESETS, Method, Plan
+from twoloop.methods import PRESETS
+from twoloop.plan import Method, Plan
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
 

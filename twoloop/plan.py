@@ -1,0 +1,54 @@
+"""What a method hands to a run: its plan; and what the methods share."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks import check_positive
+
+Array = NDArray[np.float64]
+
+# Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
+INNER_TOL = 1e-8
+OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
+OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
+
+    step: Any
+    options: Array
+    memory: Array
+    exponent: float
+    safety: float = 0.9
+    factor_min: float = 0.2
+    factor_max: float = 5.0
+    limit_start: float = np.inf
+    limit_factor: float = 0.7
+    limit_memory: int = 10
+    symmetric: bool = False
+    predictive: bool = False
+
+
+class Method(Protocol):
+    """What solve_dae needs of a method."""
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        ...
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        ...
+
+
+def check_tolerances(method: Method, *names: str) -> None:
+    """Raise unless each tolerance of these names is None or a positive number."""
+    for name in names:
+        if getattr(method, name) is not None:
+            check_positive(name, getattr(method, name))
