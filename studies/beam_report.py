@@ -111,12 +111,12 @@ def goals(rows: pd.DataFrame) -> list[list[str]]:
     for case in CASES:
         (ours, own), (other, theirs) = least(rows, case, OURS), least(rows, case, IDAS)
         value = theirs / own
-        asked = f"faster than IDA driven from C with compiled residual and exact Jacobian, {case}"
+        asked = f"faster than IDA driven from C with compiled residual and exact Jacobian, {case}: any method of this project"
         measured = f"IDA takes {_times(value)} the CPU ({other}, {number(theirs)} s, against {ours}, {number(own)} s)"
-        newton, seconds = least(rows, case, NEWTONS)
-        if newton != ours:
-            measured += f"; {_times(theirs / seconds)} that of Newton's method ({newton}, {number(seconds)} s)"
         goal(asked, measured, value, value > 1.0)
+        newton, seconds = least(rows, case, NEWTONS)
+        measured = f"IDA takes {_times(theirs / seconds)} the CPU ({newton}, {number(seconds)} s)"
+        goal(f"the same, {case}: Newton's method", measured, theirs / seconds, theirs > seconds)
     value = growth(rows, "banded")
     counts = rows[rows["group"] == "elements"]["n_elements"]
     asked = f"cost of a step from 4 to 64 elements: at most {GROWTH_ASKED:g} times"

@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
 from twoloop import ConstrainedSystem, solve_dae
+from twoloop.kernels.common import FORCE_BY_Q_GIVEN
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -14,6 +15,12 @@ TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
 
 def worst(a, b):
     return float(np.abs(np.asarray(a) - np.asarray(b)).max())
+
+
+def without_tangent(problem):
+    """The problem, its system made to difference the force."""
+    problem.system.functions.flags[FORCE_BY_Q_GIVEN] = 0
+    return problem
 
 
 def slope(f, e=1e-3):

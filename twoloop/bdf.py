@@ -17,7 +17,7 @@ class BDF:
     Of y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'), where p extrapolates the last k + 1 points and
     c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
     evaluation has the inner loop within it. Two to three evaluations make a step. At equal tolerance errors are larger
-    than those of `RungeKutta`: compare at equal error.
+    than those of `RungeKutta`: compare at equal error. It is for few digits.
 
     With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
     the estimated local error of q and v, dependents too, is within the tolerance. Fixed steps have the order

@@ -35,7 +35,8 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     """Compile one callback of a mechanism with the signature that its kind has.
 
     The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,) or the
-    multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros::
+    multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros (a tangent's of a
+    system with a bandwidth only within the band: add to it)::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
@@ -220,12 +221,12 @@ def no_rate(t, q, p, Ct):
 
 @callback("gamma")
 def no_gamma(t, q, v, p, Qd):
-    """Stands where gamma is differenced; never called."""
+    """Stands where gamma is differenced; no kernel calls it."""
 
 
 @callback("force_by_q")
 def no_tangent(t, q, v, p, K):
-    """Stands where a tangent is not given; never called."""
+    """Stands where a tangent is not given, and leaves zeros; no kernel calls it."""
 
 
 def check_arguments(kind: str, function: Callable[..., Any]) -> None:

@@ -135,6 +135,10 @@ def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str:
         "constraint": lambda: system.constraint(t, q),
         "jacobian": lambda: system.jacobian(t, q),
         "constraint_rate": lambda: system.constraint_rate(t, q),
+        # of tangents that are not given these are zeros
+        "force_by_q": lambda: system.force_by_q(t, q, v),
+        "force_by_v": lambda: system.force_by_v(t, q, v),
+        "reaction_by_q": lambda: system.reaction_by_q(t, q, np.ones(system.n_c)),
     }
     if system.functions.flags[GAMMA_GIVEN] == 1:
         values["gamma"] = lambda: system.gamma(t, q, v)

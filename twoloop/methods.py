@@ -8,7 +8,7 @@ import numpy as np
 from twoloop.bdf import BDF
 from twoloop.checks import check_number
 from twoloop.dop853 import DOP853
-from twoloop.plan import INNER_TOL, OUTER_SHARE, OUTER_TOL_FIXED, Method, Plan, check_tolerances
+from twoloop.plan import INNER_TOL, LEAST_ERROR, OUTER_SHARE, OUTER_TOL_FIXED, Method, Plan, check_tolerances
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
@@ -29,11 +29,11 @@ class RungeKutta:
         "newton": simplified Newton on the stage accelerations, its linear algebra in the eigenvectors of the tableau's
         A, with derivatives from the tangents that the system gives, else by differences of the two-loop right side,
         kept while it converges fast. For stiff problems, where sweeps need h w_max below a constant. Its error estimate
-        is an embedded one of order s, filtered, and the step follows its trend (Hairer & Wanner II, IV.8); `error` has
-        no effect.
+        is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error` has no effect.
         "auto": "fixed-point" until sweeps converge slowly and Newton's method, on trial, takes three times fewer
         evaluations for a second of motion; and back again.
         "paper": sweeps on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
+        The step size follows the error and, but with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
         Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
         "richardson": its largest component counts, and the step continues from the extrapolated state, put back on
@@ -117,7 +117,7 @@ class RungeKutta:
             outer_tol,
             1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
         )
-        exponent = 1.0 / (tableau.order + 1)
+        exponent, least_error = 1.0 / (tableau.order + 1), LEAST_ERROR
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         if self.outer == "paper":
             plan = Plan(kernels.paper_step, options, memory, exponent)
@@ -139,8 +139,9 @@ class RungeKutta:
                 memory, step, exponent = np.zeros(size), newton.newton_step, newton_exponent
             else:
                 memory = automatic.automatic_memory(memory.size, size, exponent, newton_exponent)
-                step, exponent = automatic.automatic_step, 1.0
-        return Plan(step, options, memory, exponent, symmetric=self.partition == "symmetric", predictive=True)
+                step, exponent, least_error = automatic.automatic_step, 1.0, LEAST_ERROR**exponent
+        symmetric = self.partition == "symmetric"
+        return Plan(step, options, memory, exponent, symmetric=symmetric, predictive=True, least_error=least_error)
 
 
 @dataclass(frozen=True)

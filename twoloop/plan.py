@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 # Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
+LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
 
@@ -32,6 +33,7 @@ class Plan:
     limit_memory: int = 10
     symmetric: bool = False
     predictive: bool = False
+    least_error: float = LEAST_ERROR
 
 
 class Method(Protocol):

@@ -176,6 +176,7 @@ class _Run:
         self.control[advance.LIMIT_MEMORY] = plan.limit_memory
         self.control[advance.SYMMETRIC] = plan.symmetric
         self.control[advance.PREDICTIVE] = plan.predictive
+        self.control[advance.LEAST_ERROR] = plan.least_error
         self.control[advance.MAX_STEPS] = np.inf
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0

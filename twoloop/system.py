@@ -72,6 +72,8 @@ class ConstrainedSystem:
         Tangents for Newton's method as the outer loop, each (n_q, n_q): dQ/dq, dQ/dv, and d(C_q^T lam)/dq with lam
         held. With force_by_q the force is not differenced; it must not depend on v then unless force_by_v is given too.
         reaction_by_q None: by differences of C_q, none where C_q does not change. force_by_q None: all by differences.
+        What the stiff part does not need is left out then (how M, and the directions that constraints allow, change
+        with q): at a tolerance steps are the same, but fixed steps in which bodies turn far may fail to converge.
     parameters : array_like, optional
         The vector `p` that every callback gets.
     constant_mass : bool
@@ -86,7 +88,8 @@ class ConstrainedSystem:
     Raises
     ------
     TypeError, ValueError
-        If a size or the bandwidth is not a sensible integer or a callback was not made by `twoloop.callback`.
+        If a size or the bandwidth is not a sensible integer, a callback was not made by `twoloop.callback`, or
+        force_by_v or reaction_by_q is given without force_by_q.
     """
 
     def __init__(
@@ -195,7 +198,7 @@ class ConstrainedSystem:
             constraint_rate(t, q) -> (n_c,), the partial derivative C_t. None: no dependence on time.
         gamma : callable, optional
             gamma(t, q, v) -> (n_c,), the right side of C_q a = Q_d. None: by differences of C_q and C_t along the
-            motion, over 2e-4 of the largest coordinate and at most 2e-4 s (before t too): good to about 1e-11 unless
+            motion, over 2e-4 of the largest coordinate and 2e-8 to 2e-4 s (before t too): good to about 1e-11 unless
             coordinates of very different scale, or a driving motion of kilohertz, ask for the formula.
         force_by_q, force_by_v, reaction_by_q : callable, optional
             As for the class: force_by_q(t, q, v), force_by_v(t, q, v), reaction_by_q(t, q, lam) -> (n_q, n_q).
@@ -307,10 +310,10 @@ class ConstrainedSystem:
 
     def shape_of(self, kind: str) -> tuple[int, ...]:
         """Shape of the array that a kind of callback fills."""
-        vectors = {"force": (self.n_q,), "jacobian": (self.n_c, self.n_q)}
         if kind in ("constraint", "constraint_rate", "gamma"):
             return (self.n_c,)
-        return vectors.get(kind, (self.n_q, self.n_q))
+        others = {"force": (self.n_q,), "jacobian": (self.n_c, self.n_q)}
+        return others.get(kind, (self.n_q, self.n_q))
 
     def check_returned(self, t: float, q: Array, v: Array) -> None:
         """Say what is wrong with the arrays that functions given with `compile=True` return at (t, q, v).

@@ -61,7 +61,7 @@ def test_price_of_ten_seconds(default_four_bar, tol, evaluations, per_step):
     assert stats.n_evaluations == stats.n_outer + 1  # a sweep is an evaluation; one more at the start
 
 
-def test_at_equal_error_it_costs_less_than_runge_kutta(default_four_bar):
+def test_at_few_digits_it_costs_less_than_runge_kutta(default_four_bar):
     # where the one errs by 2e-5, the other by 8e-5; below 1e-6 it no longer does
     multistep, error = four_bar_run(default_four_bar, 1e-7)
     one_step, other = four_bar_run(default_four_bar, 1e-4, method="Gauss6")

@@ -106,8 +106,8 @@ def test_no_single_angle_serves_the_default_linkage_for_a_period(default_four_ba
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"variables": "momenta"}, {"outer": "newton", "outer_tol": 1e-14}],
-    ids=["velocities", "momenta", "newton"],
+    [{}, {"variables": "momenta"}, {"outer": "newton", "outer_tol": 1e-14}, {"outer": "auto"}],
+    ids=["velocities", "momenta", "newton", "auto"],
 )
 @pytest.mark.parametrize(
     ("tableau", "reversible"), [(gauss(3), True), (lobatto_iiie(4), True), (sun_radau_iib(3), False)]

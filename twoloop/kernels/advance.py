@@ -32,8 +32,7 @@ from twoloop.kernels.partition import CHANGED, partition, partition_is_worn, par
 # what advance() returns
 ALL_OUTPUT_DONE, BUFFER_FULL, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
 
-KEPT = 1.2  # factors from 1 to this leave the step as it is where a change costs factorizations (Radau5's way)
-LEAST_ERROR = 1e-2  # what an error below it counts as where the trend is followed (Hairer & Wanner II, IV.8)
+KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run
@@ -50,9 +49,10 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     MAX_STEPS,  # accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is worn
-    PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson)
+    PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson), see also KEPT
+    LEAST_ERROR,  # what an error below it counts as in the trend (Hairer & Wanner II, IV.8)
     N_CONTROL,
-) = range(14)
+) = range(15)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far
 H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
@@ -185,7 +185,7 @@ def advance(
         if size <= near:
             return STEP_TOO_SMALL
         code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
-        if code == DONE and control[SYMMETRIC] == 1.0:
+        if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
             code = partition_of_midpoint(f, w, t + 0.5 * size, state, new_state)
             if code == CHANGED:
                 memory[0] = 0.0  # what the step keeps is of one that is not taken
@@ -228,7 +228,7 @@ def advance(
             clock[H_NEXT] = proposal
             continue
         w.counters[N_ACCEPTED] += 1
-        clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, LEAST_ERROR)
+        clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
         clock[FAILURE_CODE] = DONE
         clock[N_FIXED] += 1.0
         if lands:

@@ -26,9 +26,9 @@ from twoloop.kernels.partition import RANK_TOLERANCE
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
-ROUNDING = 1e-13  # relative to the largest coordinate: corrections of this size no longer shrink
 DIFFERENCE, SHORTEST = 2e-4, 1e-4  # see difference_step
-ROUNDING, ROUNDING_OF_Q = 1e-12, 2e-14  # see rounding_floor; the latter is a hundred roundings
+ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
+ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
 
 
 @compiled

@@ -136,7 +136,7 @@ def ldl_solve(A, x):
 
 @inlined
 def ldl_solve_rows(A, B):
-    """Solve with the factors of `ldl_factor` for every column of B at once; B is overwritten."""
+    """Solve with the factors of `ldl_factor` for all columns of B at once, row by row; B is overwritten."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):

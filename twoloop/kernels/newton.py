@@ -175,7 +175,6 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     Q_stage, V_stage = block(memory, s, n, Q_STAGE), block(memory, s, n, V_STAGE)
     a_new = vector(memory, s, n, A_NEW)
     before = 0.0
-    scale_q, scale_v = 1.0, 1.0
     floor = STAGNATION_FIXED
     if tolerances[ESTIMATE] == 1.0:
         floor = STAGNATION * min(tolerances[ATOL], tolerances[RTOL])
@@ -198,11 +197,11 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 residual[j, m] = a_new[m] - A_stage[j, m]
             for m in w.dependent:
                 A_stage[j, m] = a_new[m]
-        if iteration == 0:
-            for j in range(s):
-                for m in w.independent:
-                    scale_q = max(scale_q, abs(Q_stage[j, m]))
-                    scale_v = max(scale_v, abs(V_stage[j, m]))
+        scale_q, scale_v = 1.0, 1.0
+        for j in range(s):
+            for m in w.independent:
+                scale_q = max(scale_q, abs(Q_stage[j, m]))
+                scale_v = max(scale_v, abs(V_stage[j, m]))
         _correct(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
