@@ -201,7 +201,7 @@ def test_tangent_saves_evaluations_on_the_stiff_beam():
     [
         ({**TANGENTS, "force_by_q": lambda t, q, v: -spring_by_q(t, q, v)}, r"force_by_q of 'spring' is not the deri"),
         ({**TANGENTS, "force_by_v": lambda t, q, v: 2.0 * spring_by_v(t, q, v)}, "force_by_v of 'spring' is not the d"),
-        ({"force_by_q": spring_by_q}, "force_by_v of 'spring' is not.*or give force_by_v: beside force_by_q the force"),
+        ({"force_by_q": spring_by_q}, "force_by_v of 'spring' is not.*give force_by_v: beside force_by_q the force"),
         ({**TANGENTS, "reaction_by_q": lambda t, q, lam: -rod_by_q(t, q, lam)}, "reaction_by_q of 'spring' is not"),
         ({"force_by_v": spring_by_v}, "force_by_v and reaction_by_q go with force_by_q, which is not given"),
         (
