@@ -49,10 +49,10 @@ reports: install ## all studies into reports/
 
 # two processes that compile the same kernels at the same time would do everything twice
 compile: install ## compile the kernels, on two cores
-	@$(RUN) -c "import twoloop.kernels.runge_kutta" & \
-	$(RUN) -c "import twoloop.kernels.advance, twoloop.kernels.explicit, twoloop.kernels.newmark" && wait $$!
-	@$(RUN) -c "import twoloop.kernels.automatic" & \
-	$(RUN) -c "import twoloop.kernels.momenta, twoloop.kernels.bdf" && wait $$!
+	@$(RUN) -c "import twoloop.kernels.newton" & \
+	$(RUN) -c "import twoloop.kernels.runge_kutta, twoloop.kernels.explicit, twoloop.kernels.newmark" && wait $$!
+	@$(RUN) -c "import twoloop.kernels.automatic, twoloop.kernels.momenta" & \
+	$(RUN) -c "import twoloop.kernels.bdf, twoloop.kernels.advance" && wait $$!
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)

@@ -102,6 +102,7 @@ class RungeKutta:
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         from twoloop.kernels import runge_kutta as kernels
+        from twoloop.kernels.stages import options_array
 
         tableau = self.tableau
         outer_tol = self.outer_tol
@@ -109,7 +110,7 @@ class RungeKutta:
             outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * min(rtol, atol)
             if fixed and self.outer == "newton":
                 outer_tol = NEWTON_TOL_FIXED
-        options = kernels.options_array(
+        options = options_array(
             tableau.A,
             tableau.b,
             tableau.c,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, inlined, kernel
 from twoloop.kernels.inner import accelerations, evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.runge_kutta import options_array as gauss_options
 from twoloop.kernels.runge_kutta import sweep_accelerations
+from twoloop.kernels.stages import options_array as gauss_options
 from twoloop.tableaux import gauss
 
 MAX_ORDER = 5

@@ -37,17 +37,8 @@ from twoloop.kernels.inner import (
     rounding_floor,
 )
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_solve
-from twoloop.kernels.runge_kutta import (
-    FARTHEST,
-    GROWTH,
-    INNER_TOL,
-    MAX_SWEEPS,
-    OUTER_TOL,
-    PATIENCE,
-    conclude,
-    interpolate,
-    tableau_of,
-)
+from twoloop.kernels.runge_kutta import GROWTH, MAX_SWEEPS, PATIENCE, conclude
+from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 # places in `memory`: advance() sets the first after every attempt; then stage blocks (s, n), vectors (n), matrices
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, PARTITION_NUMBER, N_MEMORY_SCALARS = range(7)

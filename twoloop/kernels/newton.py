@@ -62,7 +62,7 @@ from twoloop.kernels.newton_memory import (
     eigen_place,
     vector,
 )
-from twoloop.kernels.runge_kutta import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
+from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 MAX_ITERATIONS = 15
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
@@ -71,7 +71,7 @@ STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
 
 
 def newton_options(A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of `options` that Newton's method needs besides runge_kutta.options_array.
+    """The part of `options` that Newton's method needs besides stages.options_array.
 
     Raises
     ------

@@ -38,7 +38,7 @@ from twoloop.kernels.newton_memory import (
     vector,
 )
 from twoloop.kernels.newton_tangents import DIFFERENCE, tangent_by_q, tangent_by_v
-from twoloop.kernels.runge_kutta import INNER_TOL
+from twoloop.kernels.stages import INNER_TOL
 
 
 @inlined

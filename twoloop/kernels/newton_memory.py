@@ -3,9 +3,9 @@
 import numpy as np
 
 from twoloop.kernels.common import inlined
-from twoloop.kernels.runge_kutta import N_SCALARS
+from twoloop.kernels.stages import N_SCALARS
 
-# `options` is that of runge_kutta.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
+# `options` is that of stages.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
 # its real and imaginary part, the row of T^-1 and the column of T that belong to it (s real, s imaginary parts each)
 N_REAL, N_PAIRS, GAMMA0, N_EIGEN_SCALARS = range(4)
 

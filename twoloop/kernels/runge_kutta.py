@@ -5,7 +5,6 @@ twice to q'' = a), `sweep_first_order` is the paper's loop on y_i = [v_i, q_i]. 
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.common import (
     ATOL,
@@ -21,49 +20,22 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.inner import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.linalg import copy
+from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
 GROWTH = 1e3  # the differences may first grow (the sweep is not normal), but not by more than this
 PATIENCE = 8  # sweeps after which a difference that grows again means divergence
-FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
-# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
-STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, N_SCALARS = range(5)
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, N_VECTORS = range(8)
 
 
-def options_array(
-    A: ArrayLike,
-    b: ArrayLike,
-    c: ArrayLike,
-    inner_tol: float,
-    outer_tol: float,
-    extrapolation: float,
-) -> NDArray[np.float64]:
-    """The parameter block that the steps of this file read."""
-    A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
-    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation])
-    return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
-
-
 def memory_size(s: int, n_q: int) -> int:
     """Length of `memory` for s stages and n_q coordinates."""
     return N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + s
-
-
-@inlined
-def tableau_of(options):
-    """Views of the parameter block: s, A, A A, b, b A, c."""
-    s = int(options[STAGES])
-    o = N_SCALARS
-    A = options[o : o + s * s].reshape((s, s))
-    A2 = options[o + s * s : o + 2 * s * s].reshape((s, s))
-    o += 2 * s * s
-    return s, A, A2, options[o : o + s], options[o + s : o + 2 * s], options[o + 2 * s : o + 3 * s]
 
 
 @inlined
@@ -76,23 +48,6 @@ def _block(memory, s, n, which):
 def _vector(memory, s, n, which):
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
-
-
-@compiled
-def interpolate(c, theta, A_stage, weights, a):
-    """The polynomial through (c_j, A_stage_j) at theta."""
-    s = c.size
-    for j in range(s):
-        product = 1.0
-        for k in range(s):
-            if k != j:
-                product *= (theta - c[k]) / (c[j] - c[k])
-        weights[j] = product
-    for m in range(a.size):
-        total = 0.0
-        for j in range(s):
-            total += weights[j] * A_stage[j, m]
-        a[m] = total
 
 
 @compiled
