@@ -22,11 +22,11 @@ from references.ida_options import (
     HIGHEST_ORDER,
     NOT_TESTED,
     check_options,
-    check_tangent,
     no_force,
-    no_tangent,
+    own_tangent,
     tolerances,
 )
+from twoloop.callbacks import no_tangent
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -62,14 +62,14 @@ def solve_ida(
     t_eval: ArrayLike | None = None,
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
-    tangent: Dispatcher | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        The problem. Its callbacks are compiled into a residual and a Jacobian at the first run (a few seconds).
+        The problem. Its callbacks are compiled into a residual and a Jacobian at the first run (a few seconds). The
+        Jacobian is by differences; with `force_by_q` what is differenced is the residual without the force.
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
@@ -92,9 +92,6 @@ def solve_ida(
     error_test : {"all", "positions"}
         What the error test, and that of Newton's iteration, sees: all unknowns but the algebraic lam of the form
         "index1", or q alone. IDA's norm is a mean over all unknowns: the fewer it sees, the looser the same tolerance.
-    tangent : compiled function, optional
-        (t, q, v, p, K) -> None, like a callback; adds dQ/dq to K (n_q, n_q). For a force that does not depend on v.
-        What is differenced for the Jacobian is then the residual without the force.
 
     Returns
     -------
@@ -121,13 +118,12 @@ def solve_ida(
     max_order = check_options(max_order, error_test)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
     check_start(system, t0, q0, v0)
-    check_tangent(system, tangent, t0, q0, v0)
 
     size = 2 * system.n_q + _n_multipliers(system, form)
     absolute = tolerances(system, size, error_test, float(atol))
     if form == "index1":
         absolute[2 * system.n_q :] = NOT_TESTED
-    callbacks = _callbacks(system, form, tangent)
+    callbacks = _callbacks(system, form)
     solver = sksundae.ida.IDA(
         callbacks[0],
         jacfn=callbacks[1],
@@ -148,10 +144,10 @@ def solve_ida(
     return _result(system, form, outcome, times, said.getvalue(), cpu)
 
 
-def _callbacks(system: ConstrainedSystem, form: str, tangent: Dispatcher | None) -> tuple[Any, Any]:
+def _callbacks(system: ConstrainedSystem, form: str) -> tuple[Any, Any]:
     """Residual and Jacobian as scikit-sundae calls them."""
     f = system.functions
-    residual, jacobian = _compiled(form, *f[:5], compiled_gamma(system), tangent)
+    residual, jacobian = _compiled(form, *f[:5], compiled_gamma(system), own_tangent(system))
     sizes_and_p = (system.n_q, system.n_c, f.p)
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]

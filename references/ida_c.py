@@ -14,12 +14,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
 from references.ida_compiled import compiled_for_ida
-from references.ida_options import HIGHEST_ORDER, check_options, check_tangent, tolerances
+from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials import LONG, POINTER, REAL, library
 from twoloop.callbacks import python_force
 from twoloop.checks import check_positive, check_span, check_times, check_vector
@@ -50,7 +49,6 @@ def solve_ida_c(
     t_eval: ArrayLike | None = None,
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
-    tangent: Dispatcher | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA, in the form "stabilised", without Python in the integration.
 
@@ -62,7 +60,8 @@ def solve_ida_c(
     ----------
     system : ConstrainedSystem
         The problem, of compiled callbacks. They are compiled into a residual and a Jacobian at the first run (a few
-        seconds). A constant mass matrix is evaluated once.
+        seconds). A constant mass matrix is evaluated once. With `force_by_q` the Jacobian is exact but for the
+        derivatives of C_q and of a varying mass by q.
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
@@ -78,9 +77,6 @@ def solve_ida_c(
         What the error test, and that of Newton's iteration, sees: all unknowns, or q alone. IDA's norm is a mean over
         all unknowns, so that without the others the same tolerances allow q an error sqrt((2 n_q + 2 n_c)/n_q) times
         as large.
-    tangent : compiled function, optional
-        (t, q, v, p, K) -> None, like a callback; adds dQ/dq to K (n_q, n_q). For a force that does not depend on v.
-        The Jacobian is then exact but for the derivatives of C_q and of a varying mass by q.
 
     Returns
     -------
@@ -114,11 +110,10 @@ def solve_ida_c(
     max_order = check_options(max_order, error_test)
     times = np.linspace(t0, t1, OUTPUTS) if t_eval is None else check_times(t_eval, t0, t1, None)
     check_start(system, t0, q0, v0)
-    check_tangent(system, tangent, t0, q0, v0)
 
     sundials, state = library(), _start(system, t0, q0, v0)
     absolute = tolerances(system, state.size // 2, error_test, float(atol))
-    with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order, tangent) as solver:
+    with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order) as solver:
         began = time.process_time()
         rows, flag, reached = _integrate(sundials.IDASolve, solver, state, t0, t1, times)
         cpu = time.process_time() - began
@@ -144,12 +139,11 @@ def _integrator(
     rtol: float,
     atol: Array,
     max_order: int,
-    tangent: Dispatcher | None,
 ) -> Iterator[tuple[Any, Any, Any]]:
     """IDA's memory and its vectors y and y', which are the halves of `state`; all is freed at the end."""
     f, n = system.functions, state.size // 2
     sizes = system.n_q, system.n_c, f.p.size
-    residual, jacobian, size = compiled_for_ida(*f[:5], *sizes, system.constant_mass, tangent)
+    residual, jacobian, size = compiled_for_ida(*f[:5], *sizes, system.constant_mass, own_tangent(system))
     data = np.zeros(size)
     data[: f.p.size] = f.p
     data[f.p.size : f.p.size + system.n_q**2] = system.mass(t0, state[: system.n_q]).ravel()

@@ -8,8 +8,9 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
 
-from references.ida_options import no_force, no_tangent
+from references.ida_options import no_force
 from references.sundials import library
+from twoloop.callbacks import no_tangent
 
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 

@@ -17,7 +17,7 @@ from references.index1 import solve_index1
 from studies.solvers import ERR_IN, OWN_EXPLICIT
 from twoloop import ConstrainedSystem, Result, RungeKutta, Statistics, Status, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem, moderately_stiff_beam, very_flexible_beam
-from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
+from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height
 from twoloop.plan import Method
 from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
@@ -93,13 +93,13 @@ def _paper_newmark(beta: float, problem: Problem, err_out: float, times: Array) 
 
 def _ida_c(options: dict[str, Any], problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
-    options = {"t_eval": times, "tangent": elastic_tangent, **options}
+    options = {"t_eval": times, **options}
     return solve_ida_c(problem.system, span, problem.q0, problem.v0, tol, tol, **options)
 
 
 def _ida(options: dict[str, Any], problem: Problem, tol: float, times: Array) -> Result:
     span = (0.0, float(times[-1]))
-    options = {"t_eval": times, "tangent": elastic_tangent, **options}
+    options = {"t_eval": times, **options}
     return solve_ida(problem.system, span, problem.q0, problem.v0, "stabilised", tol, tol, **options)
 
 

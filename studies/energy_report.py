@@ -383,7 +383,7 @@ def _panels(rows: pd.DataFrame, series: pd.DataFrame, what: str, title: str, pat
             style = STYLES[(row["variables"], row["partition"])]
             if what == "largest":
                 style = "-" if pd.isna(row["tol"]) else "--"
-            setting = f", tol = {row['tol']:.0e}" if pd.notna(row["tol"]) else ""
+            setting = f", tol = {row['tol']:.0e}" if pd.notna(row["tol"]) else f", h = {row['h']:g}"
             label = f"{_name(row)}{setting}: {row['verdict']}"
             panel.plot(part["t"], part[what].abs(), style, color=COLORS[row["solver"]], lw=1.3, label=label)
         panel.set(yscale="log", xscale="log" if what == "mean" else "linear")

@@ -2,18 +2,21 @@
 
 import numpy as np
 import pytest
-from numba import njit
 
 from references.ida import solve_ida
 from references.ida_c import solve_ida_c
-from references.ida_options import ERROR_TESTS, check_tangent
+from references.ida_options import ERROR_TESTS
 from references.index1 import solve_index1
-from twoloop import ConstrainedSystem
+from tests.problems import without_tangent
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
-from twoloop.mechanisms.ancf_beam import elastic_tangent, tip_height
+from twoloop.mechanisms.ancf_beam import tip_height
 
 TIMES = np.arange(1, 21) / 10.0
-CASES = {"flexible": very_flexible_beam(), "stiff": moderately_stiff_beam()}
+CASES = {
+    "flexible": very_flexible_beam(),
+    "stiff": moderately_stiff_beam(),
+    "stiff, no tangent": without_tangent(moderately_stiff_beam()),
+}
 FOUR_BAR = four_bar()
 ORDER_2 = {"max_order": 2, "error_test": "positions"}
 
@@ -70,7 +73,7 @@ TIPS = {
 
 def run(name, tolerance, driver=solve_ida_c, **options):
     problem = CASES[name]
-    options = {"t_eval": TIMES, "tangent": elastic_tangent} | options
+    options = {"t_eval": TIMES} | options
     t_end = options["t_eval"][-1]
     return driver(problem.system, (0.0, t_end), problem.q0, problem.v0, rtol=tolerance, atol=tolerance, **options)
 
@@ -125,38 +128,14 @@ def test_order_2_and_positions_step_over_them():
 @pytest.mark.parametrize("driver", [solve_ida, solve_ida_c])
 def test_tangent_gives_the_same_motion(driver):
     given, differenced = (
-        run("stiff", 1e-6, driver, tangent=tangent, t_eval=TIMES[:5], **ORDER_2) for tangent in (elastic_tangent, None)
+        run(name, 1e-6, driver, t_eval=TIMES[:5], **ORDER_2) for name in ("stiff", "stiff, no tangent")
     )
     assert np.abs(given.q - differenced.q).max() < 3e-3
     assert given.stats.n_factorizations == pytest.approx(differenced.stats.n_factorizations, rel=0.4)
 
 
-@njit
-def nothing(t, q, v, p, K):
-    """The tangent of a force that does not depend on q."""
-
-
-def test_a_tangent_that_is_not_that_of_the_force_is_refused():
-    beam = CASES["stiff"]
-    check_tangent(beam.system, elastic_tangent, 0.0, beam.q0, beam.v0)
-    with pytest.raises(ValueError, match=r"tangent must add dQ/dq.*at the start it differs"):
-        check_tangent(beam.system, nothing, 0.0, beam.q0, beam.v0)
-    damped = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([-v[0], -9.81]),
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: q[None, :],
-    )
-    with pytest.raises(ValueError, match="tangent is for a force that does not depend on velocities"):
-        check_tangent(damped, nothing, 0.0, np.array([1.0, 0.0]), np.zeros(2))
-
-
 @pytest.mark.parametrize("driver", [solve_ida, solve_ida_c])
 def test_wrong_options_are_named(driver):
-    with pytest.raises(TypeError, match="tangent must be compiled by numba"):
-        run("stiff", 1e-6, driver, tangent=lambda t, q, v, p, K: None)
     with pytest.raises(ValueError, match="max_order must be at most 5"):
         run("stiff", 1e-6, driver, max_order=6)
     with pytest.raises(ValueError, match="max_order must be at least 1"):
