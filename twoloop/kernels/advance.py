@@ -10,6 +10,7 @@ from twoloop.kernels.common import (
     DONE,
     FAULT_KIND,
     FUNCTIONS,
+    GAMMA_GIVEN,
     INNER_DIVERGED,
     INTEGERS,
     MATRIX,
@@ -18,6 +19,8 @@ from twoloop.kernels.common import (
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
     NOT_FINITE,
+    ORIENTATION,
+    ORIENTATION_NEW,
     SINGULAR,
     VECTOR,
     WORK,
@@ -28,9 +31,10 @@ from twoloop.kernels.common import (
     kernel,
 )
 from twoloop.kernels.differences import representable
-from twoloop.kernels.inner import accelerations, factor_dependent, factor_mass
+from twoloop.kernels.inner import accelerations, factor_mass
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.partition import CHANGED, partition, partition_is_worn, partition_of_midpoint
+from twoloop.kernels.partition import CHANGED, partition_is_worn, partition_of_midpoint
+from twoloop.kernels.predictor import renew_partition
 
 # what advance() returns; PAUSED: a buffer is full, or MAX_ATTEMPTS were made
 ALL_OUTPUT_DONE, PAUSED, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
@@ -104,10 +108,10 @@ def start(
     q, v = state[:n], state[n : 2 * n]
     code = factor_mass(f, w, t, q)
     if code == DONE:
-        code = partition(f, w, t, q)
+        code = renew_partition(f, w, t, q)
     if code == DONE:
-        code = factor_dependent(f, w, t, q)
-    if code == DONE:
+        code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -201,6 +205,7 @@ def advance(
         elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
             return STEP_TOO_SMALL
         w.notes[DEPARTURE] = 0.0
+        w.notes[ORIENTATION_NEW] = 0.0
         w.notes[FAULT_KIND] = -1.0
         code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
@@ -221,14 +226,14 @@ def advance(
                 # the step keeps its size; only a partition that went bad within it may be the reason
                 if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
                     return FIXED_STEP_FAILED
-                if partition(f, w, t, state[:n]) != DONE:
+                if renew_partition(f, w, t, state[:n]) != DONE:
                     return RANK_LOST
                 retried = t
                 continue
             clock[H_LIMIT] = control[LIMIT_FACTOR] * size
             clock[LIMIT_AGE] = 0.0
             clock[H_NEXT] = 0.5 * size
-            if code in (SINGULAR, INNER_DIVERGED) and partition(f, w, t, state[:n]) != DONE:
+            if code in (SINGULAR, INNER_DIVERGED) and renew_partition(f, w, t, state[:n]) != DONE:
                 return RANK_LOST
             continue
         factor = control[FACTOR_MAX]
@@ -255,6 +260,7 @@ def advance(
         else:
             clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
         copy(new_state, state)
+        w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
         out_steps[filled[1], H] = size
         out_steps[filled[1], ERRORS] = w.counters[N_REJECTED_ERROR]
         out_steps[filled[1], FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
@@ -274,5 +280,5 @@ def advance(
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
-        if control[SYMMETRIC] == 0.0 and partition_is_worn(w) and partition(f, w, clock[T], state[:n]) != DONE:
+        if control[SYMMETRIC] == 0.0 and partition_is_worn(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
             return RANK_LOST

@@ -134,6 +134,8 @@ WORK = types.NamedTuple(
 (
     SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
     DEPARTURE,  # how far the predicted dependents were off in this attempt, see predictor.py
+    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
+    ORIENTATION_NEW,  # ... and at the end of this attempt
     FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
     FAULT_TIME,  # ... and when
     GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see differences.py
@@ -141,7 +143,7 @@ WORK = types.NamedTuple(
     GAMMA_ACCURACY,  # reached when that share was chosen
     GAMMA_SCALE,  # largest entry of Q_d so far
     N_NOTES,
-) = range(9)
+) = range(11)
 
 # what a kernel returns: DONE, or why it could not
 DONE, OUTER_DIVERGED, INNER_DIVERGED, SINGULAR, NOT_FINITE, MASS_NOT_DEFINITE, GAMMA_INACCURATE = range(7)

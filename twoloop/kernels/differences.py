@@ -21,6 +21,7 @@ from twoloop.kernels.linalg import copy
 LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference
 LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
 TRIGGER = 0.01  # of the required accuracy: a larger estimated error has another length chosen
+LENGTHEN = 1e-9  # relative disagreement below which a longer length loses nothing and has less rounding
 
 
 @exact
@@ -116,14 +117,14 @@ def gamma_by_differences(f, w, t, q, v):
     """
     longest = longest_difference(q, v)
     e = representable(t, w.notes[GAMMA_SHARE] * longest)
-    largest, disagreement = np.inf, np.inf
     if e > 0.0:
         largest, disagreement = _differences(f, w, t, q, v, e)
-        if np.isnan(largest):
-            return DONE  # whoever uses it sees that it is not finite
-        if disagreement == 0.0:
-            return DONE
-        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
+        scale = w.notes[GAMMA_SCALE]
+        if np.isnan(largest) or disagreement == 0.0 or scale == 0.0:
+            return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
+        w.notes[GAMMA_SCALE] = max(scale, largest)
+        if disagreement < LENGTHEN * scale:
+            w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
         # of sin(x), say, the error is x^4 / 30 where the disagreement is x^2 / 2
         if disagreement * disagreement <= 7.0 * TRIGGER * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE] ** 2:
             return DONE

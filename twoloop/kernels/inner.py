@@ -13,6 +13,7 @@ from twoloop.kernels.common import (
     FAULT_KIND,
     FAULT_TIME,
     GAMMA_GIVEN,
+    GAMMA_SCALE,
     INNER_DIVERGED,
     MASS_NOT_DEFINITE,
     N_EVALUATIONS,
@@ -294,6 +295,12 @@ def _accelerations(f, w, t, q, v, a, lam):
     for j in range(n_q):
         if not np.isfinite(a[j]):
             return _not_finite(w.notes, _which_acceleration(w.Ct, w.Qd, w.Q), t, q)
+    if f.flags[GAMMA_GIVEN] == 0:
+        for i in range(n_c):
+            total = 0.0
+            for j in range(n_q):
+                total += abs(w.Cq[i, j] * a[j])
+            w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], total)
     return DONE
 
 

@@ -1,6 +1,6 @@
 """LU coordinate partitioning: which coordinates are independent."""
 
-from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, SENSITIVITY, SINGULAR, compiled, inlined
+from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, ORIENTATION, SENSITIVITY, SINGULAR, compiled, inlined
 from twoloop.kernels.linalg import lu_solve
 
 RANK_TOLERANCE = 1e-11  # a pivot below this fraction of the largest one counts as zero
@@ -64,6 +64,7 @@ def _take_order(w):
     _insert_sorted(w.order[:n_c], w.dependent)
     _insert_sorted(w.order[n_c:], w.independent)
     w.notes[SENSITIVITY] = 0.0
+    w.notes[ORIENTATION] = 0.0
 
 
 @compiled
