@@ -200,6 +200,8 @@ def advance(
             if shortened and not lands:
                 size = 0.5 * left  # two equal steps rather than a long and a tiny one
             size = representable(t, size)
+            if size > control[MAX_STEP]:
+                size = representable(t, size - np.spacing(t + size))
         if lands:
             size = left
         elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):

@@ -68,6 +68,7 @@ from twoloop.kernels.predictor import restore_predicted
 from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 MAX_ITERATIONS = 15
+SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
 STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
@@ -312,7 +313,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             memory[HAS_JACOBIAN] = 1.0
             memory[FRESH] = 1.0
             memory[H_FACTORED] = 0.0
-        if memory[H_FACTORED] != h:
+        if abs(memory[H_FACTORED] - h) > SAME_STEP * h:
             code = _factor(f, w, options, memory, s, h)
             if code != DONE:
                 memory[HAS_JACOBIAN] = 0.0
