@@ -197,9 +197,18 @@ def _first_states(system: ConstrainedSystem, times: Array, q0: Array, v0: Array,
     """States at the first times; of a failed run those before its failure."""
     if times.size > 1:
         span = (float(times[0]), float(times[-1]))
-        tight = {"rtol": START_TOLERANCE, "atol": START_TOLERANCE}
-        options: dict[str, Any] = {"stabilisation": "projection", "t_eval": times, "time_limit": limit.left()}
-        return solve_index1(system, span, q0, v0, "DOP853", **tight, **options)
+        return solve_index1(
+            system,
+            span,
+            q0,
+            v0,
+            "DOP853",
+            START_TOLERANCE,
+            START_TOLERANCE,
+            stabilisation="projection",
+            t_eval=times,
+            time_limit=limit.left(),
+        )
     a, lam = accelerations(system, times, q0[:, None], v0[:, None])
     return Result(
         times, q0[:, None], v0[:, None], a, lam, np.empty(0), Status.REACHED_END, "the state given", Statistics()

@@ -94,10 +94,10 @@ def solve_index1(
     -------
     Result
         `a` and `lam` (with the sign of M a + C_q^T lam = Q) computed from the stored q and v as in the right-hand
-        side, so with Baumgarte's terms where they are used. `h` holds all accepted steps. Of the statistics: n_accepted;
-        n_evaluations, all evaluations of the right-hand side, those for a difference Jacobian, for the interpolant and
-        after a projection included; n_factorizations, SciPy's LU count, for "Radau" and "BDF". cpu_time is that of
-        the integration, without the final `a` and `lam`. A failure of the solver gives what was computed before it,
+        side, so with Baumgarte's terms where they are used. `h` holds all accepted steps. Of the statistics:
+        n_accepted; n_evaluations, all evaluations of the right-hand side, those for a difference Jacobian, for the
+        interpolant and after a projection included; n_factorizations, SciPy's LU count, for "Radau" and "BDF". cpu_time
+        is that of the integration, without the final `a` and `lam`. A failure gives what was computed before it,
         `Status.SOLVER_FAILED` and the solver's text.
 
     Raises
