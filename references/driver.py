@@ -73,7 +73,8 @@ def check_system(system: Any) -> None:
 def check_problem(problem: Any, parameter: str, expected: str) -> Problem:
     """Return `problem` if it is a `Problem` that has this parameter, as those of one mechanism have."""
     if not isinstance(problem, Problem) or parameter not in problem.parameters:
-        raise TypeError(f"problem must be {expected}; given {problem!r} of type {type(problem).__name__}")
+        given = f"the Problem {problem.name!r}" if isinstance(problem, Problem) else repr(problem)
+        raise TypeError(f"problem must be {expected}; given {given}")
     return problem
 
 

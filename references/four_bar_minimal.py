@@ -135,6 +135,8 @@ class MinimalFourBar:
         rest.terminal = True  # type: ignore[attr-defined]
         rest.direction = -math.copysign(1.0, self._rate(0.0, start)[3])  # type: ignore[attr-defined]
         rough = solve_ivp(_counted(self._rate), (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
+        if rough.status == -1:
+            raise ValueError(f"the linkage's equation of motion cannot be integrated: {rough.message}")
         if rough.status != 1:
             raise ValueError(
                 f"the linkage does not come to rest within {LONGEST:g} s: it starts too near an equilibrium"

@@ -7,6 +7,7 @@ promise nothing to others: this was written for `WRITTEN_FOR`, and says so when 
 """
 
 import ctypes
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -220,9 +221,9 @@ def _integrate(
     rows, stored = np.empty((times.size, state.size)), 0
     for stop in [*times.tolist(), t1]:
         if stop > t0 and flag != IDA_TSTOP_RETURN:
-            for _ in range(MOST_STEPS // STEPS_A_CALL):
+            for calls in itertools.count(1):
                 flag = IDA_TOO_MUCH_WORK if limit.passed() else solve(memory, stop, place, y, yp, IDA_NORMAL)
-                if flag != IDA_TOO_MUCH_WORK or limit.exceeded:
+                if flag != IDA_TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
                     break
             if flag < 0:
                 break

@@ -1,5 +1,7 @@
 """solve_dae: checks the input, drives the compiled integrator in chunks, assembles the Result."""
 
+from __future__ import annotations  # ArrayLike stays a word in help()
+
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
