@@ -41,7 +41,8 @@ START_TOLERANCE = 1e-12
 MAX_NEWTON = 10
 SLOW = 0.1  # a correction that is not this much smaller than the last one asks for a new Newton matrix
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |q|)
-STEPS_A_CALL = 200  # between two looks at the clock
+FIRST_STEPS = 100  # of the first call of the compiled loop, when there is a time limit
+CALL = 0.05  # s; the steps of a call are doubled until one takes that long, for a call itself costs some 0.1 ms
 WHOLE = 1e-6  # how far, in steps, the length of t_span may be from a whole number of them
 
 DONE, NOT_CONVERGED, SINGULAR, NOT_FINITE = range(4)
@@ -116,8 +117,8 @@ def solve_gear(
         Increasing times in t_span, t_span[0] and multiples of the step from there, at which to store the solution.
         None: every step.
     time_limit : float, optional
-        Wall-clock time that the run may take, s, an accurate start included, looked at every `STEPS_A_CALL` steps. A
-        run past it is a failed one. None: no limit.
+        Wall-clock time that the run may take, s, an accurate start included, looked at about
+        every `CALL` seconds. A run past it is a failed one. None: no limit.
 
     Returns
     -------
@@ -168,9 +169,11 @@ def solve_gear(
     counters = np.zeros(N_COUNTERS, dtype=np.int64)
     given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
     past = np.zeros((HIGHEST, given.shape[1]))
-    code, made, stride = DONE, -1, n_steps if time_limit is None else STEPS_A_CALL
+    code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
+    formulas = _formulas()
     began = time.process_time()
     while code == DONE and made < n_steps and not limit.passed():
+        called = time.monotonic()
         last = min(made + stride, n_steps)
         code = _integrate(
             *system.functions,
@@ -182,13 +185,14 @@ def solve_gear(
             t0,
             h,
             order,
-            _formulas(),
+            formulas,
             float(newton_tol),
             keep,
             rows,
             counters,
         )
         made = last
+        stride *= 2 if time.monotonic() - called < CALL else 1
     cpu = time.process_time() - began
     return _result(system, order, t0, h, code, keep, rows, counters, cpu, limit)
 
