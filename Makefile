@@ -14,6 +14,7 @@ RUN := .venv/bin/python
 STAMP := .venv/installed
 PIP := -m pip --disable-pip-version-check --quiet
 CANDIDATES := $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python3.14)
+NEEDS := 3.11 to 3.14
 FITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 
 define FIND_PYTHON
@@ -22,7 +23,7 @@ for candidate in $(CANDIDATES); do \
 	if "$$candidate" -c "$(FITS)" >/dev/null 2>&1; then python="$$candidate"; break; fi; \
 done; \
 if [ -z "$$python" ]; then \
-	echo "twoloop needs Python 3.11 to 3.14 with the module venv; tried: $(CANDIDATES)." >&2; \
+	echo "twoloop needs Python $(NEEDS) with the module venv; tried: $(CANDIDATES)." >&2; \
 	echo "Install one, or name it: make PYTHON=/path/to/python3.11 ..." >&2; \
 	exit 1; \
 fi
@@ -62,6 +63,7 @@ test-oldest: .venv-oldest/installed ## the tests of twoloop with the oldest vers
 		--ignore tests/references --ignore tests/studies --ignore tests/test_turning_crank.py $(ARGS)
 
 .venv-oldest/installed: FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))
+.venv-oldest/installed: NEEDS := 3.11
 .venv-oldest/installed: requirements-oldest.txt
 	@$(FIND_PYTHON); "$$python" -m venv --clear .venv-oldest
 	@.venv-oldest/bin/python $(PIP) install -r requirements-oldest.txt

@@ -76,8 +76,8 @@ def solve_fully_implicit(
     check_choice("method", method, METHODS)
     check_tolerances(rtol, atol)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
-    solver_type = _solver_type(method)
     check_start(system, t0, q0, v0)
+    solver_type = _solver_type(method)
 
     y0, yp0 = start_of(system, "stabilised", t0, q0, v0)
     run = _Run(system, times, time_limit)
