@@ -1,7 +1,7 @@
 """The beam on its moving base without constraints: the base's two coordinates put in, the others by SciPy.
 
 It shares the force and the mass of the beam with `twoloop`, and nothing else: no constraints, no multipliers, no
-partition, and integrators of other people.
+partition, and other integrators.
 """
 
 import math
@@ -48,7 +48,7 @@ def reduced_motion(
     TypeError, ValueError
         If an argument is wrong.
     RuntimeError
-        If SciPy's solver fails, cannot start, or is past the time limit: a reference is whole or none.
+        If SciPy's solver fails, cannot start, or is past the time limit: an incomplete reference is of no use.
     """
     check_problem(problem, "angular_frequency", "a beam of ancf_beam, on a moving base")
     check_positive("tol", tol)

@@ -221,7 +221,7 @@ class _Run:
             return str(error)
         if solver.status == "failed":
             return str(message)
-        # LSODA would go on in both cases, for ever in the second
+        # LSODA would go on in both cases, without end in the second
         if not np.isfinite(solver.y).all():
             return f"the state at t = {solver.t:.10g} is not finite"
         if solver.status == "running" and solver.t - self.ends[-1] < SMALLEST_STEP * np.spacing(abs(solver.t)):
