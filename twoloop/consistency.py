@@ -1,5 +1,7 @@
 """Consistent states: the check of a start, the projection of a guess, and what is wrong with a system at a point."""
 
+from __future__ import annotations  # ArrayLike stays a word in help()
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr

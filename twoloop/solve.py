@@ -1,5 +1,7 @@
 """solve_dae: checks the input, chooses the method and runs it."""
 
+from __future__ import annotations  # ArrayLike stays a word in help()
+
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

@@ -1,5 +1,7 @@
 """The problem: M(t, q) q'' + C_q^T lam = Q(t, q, v) with C(t, q) = 0, as compiled callbacks, sizes and parameters."""
 
+from __future__ import annotations  # ArrayLike stays a word in help()
+
 from collections.abc import Callable
 from typing import Any
 
@@ -181,7 +183,7 @@ class ConstrainedSystem:
         compile: bool = False,
         bandwidth: int | None = None,
         name: str = "system",
-    ) -> "ConstrainedSystem":
+    ) -> ConstrainedSystem:
         """Make a system of plain functions that take arrays and return arrays.
 
         Parameters
