@@ -24,6 +24,7 @@ class Status(IntEnum):
     INTERRUPTED = -7
     STAGNATED = -8
     WRONG_DERIVATIVE = -9
+    TIME_LIMIT = -10
 
 
 MEANINGS: dict[Status, str] = {
@@ -34,10 +35,11 @@ MEANINGS: dict[Status, str] = {
     Status.NOT_CONVERGED: "a step of fixed size did not converge, or gamma by differences misses the tolerance",
     Status.NOT_FINITE: "a callback returned a value that is not finite, or the state overflowed",
     Status.RANK_LOST: "the constraint Jacobian lost rank: no choice of independent coordinates exists",
-    Status.SOLVER_FAILED: "a solver of another project failed, or reached its time limit",
+    Status.SOLVER_FAILED: "a solver of another project failed, or reached the time limit of its adapter",
     Status.INTERRUPTED: "the run was interrupted from the keyboard",
     Status.STAGNATED: "the steps became so short that the end is out of reach",
     Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong at a state of the run",
+    Status.TIME_LIMIT: "the run reached its time_limit",
 }
 
 

@@ -27,6 +27,7 @@ GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked f
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
 STAGNATION_PACE = 1e-3  # ... against the best pace of the run before, and ...
 STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
+NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
 
@@ -140,8 +141,11 @@ class Run:
             scales.append(v / a)
         return FIRST_STEP * min(scales)
 
-    def go(self, t1: float, times: Array | None, report: Any, check_derivatives: bool) -> Result:
+    def go(
+        self, t1: float, times: Array | None, report: Any, time_limit: float | None, check_derivatives: bool
+    ) -> Result:
         """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
+        deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         a, system = self.a, self.system
         every_step = times is None
         outputs = np.array([t1]) if times is None else np.append(times[times > self.t0], t1)
@@ -188,8 +192,11 @@ class Run:
             step_parts.append(out_steps[: filled[1]].copy())
             if spent < CHUNK_TIME:
                 self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], BUFFER_STEPS)
-            if code == a.PAUSED and self.control[a.MAX_STEPS] == np.inf and pace.stagnates(self.clock[a.T], filled[1], t1):
+            limited = self.control[a.MAX_STEPS] < np.inf
+            if code == a.PAUSED and pace.stagnates(self.clock[a.T], int(filled[1]), t1) and not limited:
                 code = STAGNATED
+            if code == a.PAUSED and time.monotonic() > deadline:
+                code = OUT_OF_TIME
             report(self.clock[a.T])
         t = np.concatenate(t_parts)
         table = np.concatenate(rows)
@@ -199,7 +206,7 @@ class Run:
         steps = np.concatenate(step_parts)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS :], axis=0).astype(np.int64).T
         status, message = self._outcome(code, t1, pace)
-        if check_derivatives and status is not Status.INTERRUPTED:
+        if check_derivatives and code != INTERRUPTED:
             status, message = self._check_again(t, table, status, message)
         return Result(
             t=t,
@@ -249,6 +256,11 @@ class Run:
                 f"{stopped} after max_steps = {int(self.control[a.MAX_STEPS])} accepted steps. Raise max_steps, loosen "
                 "rtol and atol, or shorten t_span.",
             )
+        if code == OUT_OF_TIME:
+            return (
+                Status.TIME_LIMIT,
+                f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
+            )
         if code == STAGNATED:
             return (
                 Status.STAGNATED,
@@ -287,8 +299,20 @@ class Run:
         return (
             Status.STEP_TOO_SMALL,
             f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-            "Look for a discontinuity or a singular position near this time, loosen rtol and atol, or use coordinates "
+            f"{self._near_singular()}Look for a discontinuity near this time, loosen rtol and atol, or use coordinates "
             "of similar scale.",
+        )
+
+    def _near_singular(self) -> str:
+        """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
+        jacobian = self.system.jacobian(float(self.clock[self.a.T]), self.state[: self.system.n_q])
+        values = np.linalg.svd(jacobian, compute_uv=False)
+        if values[-1] > NEARLY_SINGULAR * values[0]:
+            return ""
+        return (
+            f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
+            f"{values[-1] / values[0]:.1g} of the largest. Positions where it does are not handled yet: end t_span "
+            "before, or change the geometry. "
         )
 
     def _check_again(self, t: Array, table: Array, status: Status, message: str) -> tuple[Status, str]:
@@ -322,7 +346,7 @@ class Run:
         )
 
 
-INTERRUPTED, STAGNATED = -1, -2  # beside what advance() returns
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
 
 
 class _Pace:

@@ -39,6 +39,7 @@ def solve_dae(
     dense_output: bool = False,
     events: Any = None,
     progress: bool | None = None,
+    time_limit: float | None = None,
     check_derivatives: bool = True,
 ) -> Result:
     """Integrate a constrained mechanical system by a two-loop procedure.
@@ -80,6 +81,9 @@ def solve_dae(
         Not available yet.
     progress : bool, optional
         True: show a bar (needs the package rich).
+    time_limit : float, optional
+        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is looked at every few dozen steps
+        at the least, and about every 0.1 s.
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences, at the first start of a system and at a few
         states of every run, outside the time that `stats.cpu_time` counts.
@@ -125,6 +129,8 @@ def solve_dae(
             raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
     if max_steps is not None:
         check_size("max_steps", max_steps, 1)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     check_start(system, t0, q0, v0, check_derivatives)
 
@@ -135,7 +141,7 @@ def solve_dae(
     if max_steps is not None:
         run.control[run.a.MAX_STEPS] = max_steps
     with _progress_bar(progress, method.name, t0, t1) as report:
-        return run.go(t1, times, report, check_derivatives)
+        return run.go(t1, times, report, time_limit, check_derivatives)
 
 
 def _check_method(method: str | Method) -> Method:

@@ -20,8 +20,9 @@ from twoloop.kernels.linalg import copy
 
 LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference
 LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
-TRIGGER = 0.01  # of the required accuracy: a larger estimated error has another length chosen
-LENGTHEN = 1e-9  # relative disagreement below which a longer length loses nothing and has less rounding
+CERTAIN = 1e-9  # relative disagreement below which nothing but rounding is left
+LENGTHEN = 1e-11  # relative disagreement below which a longer length loses nothing and has less rounding
+ENOUGH = 0.01  # of the required accuracy: a change by less ends the search for a length
 
 
 @exact
@@ -77,6 +78,12 @@ def _differences(f, w, t, q, v, e):
     return largest, disagreement
 
 
+@inlined
+def _limit(notes):
+    """Largest disagreement that needs no other length: the result is better by far, were it not for rounding."""
+    return max(notes[GAMMA_REQUIRED], CERTAIN) * notes[GAMMA_SCALE]
+
+
 @compiled
 def _choose_length(f, w, t, q, v, longest):
     """Difference over ever shorter lengths until the result no longer changes, else keep the one that changed it least.
@@ -90,20 +97,20 @@ def _choose_length(f, w, t, q, v, longest):
         if e <= 0.0:
             break
         copy(w.Qd, w.Qd_tried[1])
-        largest, _ = _differences(f, w, t, q, v, e)
+        largest, disagreement = _differences(f, w, t, q, v, e)
         if np.isnan(largest):
             return DONE
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
         change = 0.0
         for i in range(w.Qd.size):
             change = max(change, abs(w.Qd[i] - w.Qd_tried[1, i]))
-        if level > 0 and change < best:
+        if level > 0 and change < best and disagreement <= _limit(w.notes):
             best = change
             w.notes[GAMMA_SHARE] = share
-            if change <= TRIGGER * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
+            if change <= ENOUGH * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
                 break
         share *= 0.25
-    w.notes[GAMMA_ACCURACY] = best / w.notes[GAMMA_SCALE] if w.notes[GAMMA_SCALE] > 0.0 else 0.0
+    w.notes[GAMMA_ACCURACY] = best / w.notes[GAMMA_SCALE]
     _differences(f, w, t, q, v, representable(t, w.notes[GAMMA_SHARE] * longest))
     return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
 
@@ -113,19 +120,17 @@ def gamma_by_differences(f, w, t, q, v):
     """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, into w.Qd, or GAMMA_INACCURATE where no length will do.
 
     Errors are judged relative to the largest entry that Q_d has had in this run. The length is a share of
-    longest_difference, found by trial where the estimate asks for it: a drive of kilohertz needs a short one.
+    longest_difference, found by trial where the two differences disagree: a drive of kilohertz needs a short one.
     """
     longest = longest_difference(q, v)
     e = representable(t, w.notes[GAMMA_SHARE] * longest)
     if e > 0.0:
         largest, disagreement = _differences(f, w, t, q, v, e)
-        scale = w.notes[GAMMA_SCALE]
-        if np.isnan(largest) or disagreement == 0.0 or scale == 0.0:
+        if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
             return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
-        w.notes[GAMMA_SCALE] = max(scale, largest)
-        if disagreement < LENGTHEN * scale:
+        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
+        if disagreement < LENGTHEN * w.notes[GAMMA_SCALE]:
             w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
-        # of sin(x), say, the error is x^4 / 30 where the disagreement is x^2 / 2
-        if disagreement * disagreement <= 7.0 * TRIGGER * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE] ** 2:
+        if disagreement <= _limit(w.notes):
             return DONE
     return _choose_length(f, w, t, q, v, longest)

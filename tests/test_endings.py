@@ -1,0 +1,220 @@
+"""How runs end that do not reach their end: interrupted, at a standstill, out of time, or by a value that is not finite."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from tests.problems import pendulum, pendulum_state, worst
+from twoloop import ConstrainedSystem, Newmark, Status, solve_dae
+from twoloop.mechanisms import four_bar
+from twoloop.result import MEANINGS
+
+START = ([-1.0, 0.0], [0.0, 0.0])
+
+
+def test_every_status_has_a_meaning():
+    assert set(MEANINGS) == set(Status)
+
+
+# --- Ctrl-C
+
+
+def test_ctrl_c_in_a_python_callback_returns_what_there_is():
+    calls = [0]
+
+    def force(t, q, v):
+        calls[0] += 1
+        if calls[0] == 2000:
+            raise KeyboardInterrupt
+        return np.array([0.0, -9.81])
+
+    result = solve_dae(pendulum(force=force), (0.0, 1e6), *START)
+    assert result.status is Status.INTERRUPTED and not result.success
+    assert "Interrupted" in result.message and f"t = {result.t[-1]:.10g}" in result.message
+    assert result.t.size == result.stats.n_accepted + 1 > 5
+    assert worst(result.q, pendulum_state(result.t)[0]) < 1e-6
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals to oneself")
+def test_ctrl_c_in_compiled_code_returns_what_there_is():
+    program = """
+        import os, signal, threading
+        from twoloop import Status, solve_dae
+        from twoloop.mechanisms import four_bar
+
+        problem = four_bar()
+        arguments = problem.system, (0.0, 1e9), problem.q0, problem.v0
+        solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+        threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        result = solve_dae(*arguments, t_eval=[1e9])
+        assert result.status is Status.INTERRUPTED, result.message
+        assert result.stats.n_accepted > 100
+        print("interrupted", flush=True)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=300, env=os.environ
+    )
+    assert done.stdout.strip() == "interrupted", done.stderr
+
+
+def test_other_threads_run_beside_the_compiled_integrator():
+    problem = four_bar()
+    solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+    ended = threading.Event()
+    runs = []
+
+    def integrate():
+        runs.append(solve_dae(problem.system, (0.0, 300.0), problem.q0, problem.v0, "Gauss12", t_eval=[300.0]))
+        ended.set()
+
+    counted = 0
+    thread = threading.Thread(target=integrate)
+    thread.start()
+    while not ended.is_set():
+        counted += 1
+        time.sleep(0.0)
+    thread.join()
+    # with the lock held, this thread would run between chunks only, a few dozen times
+    assert runs[0].success and counted > 1000
+
+
+# --- time limit
+
+
+def test_a_time_limit_keeps_what_there_is():
+    result = solve_dae(pendulum(), (0.0, 1e9), *START, time_limit=0.2)
+    assert result.status is Status.TIME_LIMIT and "time_limit" in result.message
+    assert result.t.size == result.stats.n_accepted + 1 > 5
+    assert solve_dae(pendulum(), (0.0, 0.1), *START, time_limit=60.0).success
+
+
+@pytest.mark.parametrize(("value", "error"), [(0.0, ValueError), (-1.0, ValueError), ("1", TypeError)])
+def test_time_limits_that_make_no_sense(value, error):
+    with pytest.raises(error, match="time_limit must be"):
+        solve_dae(pendulum(), (0.0, 1.0), *START, time_limit=value)
+
+
+# --- standstill
+
+
+def stiffening_pendulum(stiffness):
+    """A pendulum whose rod is met by a stiff spring after 0.5 s: an explicit method then needs tiny steps."""
+
+    def force(t, q, v):
+        push = stiffness * max(t - 0.5, 0.0) * np.array([q[1], -q[0]]) * q[0]
+        return np.array([0.0, -9.81]) + push
+
+    return pendulum(force=force, constant_mass=True, compile=True)
+
+
+def test_a_standstill_is_a_status():
+    result = solve_dae(stiffening_pendulum(1e16), (0.0, 100.0), *START, "DOP853", 1e-6, 1e-6)
+    assert result.status is Status.STAGNATED
+    assert 0.5 < result.t[-1] < 1.0
+    assert "steps were" in result.message and "max_steps" in result.message
+    assert result.stats.n_accepted < 100_000
+
+
+def test_max_steps_says_how_far_a_standstill_may_go():
+    n = 60_000
+    result = solve_dae(stiffening_pendulum(1e16), (0.0, 100.0), *START, "DOP853", 1e-6, 1e-6, max_steps=n)
+    assert result.status is Status.MAX_STEPS and result.stats.n_accepted == n
+
+
+def test_short_steps_for_a_while_are_no_standstill():
+    # 50 thousand steps of even length, and a phase of much shorter ones that the rest of the run can afford
+    even = solve_dae(pendulum(compile=True), (0.0, 50.0), *START, "DOP853", max_step=1e-3)
+    assert even.success and even.stats.n_accepted >= 50_000
+    kicked = solve_dae(stiffening_pendulum(1e9), (0.0, 0.52), *START, "DOP853", 1e-4, 1e-4)
+    assert kicked.success, kicked.message
+
+
+def test_a_parallelogram_is_left_or_ends_with_a_status_soon():
+    problem = four_bar((1.5423, 1.7303, 1.5423), 1.7303, 0.39914, 1)
+    for method in ("DOP853", "SunRadau5", "Gauss12", "BDF"):
+        result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, 1e-10, 1e-10)
+        assert result.stats.n_accepted < 30_000
+        if not result.success:
+            assert "close to losing rank" in result.message and "singular" in result.message
+
+
+# --- Newmark's tolerance
+
+
+@pytest.mark.parametrize("linkage", [{}, {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}])
+def test_the_error_of_newmark_is_proportional_to_its_tolerance(linkage):
+    problem = four_bar(**linkage)
+    reference = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11)
+    errors = []
+    for tolerance in (1e-4, 1e-5, 1e-6):
+        run = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Newmark", tolerance, tolerance)
+        errors.append(worst(run.q[:, -1], reference.q[:, -1]))
+    slopes = np.diff(np.log10(errors)) / -1.0
+    assert (np.abs(slopes - 1.0) < 0.3).all(), errors
+    assert errors[-1] < 300.0 * 1e-6
+
+
+def test_the_preset_of_the_paper_keeps_its_own_test():
+    problem = four_bar()
+    method = Newmark(beta=0.5, error_tol=1e-5)
+    few, many = (
+        solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tolerance, tolerance)
+        for tolerance in (1e-3, 1e-9)
+    )
+    assert few.stats.n_accepted == many.stats.n_accepted
+
+
+# --- values that are not finite
+
+
+def after(limit, good, bad):
+    return lambda t, *arguments: good(t, *arguments) * (1.0 if t < limit else bad)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "gamma"])
+@pytest.mark.parametrize("method", ["Gauss12", "Newmark", "BDF", "DOP853", "RadauIIA5"])
+def test_the_callback_is_named_with_the_time_of_the_evaluation(kind, method, bad):
+    good = {
+        "mass": lambda t, q: np.eye(2),
+        "force": lambda t, q, v: np.array([0.1, -9.81]),
+        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0) + 1e-30]),
+        "jacobian": lambda t, q: q[None, :] + 1e-30,
+        "gamma": lambda t, q, v: np.array([-(v @ v) - 1e-30]),
+    }
+    result = solve_dae(pendulum(**{kind: after(0.3, good[kind], bad)}), (0.0, 1.0), *START, method, 1e-5, 1e-5)
+    assert result.status is Status.NOT_FINITE, result.message
+    assert f"{kind} of 'pendulum' returned a value that is not finite at t = 0.3" in result.message
+    assert np.isfinite(result.q).all() and result.t[-1] <= 0.3
+
+
+def test_a_value_that_depends_on_the_position_is_named_too():
+    # at the start of the last step it is finite: only the evaluation itself knows
+    def force(t, q, v):
+        return np.array([0.0, -9.81 if q[1] > -0.5 else np.nan])
+
+    result = solve_dae(pendulum(force=force), (0.0, 2.0), *START)
+    assert result.status is Status.NOT_FINITE
+    assert "force of 'pendulum' returned a value that is not finite at t = 0." in result.message
+
+
+def test_a_message_names_no_cause_that_was_not_seen():
+    # the force overflows nothing by itself: it throws the state away until that does
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, 1e300 * max(t - 0.1, 0.0) * (1.0 + q[1] ** 2)]),
+        constraint=lambda t, q: np.array([q[0]]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0]]),
+    )
+    result = solve_dae(system, (0.0, 1.0), [0.0, 0.0], [0.0, 0.0], "DOP853", 1e-3, 1e-3, max_steps=10_000)
+    assert not result.success
+    assert "jacobian of" not in result.message and "constraint of" not in result.message

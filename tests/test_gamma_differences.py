@@ -1,0 +1,96 @@
+"""Gamma by differences: as accurate as the tolerance asks at any speed of the drive, or a status."""
+
+import numpy as np
+import pytest
+
+from tests.problems import worst
+from twoloop import ConstrainedSystem, Status, consistent_state, solve_dae
+
+AMPLITUDE = 1e-3  # m
+
+
+def shaken_pendulum(speed, gamma=True, noise=0.0):
+    """A pendulum of 1 m whose pivot is shaken horizontally with the angular frequency `speed`."""
+
+    def arm(t, q):
+        return np.array([q[0] - AMPLITUDE * np.sin(speed * t), q[1]])
+
+    def right_hand_side(t, q, v):
+        d = arm(t, q)
+        u = np.array([v[0] - AMPLITUDE * speed * np.cos(speed * t), v[1]])
+        return np.array([-(u @ u) - d[0] * AMPLITUDE * speed**2 * np.sin(speed * t)])
+
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * (arm(t, q) @ arm(t, q) - 1.0)]),
+        jacobian=lambda t, q: arm(t, q)[None, :] + noise * np.sin(1e13 * (q[0] + t)),
+        constraint_rate=lambda t, q: np.array([-arm(t, q)[0] * AMPLITUDE * speed * np.cos(speed * t)]),
+        gamma=right_hand_side if gamma else None,
+        name="shaken pendulum",
+    )
+
+
+def start(system, speed):
+    return consistent_state(system, 0.0, [-1.0, 0.0], [AMPLITUDE * speed, 0.0])
+
+
+@pytest.mark.parametrize("method", ["Gauss12", "DOP853", "BDF"])
+@pytest.mark.parametrize("speed", [1.0, 10.0, 1e3, 4e3, 2.0 * np.pi * 16e3])
+def test_a_fast_drive(speed, method):
+    exact, differenced = shaken_pendulum(speed), shaken_pendulum(speed, gamma=False)
+    span = (0.0, 30.0 / speed)
+    q0, v0 = start(exact, speed)
+    given = solve_dae(exact, span, q0, v0, method, 1e-8, 1e-8)
+    run = solve_dae(differenced, span, q0, v0, method, 1e-8, 1e-8, t_eval=[span[1]])
+    assert given.success and run.success, run.message
+    # equal at the tolerance, relative to the largest value over the run
+    assert worst(run.a[:, -1], given.a[:, -1]) < 1e-7 * np.abs(given.a).max()
+    assert worst(run.lam[:, -1], given.lam[:, -1]) < 1e-7 * np.abs(given.lam).max()
+    assert run.stats.n_accepted < 1.3 * given.stats.n_accepted + 5
+
+
+def test_differences_are_not_lengthened_over_the_drive():
+    # a drive that becomes fast long after the start
+    def angle(t):
+        return 50.0 * t**4
+
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -1.0]),
+        constraint=lambda t, q: np.array([q[0] - 0.01 * np.sin(angle(t))]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0]]),
+        constraint_rate=lambda t, q: np.array([-0.01 * np.cos(angle(t)) * 200.0 * t**3]),
+    )
+    times = np.linspace(0.1, 2.0, 20)
+    run = solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "DOP853", t_eval=times)
+    true = 0.01 * (np.cos(angle(times)) * 600.0 * times**2 - np.sin(angle(times)) * (200.0 * times**3) ** 2)
+    assert run.success, run.message
+    assert worst(run.a[0], true) < 1e-7 * np.abs(true).max()
+
+
+def test_what_cannot_reach_the_tolerance_is_a_status():
+    system = shaken_pendulum(10.0, gamma=False, noise=1e-9)
+    q0, v0 = start(system, 10.0)
+    run = solve_dae(system, (0.0, 1.0), q0, v0, check_derivatives=False)
+    assert run.status is Status.NOT_CONVERGED
+    assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message
+    assert run.t[0] == 0.0
+
+
+def test_rest_and_a_turning_point_need_no_shorter_differences():
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+        jacobian=lambda t, q: q[None, :],
+    )
+    at_rest = solve_dae(system, (0.0, 1.0), [0.0, -1.0], [0.0, 0.0])
+    assert at_rest.success and worst(at_rest.q[:, -1], [0.0, -1.0]) < 1e-12
+    assert solve_dae(system, (0.0, 5.0), [1.0, 0.0], [0.0, 0.0], rtol=1e-10, atol=1e-10).success
