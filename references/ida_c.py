@@ -20,7 +20,6 @@ from references.accelerations import accelerations
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials import LONG, POINTER, REAL, library
-from twoloop.callbacks import python_force
 from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -96,7 +95,7 @@ def solve_ida_c(
     """
     if not isinstance(system, ConstrainedSystem):
         raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
-    if system.functions.force is python_force:
+    if system.called_in_python:
         raise ValueError(
             f"system must have compiled callbacks, as Python cannot run inside; those of {system.name!r} are Python "
             "functions. Make it with from_python(..., compile=True) or of functions made by @callback, or take "

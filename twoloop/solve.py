@@ -184,7 +184,7 @@ class _Run:
         self._begin()
 
     def _begin(self) -> None:
-        code = self.a.start(*self.functions, self.work, self.t0, self.state)
+        code = self.a.start(self.functions, self.work, self.t0, self.state)
         if code == common.DONE:
             return
         n = self.system.n_q
@@ -233,7 +233,7 @@ class _Run:
         while code == a.BUFFER_FULL:
             began = time.process_time()
             code = a.advance(
-                *self.functions,
+                self.functions,
                 self.work,
                 self.plan.step,
                 self.plan.options,
