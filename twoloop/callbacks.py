@@ -222,6 +222,7 @@ _LEADING = re.compile(
 
 def _telling_line(error: Exception) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    plain = re.sub(r":\s*>>> ", ": ", plain)  # a signature that was not found
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
     telling = [line for line in lines if line and not _LEADING.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"

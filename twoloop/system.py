@@ -298,7 +298,10 @@ def _method(kind: str) -> Callable[..., Array]:
 
     def method(self: ConstrainedSystem, *arguments: Any, **named: Any) -> Array:
         if named or len(arguments) != len(parameters):
-            arguments = signature.bind(*arguments, **named).args  # says which is missing
+            try:
+                arguments = signature.bind(*arguments, **named).args
+            except TypeError as error:
+                raise TypeError(f"{kind}{signature}: {error}") from None
         return self.evaluate(kind, *arguments)
 
     own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
