@@ -14,6 +14,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
+from twoloop.bounds import check_bounds
 from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.kernels.linalg import ldl_factor, ldl_solve
 from twoloop.system import ConstrainedSystem
@@ -46,6 +47,7 @@ def accelerations(system: ConstrainedSystem, t: ArrayLike, q: ArrayLike, v: Arra
     """
     t = np.array(t, dtype=np.float64)
     states = np.concatenate([np.array(q, dtype=np.float64), np.array(v, dtype=np.float64)])
+    check_bounds(system, float(t[0]), *np.split(states[:, 0], 2))
     return Equations(system, float(t[0]), states[: system.n_q, 0]).at_points(t, states)
 
 

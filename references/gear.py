@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
 from references.index1 import solve_index1
-from twoloop.caches import compile_kept, stamp_of
+from twoloop.caches import compile_kept, watch
 from twoloop.checks import check_positive, check_size, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.kernels.common import FUNCTIONS, INTEGERS, MATRIX
@@ -327,7 +327,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
 
 def _compile_now(function: Callable[..., Any]) -> Any:
     """Compile for `_INTEGRATE` and keep the machine code on disk until it or something that it calls changes."""
-    return compile_kept(function, _INTEGRATE, stamp_of(function), error_model="numpy")
+    return compile_kept(function, _INTEGRATE, watch(function), error_model="numpy")
 
 
 @_compile_now

@@ -13,7 +13,7 @@ from numba import njit, objmode
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from twoloop.caches import key_of, stamp_of
+from twoloop.caches import watch
 from twoloop.callbacks import KINDS, compile_callback
 
 Array = NDArray[np.float64]
@@ -96,7 +96,7 @@ def through_python(kind: str) -> Dispatcher:
             with objmode():
                 _call(number, (t, q.copy(), x.copy()), p, out)
 
-    return compile_callback(kind, through, "through Python", key=str(place))
+    return compile_callback(kind, through, ("through Python", str(place)))
 
 
 def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
@@ -128,11 +128,11 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
                 raise ValueError(message)
             out[:] = value
 
-    stamp, key = stamp_of(in_place), key_of(in_place)
+    watched = watch(in_place)
     code = user.py_func.__code__
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
     in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
-    return compile_callback(kind, in_place, stamp if key else None, key=key or "", named=user.py_func)
+    return compile_callback(kind, in_place, watched, named=user.py_func)
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,9 +35,8 @@ LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 def compile_kept(
     function: Callable[..., Any],
     signature: Any,
-    stamp: Any,
+    watched: tuple[str, str] | None,
     *,
-    key: str = "",
     announcement: str = "",
     **options: Any,
 ) -> Dispatcher:
@@ -49,19 +48,18 @@ def compile_kept(
         What numba compiles.
     signature : numba signature
         The only one that it will have.
-    stamp : Any
-        What the machine code depends on beside the file of the function and `key`. None: it is not kept.
-    key : str
-        Tells functions apart that share their source and differ by what they enclose.
+    watched : (str, str) or None
+        What the machine code depends on beside the file of the function, see `watch`: when the first changes, all is
+        made anew; the second tells functions apart that share their source. None: the machine code is not kept.
     announcement : str
         Said on stderr, once a process, before it compiles.
     **options
         Of numba.njit.
     """
     dispatcher = njit(**options)(function)
-    if stamp is not None:
+    if watched is not None:
         try:
-            dispatcher._cache = _Cache(function, stamp, key, announcement)
+            dispatcher._cache = _Cache(function, *watched, announcement)
         except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 say_once(UNWRITABLE)
@@ -73,7 +71,7 @@ def compile_kept(
 class _Cache(FunctionCache):
     """Numba's cache of one function, with our stamp; what goes wrong in it costs time and raises nothing."""
 
-    def __init__(self, function: Callable[..., Any], stamp: Any, key: str, announcement: str):
+    def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         super().__init__(function)
         source = self._cache_file._source_stamp
         self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, (source, stamp))
@@ -135,27 +133,19 @@ def say_once(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def stamp_of(function: Callable[..., Any]) -> str | None:
-    """A digest of all that the machine code of a function depends on, but for what it encloses (see `key_of`).
+def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
+    """Digests of all that the machine code of a function depends on, and of what it encloses.
 
-    That is its code, its defaults, and the values of the globals and of the attributes of modules that it names; of
-    compiled helpers among them the same, and so on. None: something among it cannot be watched.
+    The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
+    names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
     """
-    return _digest(lambda digest: digest.add_function(function, enclosed=False))
-
-
-def key_of(function: Callable[..., Any]) -> str | None:
-    """A digest of what a function encloses; None: something among it cannot be watched."""
-    return _digest(lambda digest: digest.add(_enclosed(function)))
-
-
-def _digest(fill: Callable[["_Digest"], None]) -> str | None:
-    digest = _Digest()
+    code, enclosed = _Digest(), _Digest()
     try:
-        fill(digest)
+        code.add_function(function, enclosed=False)
+        enclosed.add(_enclosed(function))
     except _CannotBeWatched:
         return None
-    return digest.hash.hexdigest()
+    return code.hash.hexdigest(), enclosed.hash.hexdigest()
 
 
 def _enclosed(function: Any) -> list[Any]:

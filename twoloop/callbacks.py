@@ -16,7 +16,7 @@ import numba
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 
-from twoloop.caches import compile_kept, stamp_of
+from twoloop.caches import compile_kept, watch
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
@@ -42,10 +42,10 @@ class Kind:
         What it fills the array with, in a few words, for messages.
     note : str
         What else there is to know, for the documentation.
-    optional : bool
-        Whether it may be left out. In its place stands a callback that leaves zeros.
-    zero : bool
-        Whether these zeros are meant; False: they stand for values that are found by differences.
+    absent : str
+        What is in its place where it is left out. "": it must be given; "zeros": a callback that leaves zeros;
+        "differences": one that differences C, see `jacobian.py`; "kernels": nothing that could be called, as the
+        kernels take differences of their own.
     """
 
     state: tuple[str, ...]
@@ -53,8 +53,12 @@ class Kind:
     shape: tuple[str, ...]
     meaning: str
     note: str = ""
-    optional: bool = False
-    zero: bool = True
+    absent: str = ""
+
+    @property
+    def optional(self) -> bool:
+        """Whether it may be left out."""
+        return self.absent != ""
 
     @property
     def arguments(self) -> tuple[str, ...]:
@@ -77,14 +81,24 @@ KINDS = {
     "mass": Kind(("q",), "M", ("n_q", "n_q"), "the mass matrix M", "Symmetric and positive definite."),
     "force": Kind(("q", "v"), "Q", ("n_q",), "the force Q"),
     "constraint": Kind(("q",), "C", ("n_c",), "the constraints C"),
-    "jacobian": Kind(("q",), "Cq", ("n_c", "n_q"), "C_q, the derivative of constraint with respect to q"),
+    "jacobian": Kind(
+        ("q",),
+        "Cq",
+        ("n_c", "n_q"),
+        "C_q, the derivative of constraint with respect to q",
+        "None: by differences of C, of order 8. That costs 8 n_q calls of constraint for each Jacobian (more where the "
+        "constraint bends on a scale far below max(1, |q_j|)), and constraint must be defined within 1/16 of "
+        "max(1, |q_j|) about q. Entries are good to about 1e-13 of the largest term in the constraint; differences of "
+        "differences, that is, gamma left out too, to about 1e-9.",
+        absent="differences",
+    ),
     "constraint_rate": Kind(
         ("q",),
         "Ct",
         ("n_c",),
         "C_t, the derivative of constraint with respect to t",
         "None: the constraints do not depend on time.",
-        optional=True,
+        absent="zeros",
     ),
     "gamma": Kind(
         ("q", "v"),
@@ -92,8 +106,7 @@ KINDS = {
         ("n_c",),
         "Q_d = -((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = Q_d",
         "None: by differences of C_q and C_t along the motion.",
-        optional=True,
-        zero=False,
+        absent="kernels",
     ),
     "force_by_q": Kind(
         ("q", "v"),
@@ -104,7 +117,7 @@ KINDS = {
         "differenced; it must not depend on v then unless force_by_v is given too. None: all by differences. What the "
         "stiff part does not need is left out then (how M, and the directions that constraints allow, change with q): "
         "at a tolerance steps are the same, but fixed steps in which bodies turn far may fail to converge.",
-        optional=True,
+        absent="zeros",
     ),
     "force_by_v": Kind(
         ("q", "v"),
@@ -112,7 +125,7 @@ KINDS = {
         ("n_q", "n_q"),
         "dQ/dv, the derivative of force with respect to v",
         "None beside force_by_q: the force does not depend on v.",
-        optional=True,
+        absent="zeros",
     ),
     "reaction_by_q": Kind(
         ("q", "lam"),
@@ -120,7 +133,7 @@ KINDS = {
         ("n_q", "n_q"),
         "d(C_q^T lam)/dq with lam held, the derivative of the reactions with respect to q",
         "None: by differences of C_q, none where C_q does not change.",
-        optional=True,
+        absent="zeros",
     ),
 }
 OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
@@ -164,7 +177,7 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
                 f"{function.__name__} is declared as the callback {kind!r}, whose arguments are "
                 f"({', '.join(wanted)}); it has ({', '.join(given)})"
             )
-        return compile_callback(kind, function, stamp_of(function))
+        return compile_callback(kind, function, watch(function))
 
     return decorate
 
@@ -175,13 +188,15 @@ if callback.__doc__:  # not so with python -OO
     )
 
 
-def compile_callback(kind: str, function: Callable[..., Any], stamp: Any, key: str = "", named: Any = None) -> Dispatcher:
+def compile_callback(
+    kind: str, function: Callable[..., Any], watched: tuple[str, str] | None, named: Callable[..., Any] | None = None
+) -> Dispatcher:
     """Compile a function that works in place for the signature of its kind, or say in two lines why it cannot be.
 
-    `stamp` and `key` are those of `compile_kept`; `named` is the function to name in the message, if it is another.
+    `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
     """
     try:
-        return compile_kept(function, KINDS[kind].signature, stamp, key=key, error_model="numpy")
+        return compile_kept(function, KINDS[kind].signature, watched, error_model="numpy")
     except (NumbaError, AssertionError, AttributeError, LookupError, NotImplementedError, ValueError) as error:
         # numba lets some of its own assertions through
         raise TypeError(_why_not(kind, named or function, error)) from None
@@ -199,7 +214,7 @@ def stand_in(kind: str) -> Dispatcher:
         def leaves_zeros(t, q, x, p, out):
             pass
 
-    return compile_callback(kind, leaves_zeros, "leaves zeros")
+    return compile_callback(kind, leaves_zeros, ("leaves zeros", ""))
 
 
 def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:

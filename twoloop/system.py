@@ -22,6 +22,7 @@ from twoloop.adapters import (
 from twoloop.bounds import check_callback
 from twoloop.callbacks import KINDS, STATE, stand_in
 from twoloop.checks import check_number, check_real, check_size
+from twoloop.jacobian import differenced_jacobian
 from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
 from twoloop.pickling import packed, unpacked
 
@@ -105,7 +106,7 @@ class ConstrainedSystem:
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
-        all_callbacks = {kind: self.given.get(kind) or stand_in(kind) for kind in KINDS}
+        all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
         self.functions = Functions(**all_callbacks, p=self.parameters, flags=flags)
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
@@ -197,7 +198,7 @@ class ConstrainedSystem:
             nothing can stand for it, as for gamma: the integrator then finds it by differences.
         """
         entry = KINDS[kind]
-        if not entry.zero and kind not in self.given:
+        if entry.absent == "kernels" and kind not in self.given:
             raise ValueError(f"{self.name!r} was given no {kind}")
         t = check_number("t", t)
         if not math.isfinite(t):
@@ -283,11 +284,21 @@ def _given(callbacks: dict[str, Any]) -> dict[str, Any]:
     given = {
         kind: each
         for kind, each in given.items()
-        if not (KINDS[kind].optional and (each is None or each is stand_in(kind)))
+        if not (KINDS[kind].optional and (each is None or (KINDS[kind].absent == "zeros" and each is stand_in(kind))))
     }
     if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
         raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
     return given
+
+
+def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
+    """The callback that stands in the place of one that is not given."""
+    if KINDS[kind].absent != "differences":
+        return stand_in(kind)
+    constraint = given["constraint"]
+    # what is called in Python cannot be watched, and need not be: it is looked up at every call
+    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
+    return differenced_jacobian(constraint, watched)
 
 
 def _method(kind: str) -> Callable[..., Array]:

@@ -120,7 +120,7 @@ def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     """Compile a function of the integrator for `signature` and keep the machine code on disk."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
-        return compile_kept(function, signature, _stamp(), announcement=_ANNOUNCEMENT, **_OPTIONS)
+        return compile_kept(function, signature, (_stamp(), ""), announcement=_ANNOUNCEMENT, **_OPTIONS)
 
     return compile_now
 
