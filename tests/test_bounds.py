@@ -72,7 +72,9 @@ def test_too_few_parameters_are_reported_as_such(entry):
 
 
 def test_the_message_shows_the_line():
-    with pytest.raises(ValueError, match=r"index 0 is out of bounds.*in `.* = p\[0\]` \(.*test_callbacks.py, line \d+\)"):
+    with pytest.raises(
+        ValueError, match=r"index 0 is out of bounds.*in `.* = p\[0\]` \(.*test_callbacks.py, line \d+\)"
+    ):
         system(parameters=[]).mass(0.0, Q)
 
 
@@ -125,7 +127,9 @@ MODULE.fill = fill
     ids=["helper", "helper of a helper", "recursive", "module", "tuple"],
 )
 def test_helpers_are_watched(force):
-    with pytest.raises(ValueError, match=r"force of 'far' goes out of bounds: index 1000000\d is .*`out\[place\] = 1.0`"):
+    with pytest.raises(
+        ValueError, match=r"force of 'far' goes out of bounds: index 1000000\d is .*`out\[place\] = 1.0`"
+    ):
         system(force=callback("force")(force)).force(0.0, Q, V)
 
 

@@ -83,19 +83,17 @@ def through_python(kind: str) -> Dispatcher:
     """The callback that calls a Python function of this kind, whichever `p` leads to."""
     place = KIND_NAMES.index(kind)
 
-    if len(KINDS[kind].state) == 1:
+    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+        number = place
+        with objmode():
+            _call(number, (t, q.copy()), p, out)
 
-        def through(t, q, p, out):
-            number = place
-            with objmode():
-                _call(number, (t, q.copy()), p, out)
-    else:
+    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        number = place
+        with objmode():
+            _call(number, (t, q.copy(), x.copy()), p, out)
 
-        def through(t, q, x, p, out):
-            number = place
-            with objmode():
-                _call(number, (t, q.copy(), x.copy()), p, out)
-
+    through = with_two if len(KINDS[kind].state) == 1 else with_three
     return compile_callback(kind, through, ("through Python", str(place)))
 
 
@@ -105,29 +103,27 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
     The machine code is kept beside the source of the function, if it has one.
     """
     if isinstance(function, ConstantMatrix):
-        matrix = function.matrix
+        matrix = function.matrix  # numba knows what a function encloses, but not the attributes of an object
 
-        def function(t, q):  # numba knows what functions enclose, but not attributes of objects
+        def function(t, q):  # type: ignore[no-untyped-def]
             return matrix
 
     user = function if isinstance(function, Dispatcher) else njit(function)
     message = f"{kind} returned an array of the wrong shape"
 
-    if len(KINDS[kind].state) == 1:
+    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
 
-        def in_place(t, q, p, out):
-            value = user(t, q)
-            if value.shape != out.shape:
-                raise ValueError(message)
-            out[:] = value
-    else:
+    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, x)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
 
-        def in_place(t, q, x, p, out):
-            value = user(t, q, x)
-            if value.shape != out.shape:
-                raise ValueError(message)
-            out[:] = value
-
+    in_place: Any = with_two if len(KINDS[kind].state) == 1 else with_three
     watched = watch(in_place)
     code = user.py_func.__code__
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)

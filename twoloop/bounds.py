@@ -50,8 +50,8 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
         too_short = _index_error(function, t, state, longer, out) is None
         sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
         raise ValueError(
-            f"{kind} of {system.name!r} goes out of bounds: {error}{_place(error)}. {', '.join(sizes)}, p has {p.size}, "
-            f"{KINDS[kind].output} has shape {out.shape} (n_q = {system.n_q}, n_c = {system.n_c})"
+            f"{kind} of {system.name!r} goes out of bounds: {error}{_place(error)}. {', '.join(sizes)}, p has "
+            f"{p.size}, {KINDS[kind].output} has shape {out.shape} (n_q = {system.n_q}, n_c = {system.n_c})"
             + (". Give more `parameters`: it reads more of them than there are" if too_short else "")
         )
     system.within_bounds.add(kind)

@@ -23,8 +23,8 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.types import Type
 
 UNWRITABLE = (
-    "twoloop: machine code cannot be kept on disk, so every process compiles anew. Set NUMBA_CACHE_DIR to a folder that "
-    "can be written"
+    "twoloop: machine code cannot be kept on disk, so every process compiles anew. Set NUMBA_CACHE_DIR to a folder "
+    "that can be written"
 )
 CHECKSUM = hashlib.sha256().digest_size
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numba
 from numba.core.dispatcher import Dispatcher
-from numba.core.errors import NumbaError
 
 from twoloop.caches import compile_kept, watch
 
@@ -197,24 +196,22 @@ def compile_callback(
     """
     try:
         return compile_kept(function, KINDS[kind].signature, watched, error_model="numpy")
-    except (NumbaError, AssertionError, AttributeError, LookupError, NotImplementedError, ValueError) as error:
-        # numba lets some of its own assertions through
+    except Exception as error:  # numba lets some of its own assertions through
         raise TypeError(_why_not(kind, named or function, error)) from None
 
 
 @cache
 def stand_in(kind: str) -> Dispatcher:
     """What stands in the place of an optional callback that is not given: it leaves zeros."""
-    if len(KINDS[kind].state) == 1:
 
-        def leaves_zeros(t, q, p, out):
-            pass
-    else:
+    def leaves_zeros(t, q, p, out):
+        pass
 
-        def leaves_zeros(t, q, x, p, out):
-            pass
+    def leaves_zeros_too(t, q, x, p, out):
+        pass
 
-    return compile_callback(kind, leaves_zeros, ("leaves zeros", ""))
+    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_zeros_too
+    return compile_callback(kind, function, ("leaves zeros", ""))
 
 
 def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:

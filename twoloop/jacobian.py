@@ -1,7 +1,6 @@
 """C_q by differences of C, for systems that give none."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
@@ -32,7 +31,7 @@ def differenced_jacobian(constraint: Dispatcher, watched: tuple[str, str] | None
     good to about 1e-13 of the largest term in the constraint.
     """
 
-    def jacobian(t, q, p, Cq):
+    def jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
         n_c, n_q = Cq.shape
         moved = q.copy()
         ahead, behind = np.zeros(n_c), np.zeros(n_c)

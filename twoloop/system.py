@@ -1,9 +1,7 @@
 """The problem: M(t, q) q'' + C_q^T lam = Q(t, q, v) with C(t, q) = 0, as compiled callbacks, sizes and parameters."""
 
 import copy
-import inspect
 import math
-import textwrap
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -25,20 +23,22 @@ from twoloop.checks import check_number, check_real, check_size
 from twoloop.jacobian import differenced_jacobian
 from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
 from twoloop.pickling import packed, unpacked
+from twoloop.system_methods import add_callbacks
 
 Array = NDArray[np.float64]
 
 
+@add_callbacks
 class ConstrainedSystem:
     """A constrained mechanical system, M(t, q) a + C_q^T lam = Q(t, q, v), C(t, q) = 0 (eq. (1) of the paper).
 
-    The methods {methods} evaluate one callback each. They check the arguments.
+    Each callback can be evaluated by the method of its name, which checks the arguments: `system.force(t, q, v)`.
 
     Parameters
     ----------
     n_q, n_c : int
         Number of coordinates and of constraints, 1 <= n_c <= n_q.
-{callbacks}
+    {callbacks}
     parameters : array_like, optional
         The vector `p` that every callback gets.
     constant_mass : bool
@@ -107,7 +107,7 @@ class ConstrainedSystem:
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
         all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
-        self.functions = Functions(**all_callbacks, p=self.parameters, flags=flags)
+        self.functions: Any = Functions(**all_callbacks, p=self.parameters, flags=flags)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
@@ -133,7 +133,7 @@ class ConstrainedSystem:
         ----------
         n_q, n_c : int
             Number of coordinates and of constraints.
-{functions}
+        {callbacks}
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
@@ -299,64 +299,3 @@ def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
     # what is called in Python cannot be watched, and need not be: it is looked up at every call
     watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
     return differenced_jacobian(constraint, watched)
-
-
-def _method(kind: str) -> Callable[..., Array]:
-    """The method of a system that evaluates one kind of callback."""
-    entry = KINDS[kind]
-    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("t", *entry.state)]
-    signature = inspect.Signature(parameters)
-
-    def method(self: ConstrainedSystem, *arguments: Any, **named: Any) -> Array:
-        if named or len(arguments) != len(parameters):
-            try:
-                arguments = signature.bind(*arguments, **named).args
-            except TypeError as error:
-                raise TypeError(f"{kind}{signature}: {error}") from None
-        return self.evaluate(kind, *arguments)
-
-    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
-    method.__signature__ = signature.replace(parameters=[own, *parameters])  # type: ignore[attr-defined]
-    method.__name__, method.__qualname__ = kind, f"ConstrainedSystem.{kind}"
-    method.__doc__ = f"{entry.meaning[0].upper()}{entry.meaning[1:]}, {entry.size}.\n\nSee `evaluate`."
-    return method
-
-
-def _documentation(kind: str, plain: bool) -> str:
-    """The entry of a kind among the parameters of a docstring."""
-    entry = KINDS[kind]
-    called = f"{kind}({', '.join(('t', *entry.state))}) -> {entry.size}: " if plain else ""
-    text = f"{called}{entry.meaning}{'' if plain else ', ' + entry.size}. {entry.note}"
-    if plain and kind == "mass":
-        text += " Or an array: a constant matrix, factored once."
-    head = f"{kind} : {'callable' if plain else 'compiled callback'}{', optional' if entry.optional else ''}"
-    indent = " " * (8 if plain else 4)
-    body = textwrap.fill(text, 120, initial_indent=indent + "    ", subsequent_indent=indent + "    ")
-    return f"{indent}{head}\n{body}"
-
-
-def _complete(function: Any, plain: bool) -> inspect.Signature:
-    """The signature of a constructor with the callbacks by name."""
-    own = inspect.signature(function).parameters.values()
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    callbacks = [
-        inspect.Parameter(kind, keyword, **({"default": None} if entry.optional else {})) for kind, entry in KINDS.items()
-    ]
-    needed = [each for each in own if each.default is each.empty and each.kind != each.VAR_KEYWORD]
-    options = [each for each in own if each.default is not each.empty]
-    return inspect.Signature([*needed, *callbacks, *options])
-
-
-for _kind in KINDS:
-    setattr(ConstrainedSystem, _kind, _method(_kind))
-for _function, _plain, _place in (
-    (ConstrainedSystem, False, "{callbacks}"),
-    (ConstrainedSystem.from_python.__func__, True, "{functions}"),  # type: ignore[attr-defined]
-):
-    if _function.__doc__:  # not so with python -OO
-        _text = "\n".join(_documentation(kind, _plain) for kind in KINDS)
-        _function.__doc__ = _function.__doc__.replace(_place, _text).replace("{methods}", ", ".join(KINDS))
-ConstrainedSystem.from_python.__func__.__signature__ = _complete(  # type: ignore[attr-defined]
-    ConstrainedSystem.from_python.__func__, True  # type: ignore[attr-defined]
-)
-ConstrainedSystem.__signature__ = _complete(ConstrainedSystem, False)  # type: ignore[attr-defined]
