@@ -2,9 +2,9 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install compile table3 reports test lint lock clean
+.PHONY: help install compile table3 reports test test-oldest lint lock clean
 
-# one thread: CPU times can be compared, and nobody's BLAS changes a count
+# one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
@@ -14,6 +14,7 @@ RUN := .venv/bin/python
 STAMP := .venv/installed
 PIP := -m pip --disable-pip-version-check --quiet
 CANDIDATES := $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python3.14)
+NEEDS := 3.11 to 3.14
 FITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 
 define FIND_PYTHON
@@ -22,14 +23,14 @@ for candidate in $(CANDIDATES); do \
 	if "$$candidate" -c "$(FITS)" >/dev/null 2>&1; then python="$$candidate"; break; fi; \
 done; \
 if [ -z "$$python" ]; then \
-	echo "twoloop needs Python 3.11 to 3.14 with the module venv; tried: $(CANDIDATES)." >&2; \
+	echo "twoloop needs Python $(NEEDS) with the module venv; tried: $(CANDIDATES)." >&2; \
 	echo "Install one, or name it: make PYTHON=/path/to/python3.11 ..." >&2; \
 	exit 1; \
 fi
 endef
 
 help: ## say what there is
-	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 install: $(STAMP) ## make .venv; runs by itself when it must
 
@@ -56,6 +57,18 @@ compile: install ## compile the kernels, on two cores
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
 
+# the numba cache is its own: the versions would take turns in compiling everything anew
+test-oldest: .venv-oldest/installed ## the tests of twoloop with the oldest versions it supports; about ten minutes
+	NUMBA_CACHE_DIR=$(CURDIR)/.venv-oldest/numba .venv-oldest/bin/python -m pytest tests \
+		--ignore tests/references --ignore tests/studies --ignore tests/test_turning_crank.py $(ARGS)
+
+.venv-oldest/installed: FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))
+.venv-oldest/installed: NEEDS := 3.11
+.venv-oldest/installed: requirements-oldest.txt
+	@$(FIND_PYTHON); "$$python" -m venv --clear .venv-oldest
+	@.venv-oldest/bin/python $(PIP) install -r requirements-oldest.txt
+	@touch $@
+
 lint: install ## ruff and mypy
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
@@ -67,6 +80,6 @@ lock: ## renew requirements.lock from pyproject.toml; PYTHON=python3.11, the old
 	@{ grep '^#' requirements.lock; $(RUN) -m pip freeze --exclude twoloop; } > requirements.new
 	@mv requirements.new requirements.lock
 
-clean: ## remove caches (numba's too) and builds; .venv stays
-	find . -name .venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+clean: ## remove caches (numba's too) and builds; .venv and .venv-oldest stay
+	find . -name '.venv*' -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache build dist

@@ -14,7 +14,9 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
+from references.driver import check_system
 from twoloop.bounds import check_bounds
+from twoloop.checks import check_real
 from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.kernels.linalg import ldl_factor, ldl_solve
 from twoloop.system import ConstrainedSystem
@@ -44,9 +46,20 @@ def accelerations(system: ConstrainedSystem, t: ArrayLike, q: ArrayLike, v: Arra
     a : ndarray (n_q, n_t)
     lam : ndarray (n_c, n_t)
         Of M a + C_q^T lam = Q and C_q a = Q_d; NaN where the matrix is singular.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong.
     """
-    t = np.array(t, dtype=np.float64)
-    states = np.concatenate([np.array(q, dtype=np.float64), np.array(v, dtype=np.float64)])
+    check_system(system)
+    t = check_real("t", t)
+    states = np.concatenate([check_real("q", q), check_real("v", v)])
+    if t.ndim != 1 or states.shape != (2 * system.n_q, t.size):
+        raise ValueError(
+            f"q and v must have a column of {system.n_q} for each of the {t.size} times; together they have shape "
+            f"{states.shape}"
+        )
     check_bounds(system, float(t[0]), *np.split(states[:, 0], 2))
     return Equations(system, float(t[0]), states[: system.n_q, 0]).at_points(t, states)
 

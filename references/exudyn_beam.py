@@ -27,7 +27,8 @@ from exudyn.itemInterface import (
 )
 from numpy.typing import NDArray
 
-from references.exudyn_run import add_sensors, check_run, run
+from references.driver import check_choice, check_problem
+from references.exudyn_run import add_sensors, check_steps, run
 from twoloop.checks import check_size
 from twoloop.mechanisms.problem import Problem
 from twoloop.result import Result
@@ -49,6 +50,7 @@ def solve_exudyn_beam(
     n_elements: int | None = None,
     solver: str = "GeneralizedAlpha",
     store_every: int = 1,
+    time_limit: float | None = None,
 ) -> Result:
     """Run the beam on its moving base with one of Exudyn's implicit solvers, with a fixed step.
 
@@ -64,10 +66,13 @@ def solve_exudyn_beam(
         `MODELS` describes each in a line fit for a table. The first converges far faster with the mesh.
     n_elements : int, optional
         Number of equal elements. None: that of the problem.
-    solver : {"GeneralizedAlpha", "TrapezoidalIndex2"}
+    solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
         `references.exudyn_run.SOLVERS` describes each in a line fit for a table.
     store_every : int
         Store the start and every so many steps; `n_steps` must be a multiple of it.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s, looked at after every step. A run past it is a failed one. None: no
+        limit.
 
     Returns
     -------
@@ -81,15 +86,13 @@ def solve_exudyn_beam(
     TypeError, ValueError
         If an argument is wrong, naming it.
     """
-    t_end, n_steps, store_every = check_run(t_end, n_steps, solver, store_every)
-    if model not in MODELS:
-        raise ValueError(f"model must be one of {', '.join(MODELS)}; given {model!r}")
-    if not isinstance(problem, Problem) or "youngs_modulus" not in problem.parameters:
-        raise TypeError(f"problem must be a beam of twoloop.mechanisms.ancf_beam; given {problem!r}")
+    check_problem(problem, "youngs_modulus", "a beam of twoloop.mechanisms.ancf_beam")
+    t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
+    check_choice("model", model, MODELS)
     p = problem.parameters
     n_elements = p["n_elements"] if n_elements is None else check_size("n_elements", n_elements, 1)
     _container, mbs, sensors, reference = _model(p, model, n_elements)
-    result = run(mbs, sensors, reference.ravel(), 2, t_end, n_steps, solver, store_every)
+    result = run(mbs, sensors, reference.ravel(), 2, t_end, n_steps, solver, store_every, time_limit)
     q, v, a = (_ours(coordinates, n_elements) for coordinates in (result.q, result.v, result.a))
     return replace(result, q=q, v=v, a=a)
 

@@ -18,7 +18,8 @@ from exudyn.itemInterface import (
 )
 from numpy.typing import NDArray
 
-from references.exudyn_run import ALPHA, SOLVERS, SPECTRAL_RADIUS, add_sensors, check_run, run
+from references.driver import check_problem
+from references.exudyn_run import ALPHA, SOLVERS, SPECTRAL_RADIUS, add_sensors, check_steps, run
 from twoloop.checks import check_number
 from twoloop.mechanisms.problem import Problem
 from twoloop.result import Result
@@ -37,6 +38,7 @@ def solve_exudyn(
     spectral_radius: float | None = None,
     alpha: float | None = None,
     store_every: int = 1,
+    time_limit: float | None = None,
 ) -> Result:
     """Run the four-bar linkage from rest with one of Exudyn's implicit solvers, with a fixed step.
 
@@ -68,6 +70,9 @@ def solve_exudyn(
         -0.3, the default of MSC Adams.
     store_every : int
         Store the start and every so many steps; `n_steps` must be a multiple of it.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s, looked at after every step. A run past it is a failed one. None: no
+        limit.
 
     Returns
     -------
@@ -84,14 +89,13 @@ def solve_exudyn(
     TypeError, ValueError
         If an argument is wrong, naming it.
     """
-    t_end, n_steps, store_every = check_run(t_end, n_steps, solver, store_every)
-    if not isinstance(problem, Problem) or "L3" not in problem.parameters:
-        raise TypeError(f"problem must be a linkage of twoloop.mechanisms.four_bar; given {problem!r}")
+    check_problem(problem, "L3", "a linkage of twoloop.mechanisms.four_bar")
+    t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
     radius = _option("spectral_radius", spectral_radius, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
     strength = _option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
     q0 = _positions(problem)
     _container, mbs, sensors = _model(problem, q0)
-    return run(mbs, sensors, q0, 8, t_end, n_steps, solver, store_every, radius, strength)
+    return run(mbs, sensors, q0, 8, t_end, n_steps, solver, store_every, time_limit, radius, strength)
 
 
 def _option(

@@ -10,18 +10,21 @@ With th' = N u and the kinetic energy m(th) u^2 / 2, the motion is one scalar eq
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
+from twoloop.checks import check_number, check_positive, check_real, check_vector
+
 Array = NDArray[np.float64]
 
 RTOL, ATOL = 1e-13, 1e-14
 STEPS = 400  # least number of steps over half a period; the interpolant is then as good as the steps
 LONGEST = 1000.0  # s; a linkage that has not come to rest by then started too near an equilibrium
+MOST_EVALUATIONS = 200_000  # of the equation of motion, each of the two times; about 10 s of time
 
 
 class MinimalFourBar:
@@ -53,8 +56,9 @@ class MinimalFourBar:
 
     Raises
     ------
-    ValueError
-        If the linkage cannot be assembled, starts in equilibrium or singular, or does not come to rest again.
+    TypeError, ValueError
+        If an argument is wrong; if the linkage cannot be assembled, starts in equilibrium or singular, does not come to
+        rest again within `LONGEST`, or takes more than `MOST_EVALUATIONS` to get there.
     """
 
     def __init__(
@@ -66,7 +70,16 @@ class MinimalFourBar:
         density: float,
         gravity: float,
     ):
-        self._lengths = np.array(lengths, dtype=np.float64)
+        self._lengths = check_vector("lengths", lengths, 3)
+        if not (self._lengths > 0.0).all():
+            raise ValueError(f"lengths must be positive; given {lengths!r}")
+        check_positive("ground", ground)
+        check_positive("density", density)
+        for name, value in (("theta3", theta3), ("gravity", gravity)):
+            if not math.isfinite(check_number(name, value)):
+                raise ValueError(f"{name} must be finite; given {value!r}")
+        if branch not in (-1, 1):
+            raise ValueError(f"branch must be 1 or -1; given {branch!r}")
         self._masses = density * self._lengths
         self._gravity = gravity
         angles = _assemble(self._lengths, ground, theta3, branch)
@@ -82,7 +95,7 @@ class MinimalFourBar:
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "MinimalFourBar":
         """Make the linkage of `four_bar(...).parameters`: L1, L2, L3, L, theta3, branch, density, gravity."""
         p = parameters
-        return cls((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], int(p["branch"]), p["density"], p["gravity"])
+        return cls((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], p["branch"], p["density"], p["gravity"])
 
     def states(self, times: ArrayLike) -> tuple[Array, Array]:
         """Absolute coordinates and velocities at any times.
@@ -97,7 +110,9 @@ class MinimalFourBar:
         q, v : ndarray (9, n_t)
             [x1 y1 th1 x2 y2 th2 x3 y3 th3], m and rad, and their rates. The angles are continuous from the start.
         """
-        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        times = np.atleast_1d(check_real("times", times))
+        if times.ndim != 1 or not np.isfinite(times).all():
+            raise ValueError(f"times must be a list of finite times; given {times!r}")
         folded = np.mod(times, self.period)
         back = folded > 0.5 * self.period
         folded[back] = self.period - folded[back]
@@ -119,14 +134,16 @@ class MinimalFourBar:
 
         rest.terminal = True  # type: ignore[attr-defined]
         rest.direction = -math.copysign(1.0, self._rate(0.0, start)[3])  # type: ignore[attr-defined]
-        rough = solve_ivp(self._rate, (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
+        rough = solve_ivp(_counted(self._rate), (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
+        if rough.status == -1:
+            raise ValueError(f"the linkage's equation of motion cannot be integrated: {rough.message}")
         if rough.status != 1:
             raise ValueError(
                 f"the linkage does not come to rest within {LONGEST:g} s: it starts too near an equilibrium"
             )
         end = float(rough.t[-1])
-        return solve_ivp(
-            self._rate,
+        fine = solve_ivp(
+            _counted(self._rate),
             (0.0, 1.1 * end),
             start,
             "DOP853",
@@ -136,6 +153,9 @@ class MinimalFourBar:
             events=rest,
             dense_output=True,
         )
+        if fine.status != 1:
+            raise ValueError(f"the linkage comes to rest at {end:g} s with loose tolerances, and not with tight ones")
+        return fine
 
     def _rate(self, t: float, state: Array) -> Array:
         """(th', u') from Lagrange's equation for u; x and y are the centres' displacements along the tangent."""
@@ -155,6 +175,26 @@ class MinimalFourBar:
 def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:
     """States of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
     return MinimalFourBar.from_parameters(parameters).states(times)
+
+
+def _counted(rate: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:
+    """Return the same function, which ends with an error where SciPy's integrator would go on without end."""
+    count = 0
+
+    def counted(t: float, state: Array) -> Array:
+        nonlocal count
+        count += 1
+        if count > MOST_EVALUATIONS:
+            raise ValueError(
+                f"the linkage has not come to rest after {MOST_EVALUATIONS} evaluations of its equation of motion, at "
+                f"t = {t:g} s: it starts too near an equilibrium, or gravity and lengths are of very different scales"
+            )
+        value = rate(t, state)
+        if not np.isfinite(value).all():
+            raise ValueError(f"the linkage's equation of motion gives values that are not finite at t = {t:g} s")
+        return value
+
+    return counted
 
 
 def _centres(lengths: Array, directions: Array) -> Array:

@@ -17,9 +17,10 @@ from numba import njit, types
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
+from references.driver import TimeLimit, check_choice, check_run
 from references.index1 import solve_index1
 from twoloop.caches import compile_kept, watch
-from twoloop.checks import check_positive, check_size, check_span, check_times, check_vector
+from twoloop.checks import check_positive, check_size, check_times
 from twoloop.consistency import check_start
 from twoloop.kernels.common import FUNCTIONS, INTEGERS, MATRIX
 from twoloop.kernels.linalg import lu_factor, lu_solve
@@ -39,6 +40,8 @@ START_TOLERANCE = 1e-12
 MAX_NEWTON = 10
 SLOW = 0.1  # a correction that is not this much smaller than the last one asks for a new Newton matrix
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |q|)
+FIRST_STEPS = 100  # of the first call of the compiled loop, when there is a time limit
+CALL = 0.05  # s; the steps of a call are doubled until one takes that long, for a call itself costs some 0.1 ms
 WHOLE = 1e-6  # how far, in steps, the length of t_span may be from a whole number of them
 
 DONE, NOT_CONVERGED, SINGULAR, NOT_FINITE = range(4)
@@ -52,6 +55,8 @@ _INTEGRATE = types.int64(
     FUNCTIONS,
     types.int64,
     MATRIX,
+    MATRIX,
+    types.int64,
     types.int64,
     types.float64,
     types.float64,
@@ -75,6 +80,7 @@ def solve_gear(
     start: str = "ramp",
     newton_tol: float = 1e-12,
     t_eval: ArrayLike | None = None,
+    time_limit: float | None = None,
 ) -> Result:
     """Integrate the index-3 equations by BDF with a fixed step and order: the stand-in for ADAMS GSTIFF.
 
@@ -109,6 +115,9 @@ def solve_gear(
     t_eval : array_like, optional
         Increasing times in t_span, t_span[0] and multiples of the step from there, at which to store the solution.
         None: every step.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s, an accurate start included, looked at about
+        every `CALL` seconds. A run past it is a failed one. None: no limit.
 
     Returns
     -------
@@ -131,11 +140,7 @@ def solve_gear(
     coefficient, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
     Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] then has a condition number that does not grow as h becomes small.
     """
-    if not isinstance(system, ConstrainedSystem):
-        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
-    t0, t1 = check_span(t_span)
-    q0 = check_vector("q0", q0, system.n_q)
-    v0 = check_vector("v0", v0, system.n_q)
+    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
     check_positive("step", step)
     n_steps = round((t1 - t0) / step)
     if n_steps < 1 or abs((t1 - t0) / step - n_steps) > WHOLE:
@@ -144,46 +149,69 @@ def solve_gear(
         )
     if check_size("order", order, 1) > HIGHEST:
         raise ValueError(f"order must be at most {HIGHEST}, BDF of higher order is unstable; given {order}")
-    if start not in STARTS:
-        raise ValueError(f"start must be one of {', '.join(STARTS)}; given {start!r}")
+    check_choice("start", start, STARTS)
     check_positive("newton_tol", newton_tol)
     times = None if t_eval is None else check_times(t_eval, t0, t1, step)
     check_start(system, t0, q0, v0)
 
     h = (t1 - t0) / n_steps
     n_given = min(order, n_steps) if start == "accurate" else 1
-    first = _first_states(system, np.array([t0 + k * h for k in range(n_given)]), q0, v0)
+    limit = TimeLimit(time_limit)
+    first = _first_states(system, np.array([t0 + k * h for k in range(n_given)]), q0, v0, limit)
     if not first.success:
-        return replace(first, message=f"The accurate start failed. {first.message}")
+        message = f"The accurate start failed. {first.message}"
+        if limit.passed():
+            message = limit.message("The accurate start", float(first.t[-1]), "take start='ramp'")
+        return replace(first, message=message)
     keep = np.arange(n_steps + 1) if times is None else np.rint((times - t0) / h).astype(np.int64)
     rows = np.empty((keep.size, 3 * system.n_q + system.n_c))
     counters = np.zeros(N_COUNTERS, dtype=np.int64)
     given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
+    past = np.zeros((HIGHEST, given.shape[1]))
+    code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
+    formulas = _formulas()
     began = time.process_time()
-    code = _integrate(
-        system.functions,
-        system.n_q,
-        given,
-        n_steps,
-        t0,
-        h,
-        order,
-        _formulas(),
-        float(newton_tol),
-        keep,
-        rows,
-        counters,
-    )
+    while code == DONE and made < n_steps and not limit.passed():
+        called = time.monotonic()
+        last = min(made + stride, n_steps)
+        code = _integrate(
+            system.functions,
+            system.n_q,
+            given,
+            past,
+            made + 1,
+            last,
+            t0,
+            h,
+            order,
+            formulas,
+            float(newton_tol),
+            keep,
+            rows,
+            counters,
+        )
+        made = last
+        stride *= 2 if time.monotonic() - called < CALL else 1
     cpu = time.process_time() - began
-    return _result(system, order, t0, h, code, keep, rows, counters, cpu)
+    return _result(system, order, t0, h, code, keep, rows, counters, cpu, limit)
 
 
-def _first_states(system: ConstrainedSystem, times: Array, q0: Array, v0: Array) -> Result:
+def _first_states(system: ConstrainedSystem, times: Array, q0: Array, v0: Array, limit: TimeLimit) -> Result:
     """States at the first times; of a failed run those before its failure."""
     if times.size > 1:
         span = (float(times[0]), float(times[-1]))
-        tight = {"rtol": START_TOLERANCE, "atol": START_TOLERANCE}
-        return solve_index1(system, span, q0, v0, "DOP853", **tight, stabilisation="projection", t_eval=times)
+        return solve_index1(
+            system,
+            span,
+            q0,
+            v0,
+            "DOP853",
+            START_TOLERANCE,
+            START_TOLERANCE,
+            stabilisation="projection",
+            t_eval=times,
+            time_limit=limit.left(),
+        )
     a, lam = accelerations(system, times, q0[:, None], v0[:, None])
     return Result(
         times, q0[:, None], v0[:, None], a, lam, np.empty(0), Status.REACHED_END, "the state given", Statistics()
@@ -215,10 +243,14 @@ def _result(
     rows: Array,
     counters: NDArray[np.int64],
     cpu: float,
+    limit: TimeLimit,
 ) -> Result:
     n, made, stored = system.n_q, int(counters[STEPS]), int(counters[STORED])
+    failed = code != DONE or limit.exceeded
     message = f"BDF of order {order} reached the end, t = {t0 + made * h:g}."
-    if code != DONE:
+    if limit.exceeded:
+        message = limit.message(f"BDF of order {order}", t0 + made * h, "take a larger step")
+    elif code != DONE:
         message = (
             f"BDF of order {order} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. Take a "
             f"smaller step{' or a lower order' if order > 1 else ''}."
@@ -231,7 +263,7 @@ def _result(
         a=columns[2 * n : 3 * n],
         lam=columns[3 * n :],
         h=np.full(made, h),
-        status=Status.REACHED_END if code == DONE else Status.SOLVER_FAILED,
+        status=Status.SOLVER_FAILED if failed else Status.REACHED_END,
         message=message,
         stats=Statistics(
             n_accepted=made,
@@ -335,7 +367,9 @@ def _integrate(  # type: ignore[no-untyped-def]
     f,
     n,
     given,
-    n_steps,
+    past,
+    first,
+    last,
     t0,
     h,
     order,
@@ -345,13 +379,15 @@ def _integrate(  # type: ignore[no-untyped-def]
     rows,
     counters,
 ):
-    """All steps; `given` and `rows` hold states [q v a lam], `keep` the numbers of the steps to store."""
+    """Steps `first` to `last`; `keep` holds the numbers of those to store.
+
+    `given`, `past` and `rows` hold states [q v a lam]: of the start, of step i in row i % HIGHEST, those stored.
+    """
     m = given.shape[1] - 3 * n
     w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))
     r, there, J, pivots = np.zeros(n + m), np.zeros(n + m), np.zeros((n + m, n + m)), np.zeros(n + m, dtype=np.int64)
-    past = np.zeros((HIGHEST, 2 * n))  # [q v] of step i in row i % HIGHEST
-    combined, new = np.zeros(2 * n), given[0].copy()
-    for step in range(n_steps + 1):
+    combined, new = np.zeros(2 * n), past[(first - 1) % HIGHEST].copy()
+    for step in range(first, last + 1):
         if step < given.shape[0]:
             new[:] = given[step]
         else:
@@ -376,7 +412,7 @@ def _integrate(  # type: ignore[no-untyped-def]
                 new[2 * n + j] = (new[n + j] - combined[n + j]) / hb
             for j in range(m):
                 new[3 * n + j] = forces[j] / (hb * hb)
-        past[step % HIGHEST] = new[: 2 * n]
+        past[step % HIGHEST] = new
         counters[STEPS] = step
         if counters[STORED] < keep.size and keep[counters[STORED]] == step:
             rows[counters[STORED]] = new

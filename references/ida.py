@@ -18,6 +18,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import compiled_gamma
+from references.driver import TimeLimit, check_choice, check_run, check_tolerances
 from references.ida_options import (
     HIGHEST_ORDER,
     NOT_TESTED,
@@ -27,7 +28,6 @@ from references.ida_options import (
     tolerances,
 )
 from twoloop.callbacks import stand_in
-from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -39,7 +39,9 @@ FORMS = {
     "stabilised": "GGL, integrated multipliers: C = 0 and C_q v + C_t = 0; multipliers' integrals in the error test",
 }
 
-SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
+SMALLEST_STEP = (
+    1e-12  # of the length of t_span; without a smallest step IDA shrinks its steps towards a NaN without end
+)
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 
 _READ = types.Array(types.float64, 1, "C", readonly=True)  # IDA hands y and y' over as read-only arrays
@@ -62,6 +64,7 @@ def solve_ida(
     t_eval: ArrayLike | None = None,
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
+    time_limit: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA.
 
@@ -92,6 +95,9 @@ def solve_ida(
     error_test : {"all", "positions"}
         What the error test, and that of Newton's iteration, sees: all unknowns but the algebraic lam of the form
         "index1", or q alone. IDA's norm is a mean over all unknowns: the fewer it sees, the looser the same tolerance.
+    time_limit : float, optional
+        Wall-clock time that the integration may take, s, looked at in every evaluation of the residual. A run past it
+        is a failed one. None: no limit.
 
     Returns
     -------
@@ -106,27 +112,24 @@ def solve_ida(
     TypeError, ValueError
         If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
     """
-    if not isinstance(system, ConstrainedSystem):
-        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
-    if form not in FORMS:
-        raise ValueError(f"form must be one of {', '.join(FORMS)}; given {form!r}")
-    t0, t1 = check_span(t_span)
-    q0 = check_vector("q0", q0, system.n_q)
-    v0 = check_vector("v0", v0, system.n_q)
-    check_positive("rtol", rtol)
-    check_positive("atol", atol)
+    check_choice("form", form, FORMS)
+    check_tolerances(rtol, atol)
     max_order = check_options(max_order, error_test)
-    times = None if t_eval is None else check_times(t_eval, t0, t1, None)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     check_start(system, t0, q0, v0)
 
     size = 2 * system.n_q + _n_multipliers(system, form)
     absolute = tolerances(system, size, error_test, float(atol))
     if form == "index1":
         absolute[2 * system.n_q :] = NOT_TESTED
-    callbacks = _callbacks(system, form)
+    compiled = compiled_residual(system, form)
+    y0, yp0 = start_of(system, form, t0, q0, v0)
+    tspan = np.array([t0, t1]) if times is None else _stops(t0, t1, times)
+    limit, said = TimeLimit(time_limit), io.StringIO()
+    residual, jacobian = _callbacks(system, compiled, limit)
     solver = sksundae.ida.IDA(
-        callbacks[0],
-        jacfn=callbacks[1],
+        residual,
+        jacfn=jacobian,
         rtol=float(rtol),
         atol=absolute,
         max_order=max_order,
@@ -134,27 +137,39 @@ def solve_ida(
         max_step=t1 - t0,
         max_num_steps=10**9,  # per output time
     )
-    y0, yp0 = _start(system, form, t0, q0, v0)
-    tspan = np.array([t0, t1]) if times is None else _stops(t0, t1, times)
-    said = io.StringIO()
     with redirect_stdout(said):
         began = time.process_time()
         outcome = solver.solve(tspan, y0, yp0)
         cpu = time.process_time() - began
-    return _result(system, form, outcome, times, said.getvalue(), cpu)
+    return _result(system, form, outcome, times, said.getvalue(), cpu, limit)
 
 
-def _callbacks(system: ConstrainedSystem, form: str) -> tuple[Any, Any]:
-    """Residual and Jacobian as scikit-sundae calls them."""
-    f = system.functions
-    residual, jacobian = _compiled(form, *f[:5], compiled_gamma(system), own_tangent(system))
-    sizes_and_p = (system.n_q, system.n_c, f.p)
+def compiled_residual(system: ConstrainedSystem, form: str) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Residual (t, y, y', res, n_q, n_c, p) and dF/dy + cj dF/dy' (t, y, y', cj, JJ, n_q, n_c, p) of a form."""
+    return _compiled(form, *system.functions[:5], compiled_gamma(system), own_tangent(system))
+
+
+def _callbacks(
+    system: ConstrainedSystem, compiled: tuple[Callable[..., None], Callable[..., None]], limit: TimeLimit
+) -> tuple[Any, Any]:
+    """Residual and Jacobian as scikit-sundae calls them.
+
+    Past the time limit the residual is NaN: IDA then fails and returns what it has, which is lost with an exception.
+    """
+    residual, jacobian = compiled
+    sizes_and_p = (system.n_q, system.n_c, system.functions.p)
+
+    monotonic, deadline = time.monotonic, limit.deadline  # a call of `limit` would be 3 % of an evaluation
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
-        residual(t, y, yp, res, *sizes_and_p)
+        if monotonic() > deadline and limit.passed():
+            res[:] = np.nan
+        else:
+            residual(t, y, yp, res, *sizes_and_p)
 
     def jacfn(t, y, yp, res, cj, JJ):  # type: ignore[no-untyped-def]
-        jacobian(t, y, yp, cj, JJ, *sizes_and_p)
+        if not limit.exceeded:
+            jacobian(t, y, yp, cj, JJ, *sizes_and_p)
 
     return resfn, jacfn
 
@@ -163,7 +178,7 @@ def _n_multipliers(system: ConstrainedSystem, form: str) -> int:
     return system.n_c if form == "index1" else 2 * system.n_c
 
 
-def _start(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> tuple[Array, Array]:
+def start_of(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Unknowns and their derivatives at the start; accelerations and multipliers from one linear system."""
     n, m = system.n_q, system.n_c
     jacobian, gamma = system.jacobian(t0, q), np.zeros(m)
@@ -183,31 +198,44 @@ def _stops(t0: float, t1: float, times: Array) -> Array:
     return stops if stops.size > 2 else np.array([t0, 0.5 * (t0 + t1), t1])
 
 
-def _result(system: ConstrainedSystem, form: str, outcome: Any, times: Array | None, said: str, cpu: float) -> Result:
+def _result(
+    system: ConstrainedSystem,
+    form: str,
+    outcome: Any,
+    times: Array | None,
+    said: str,
+    cpu: float,
+    limit: TimeLimit,
+) -> Result:
     n, m = system.n_q, system.n_c
     y, yp = outcome.y.T, outcome.yp.T
     lam = (y if form == "index1" else yp)[2 * n : 2 * n + m]
-    keep = np.ones(outcome.t.size, dtype=bool) if times is None else np.isin(outcome.t, times)
+    keep = np.append(True, np.diff(outcome.t) > 0.0)  # a failed run comes with its last state twice
+    if times is not None:
+        keep &= np.isin(outcome.t, times)
     failed = outcome.status < 0
     end = float(outcome.t[-1])
-    told = " ".join([outcome.message, *said.split()])
+    message = f"IDA reached the end, t = {end:g}."
+    if failed and limit.exceeded:
+        message = limit.message("IDA", end, "take looser tolerances")
+    elif failed:
+        told = " ".join([outcome.message, *said.split()])
+        message = (
+            f"IDA failed after t = {end:.10g} with status {outcome.status}: {told} "
+            "Look for a discontinuity, a singular position or a value that is not finite near this time, or try the "
+            "other form or other tolerances."
+        )
     return Result(
         t=outcome.t[keep],
         q=y[:n, keep],
         v=y[n : 2 * n, keep],
         a=yp[n : 2 * n, keep],
         lam=lam[:, keep],
-        h=np.diff(outcome.t) if times is None else np.empty(0),
+        h=np.diff(outcome.t[keep]) if times is None else np.empty(0),
         status=Status.SOLVER_FAILED if failed else Status.REACHED_END,
-        message=(
-            f"IDA failed after t = {end:.10g} with status {outcome.status}: {told} "
-            "Look for a discontinuity, a singular position or a value that is not finite near this time, or try the "
-            "other form or other tolerances."
-            if failed
-            else f"IDA reached the end, t = {end:g}."
-        ),
+        message=message,
         stats=Statistics(
-            n_accepted=outcome.t.size - 1 if times is None else None,
+            n_accepted=int(keep.sum()) - 1 if times is None else None,
             n_evaluations=int(outcome.nfev),
             n_factorizations=int(outcome.njev),
             cpu_time=cpu,

@@ -7,6 +7,7 @@ promise nothing to others: this was written for `WRITTEN_FOR`, and says so when 
 """
 
 import ctypes
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
+from references.driver import TimeLimit, check_run, check_system, check_tolerances
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials import LONG, POINTER, REAL, library
-from twoloop.checks import check_positive, check_span, check_times, check_vector
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -30,10 +31,13 @@ Array = NDArray[np.float64]
 LABEL = "SUNDIALS IDA, stabilised (GGL): the library of scikit-sundae, driven without Python"
 
 OUTPUTS = 1001  # instants of the default t_eval
-SMALLEST_STEP = 1e-12  # of the length of t_span; without a smallest step IDA creeps up to a NaN for ever
+SMALLEST_STEP = (
+    1e-12  # of the length of t_span; without a smallest step IDA shrinks its steps towards a NaN without end
+)
 MOST_STEPS = 10**7  # between two output times
+STEPS_A_CALL = 100  # between two looks at the clock
 
-IDA_NORMAL, IDA_TSTOP_RETURN = 1, 1
+IDA_NORMAL, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 1, -1
 SUN_COMM_NULL = 0
 
 
@@ -48,6 +52,7 @@ def solve_ida_c(
     t_eval: ArrayLike | None = None,
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
+    time_limit: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA, in the form "stabilised", without Python in the integration.
 
@@ -76,6 +81,9 @@ def solve_ida_c(
         What the error test, and that of Newton's iteration, sees: all unknowns, or q alone. IDA's norm is a mean over
         all unknowns, so that without the others the same tolerances allow q an error sqrt((2 n_q + 2 n_c)/n_q) times
         as large.
+    time_limit : float, optional
+        Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps and at output times. A
+        run past it is a failed one. None: no limit.
 
     Returns
     -------
@@ -93,32 +101,37 @@ def solve_ida_c(
     RuntimeError
         If scikit-sundae is not the one that this was written for.
     """
-    if not isinstance(system, ConstrainedSystem):
-        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
+    check_system(system)
     if system.called_in_python:
         raise ValueError(
             f"system must have compiled callbacks, as Python cannot run inside; those of {system.name!r} are Python "
             "functions. Make it with from_python(..., compile=True) or of functions made by @callback, or take "
             "references.ida.solve_ida"
         )
-    t0, t1 = check_span(t_span)
-    q0 = check_vector("q0", q0, system.n_q)
-    v0 = check_vector("v0", v0, system.n_q)
-    check_positive("rtol", rtol)
-    check_positive("atol", atol)
+    check_tolerances(rtol, atol)
     max_order = check_options(max_order, error_test)
-    times = np.linspace(t0, t1, OUTPUTS) if t_eval is None else check_times(t_eval, t0, t1, None)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    times = np.linspace(t0, t1, OUTPUTS) if times is None else times
     check_start(system, t0, q0, v0)
 
     sundials, state = library(), _start(system, t0, q0, v0)
     absolute = tolerances(system, state.size // 2, error_test, float(atol))
     with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order) as solver:
-        began = time.process_time()
-        rows, flag, reached = _integrate(sundials.IDASolve, solver, state, t0, t1, times)
+        limit, began = TimeLimit(time_limit), time.process_time()
+        rows, flag, reached = _integrate(sundials.IDASolve, solver, state, t0, t1, times, limit)
         cpu = time.process_time() - began
         statistics = _statistics(sundials, solver[0], cpu)
-    failure = f"{_flag_name(sundials, flag)} ({flag})" if flag < 0 else ""
-    return _result(system, times[: len(rows)], rows, failure, reached, statistics)
+    message = f"IDA reached the end, t = {reached:g}."
+    if limit.exceeded:
+        message = limit.message("IDA", reached, "take looser tolerances")
+    elif flag < 0:
+        message = (
+            f"IDA failed after t = {reached:.10g} with {_flag_name(sundials, flag)} ({flag}). Look for a "
+            "discontinuity, a singular position, a value that is not finite or an exception in a callback near this "
+            "time, or try other tolerances."
+        )
+    status = Status.SOLVER_FAILED if flag < 0 else Status.REACHED_END
+    return _result(system, times[: len(rows)], rows, status, message, statistics)
 
 
 def _start(system: ConstrainedSystem, t0: float, q: Array, v: Array) -> Array:
@@ -171,7 +184,7 @@ def _integrator(
             ("IDASetUserData", data.ctypes.data),
             ("IDASetLinearSolver", linear, matrix),
             ("IDASetJacFn", jacobian.address),
-            ("IDASetMaxNumSteps", MOST_STEPS),
+            ("IDASetMaxNumSteps", STEPS_A_CALL),
             ("IDASetMaxStep", t1 - t0),
             ("IDASetMinStep", SMALLEST_STEP * (t1 - t0)),
             ("IDASetStopTime", t1),
@@ -195,16 +208,22 @@ def _check(name: str, flag: int) -> None:
 
 
 def _integrate(
-    solve: Any, solver: tuple[Any, Any, Any], state: Array, t0: float, t1: float, times: Array
+    solve: Any, solver: tuple[Any, Any, Any], state: Array, t0: float, t1: float, times: Array, limit: TimeLimit
 ) -> tuple[Array, int, float]:
-    """Rows [y y'] at the times before a failure, IDA's last flag, and the time that IDA reached."""
+    """Rows [y y'] at the times before a failure, IDA's last flag, and the time that IDA reached.
+
+    Past the time limit the flag is that of IDA when it is stopped at its greatest number of steps.
+    """
     memory, y, yp = solver
     reached, flag = REAL(t0), 0
     place = ctypes.byref(reached)
     rows, stored = np.empty((times.size, state.size)), 0
     for stop in [*times.tolist(), t1]:
         if stop > t0 and flag != IDA_TSTOP_RETURN:
-            flag = solve(memory, stop, place, y, yp, IDA_NORMAL)
+            for calls in itertools.count(1):
+                flag = IDA_TOO_MUCH_WORK if limit.passed() else solve(memory, stop, place, y, yp, IDA_NORMAL)
+                if flag != IDA_TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
+                    break
             if flag < 0:
                 break
         if stored < times.size:
@@ -241,16 +260,10 @@ def _flag_name(sundials: SimpleNamespace, flag: int) -> str:
 
 
 def _result(
-    system: ConstrainedSystem, times: Array, rows: Array, failure: str, reached: float, statistics: Statistics
+    system: ConstrainedSystem, times: Array, rows: Array, status: Status, message: str, statistics: Statistics
 ) -> Result:
     n, m = system.n_q, system.n_c
     y, yp = np.split(rows.T, 2)
-    message = f"IDA reached the end, t = {reached:g}."
-    if failure:
-        message = (
-            f"IDA failed after t = {reached:.10g} with {failure}. Look for a discontinuity, a singular position, a "
-            "value that is not finite or an exception in a callback near this time, or try other tolerances."
-        )
     return Result(
         t=times,
         q=y[:n],
@@ -258,7 +271,7 @@ def _result(
         a=yp[n : 2 * n],
         lam=yp[2 * n : 2 * n + m],
         h=np.empty(0),
-        status=Status.SOLVER_FAILED if failure else Status.REACHED_END,
+        status=status,
         message=message,
         stats=statistics,
     )

@@ -1,7 +1,7 @@
 """SciPy's solvers on the index-1 ODE y = [q, v] of any ConstrainedSystem: plain, Baumgarte's, or with projection.
 
-The accelerations are those of `references.accelerations`; the right side is compiled, one call of it from Python an
-evaluation. Nothing here uses the integrator of twoloop, but its small dense factorisations are shared.
+The accelerations are those of `references.accelerations`; the right-hand side is compiled, and called from Python once
+an evaluation. Nothing here uses the integrator of twoloop, but its small dense factorisations are shared.
 """
 
 import time
@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
-from twoloop.checks import check_positive, check_span, check_times, check_vector
+from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances
+from twoloop.checks import check_positive
 from twoloop.consistency import check_start
 from twoloop.kernels.linalg import ldl_solve
 from twoloop.result import Result, Statistics, Status
@@ -50,19 +51,20 @@ def solve_index1(
     stabilisation: str = "none",
     alpha: float | None = None,
     t_eval: ArrayLike | None = None,
+    time_limit: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system as the ODE q' = v, v' = a(t, q, v) with one of SciPy's solvers.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        The problem. Its callbacks are compiled into a right side at the first run (a few seconds).
+        The problem. Its callbacks are compiled into a right-hand side at the first run (a few seconds).
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities.
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF"}
-        The solver of `scipy.integrate`. The implicit ones difference the right side for their Jacobian.
+        The solver of `scipy.integrate`. The implicit ones difference the right-hand side for their Jacobian.
     rtol, atol : float
         SciPy's tolerances for q and v.
     stabilisation : {"none", "baumgarte", "projection"}
@@ -74,7 +76,7 @@ def solve_index1(
 
         "projection": E. Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482. After every accepted step the positions are
         moved onto C = 0 by Newton's method, then the velocities onto C_q v + C_t = 0, both by the least change in the
-        norm of the mass matrix; the next step begins with a right side evaluated there (one more evaluation a
+        norm of the mass matrix; the next step begins with a right-hand side evaluated there (one more evaluation a
         step). States interpolated to `t_eval` are projected too. Only for "DOP853" and "RK45": the others go on from
         a history that a projection would have to change with y.
     alpha : float, optional
@@ -84,15 +86,18 @@ def solve_index1(
         stabilisation, and its error is 1/300 and 1/35; from 20 on the cost grows with alpha: the ODE becomes stiff.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution, by the solver's interpolant. None: every step.
+    time_limit : float, optional
+        Wall-clock time that the integration may take, s, looked at in every evaluation of the right-hand side. A run
+        past it is a failed one. None: no limit.
 
     Returns
     -------
     Result
-        `a` and `lam` (with the sign of M a + C_q^T lam = Q) computed from the stored q and v as the right side does, so
-        with Baumgarte's terms where they are used. `h` holds all accepted steps. Of the statistics: n_accepted;
-        n_evaluations, all evaluations of the right side, those for a difference Jacobian, for the interpolant and
-        after a projection included; n_factorizations, SciPy's LU count, for "Radau" and "BDF". cpu_time is that of
-        the integration, without the final `a` and `lam`. A failure of the solver gives what was computed before it,
+        `a` and `lam` (with the sign of M a + C_q^T lam = Q) computed from the stored q and v as in the right-hand
+        side, so with Baumgarte's terms where they are used. `h` holds all accepted steps. Of the statistics:
+        n_accepted; n_evaluations, all evaluations of the right-hand side, those for a difference Jacobian, for the
+        interpolant and after a projection included; n_factorizations, SciPy's LU count, for "Radau" and "BDF". cpu_time
+        is that of the integration, without the final `a` and `lam`. A failure gives what was computed before it,
         `Status.SOLVER_FAILED` and the solver's text.
 
     Raises
@@ -100,22 +105,16 @@ def solve_index1(
     TypeError, ValueError
         If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
     """
-    if not isinstance(system, ConstrainedSystem):
-        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
     _check_choices(method, stabilisation, alpha)
-    t0, t1 = check_span(t_span)
-    q0 = check_vector("q0", q0, system.n_q)
-    v0 = check_vector("v0", v0, system.n_q)
-    check_positive("rtol", rtol)
-    check_positive("atol", atol)
-    times = None if t_eval is None else check_times(t_eval, t0, t1, None)
+    check_tolerances(rtol, atol)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     check_start(system, t0, q0, v0)
 
     strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0
-    equations = _RightSide(system, t0, q0, strength)
+    equations = _RightHandSide(system, t0, q0, strength)
     y0 = np.concatenate([q0, v0])
     equations.warm(t0, y0, stabilisation == "projection")
-    run = _Run(equations, times, stabilisation == "projection")
+    run = _Run(equations, times, stabilisation == "projection", time_limit)
     options = {"rtol": float(rtol), "atol": float(atol)}
     began = time.process_time()
     run.go(METHODS[method], t0, y0, t1, options)
@@ -124,10 +123,8 @@ def solve_index1(
 
 
 def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None:
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}; given {method!r}")
-    if stabilisation not in STABILISATIONS:
-        raise ValueError(f"stabilisation must be one of {', '.join(STABILISATIONS)}; given {stabilisation!r}")
+    check_choice("method", method, METHODS)
+    check_choice("stabilisation", stabilisation, STABILISATIONS)
     if stabilisation == "projection" and method not in ONE_STEP:
         raise ValueError(
             f"stabilisation='projection' needs an explicit one-step method, {' or '.join(ONE_STEP)}: the others carry "
@@ -141,7 +138,7 @@ def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None
             )
 
 
-class _RightSide(Equations):
+class _RightHandSide(Equations):
     """The ODE of one system as SciPy calls it, and the projection onto its constraints."""
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, alpha: float):
@@ -153,12 +150,16 @@ class _RightSide(Equations):
         self.counters = np.zeros(1, dtype=np.int64)
         self.raised = False  # a callback raised an exception
 
-    def right_side(self) -> Callable[[float, Array], Array]:
+    def function(self, limit: TimeLimit) -> Callable[[float, Array], Array]:
         """y' = f(t, y) as SciPy calls it."""
         derivative, n_c, alpha = self.derivative, self.system.n_c, self.alpha
         p, factors, known, counters = self.system.functions.p, self.factors, self.known, self.counters
 
+        monotonic, deadline = time.monotonic, limit.deadline  # a call of `limit` would be 3 % of an evaluation
+
         def fun(t, y):  # type: ignore[no-untyped-def]
+            if monotonic() > deadline:
+                limit.check()
             try:
                 return derivative(t, y, n_c, alpha, p, factors, known, counters)
             except BaseException:
@@ -173,7 +174,7 @@ class _RightSide(Equations):
 
     def warm(self, t: float, y: Array, projection: bool) -> None:
         """Compile what the run calls, so that its time does not hold that."""
-        self.right_side()(t, y)
+        self.function(TimeLimit(None))(t, y)
         if projection:
             self.project(t, y.copy())
         self.counters[:] = 0
@@ -182,8 +183,11 @@ class _RightSide(Equations):
 class _Run:
     """The loop over a solver's steps, and what it stores."""
 
-    def __init__(self, equations: _RightSide, times: Array | None, projection: bool):
+    def __init__(
+        self, equations: _RightHandSide, times: Array | None, projection: bool, time_limit: float | None
+    ) -> None:
         self.equations, self.times, self.projection = equations, times, projection
+        self.limit = TimeLimit(time_limit)
         self.ends: list[float] = []  # of the accepted steps
         self.t: list[float] = []
         self.y: list[Array] = []
@@ -195,11 +199,15 @@ class _Run:
         self.ends.append(t0)
         if self.times is None or self.times[0] == t0:
             self._store(t0, y0)
-        solver = solver_type(self.equations.right_side(), t0, y0, t1, **options)
-        while solver.status == "running" and not self.failure:
-            self.failure = self._attempt(solver)
-            if not self.failure:
-                self._accept(solver)
+        solver = None
+        try:
+            solver = solver_type(self.equations.function(self.limit), t0, y0, t1, **options)
+            while solver.status == "running" and not self.failure:
+                self.failure = self._attempt(solver)
+                if not self.failure:
+                    self._accept(solver)
+        except OutOfTimeError:
+            self.failure = "out of time"
         self.n_factorizations = solver.nlu if isinstance(solver, Radau | BDF) else None
 
     def _attempt(self, solver: OdeSolver) -> str:
@@ -213,7 +221,7 @@ class _Run:
             return str(error)
         if solver.status == "failed":
             return str(message)
-        # LSODA would go on in both cases, for ever in the second
+        # LSODA would go on in both cases, without end in the second
         if not np.isfinite(solver.y).all():
             return f"the state at t = {solver.t:.10g} is not finite"
         if solver.status == "running" and solver.t - self.ends[-1] < SMALLEST_STEP * np.spacing(abs(solver.t)):
@@ -262,14 +270,16 @@ class _Run:
         self.y.append(y)
 
 
-def _result(method: str, equations: _RightSide, run: _Run, t1: float, cpu: float) -> Result:
+def _result(method: str, equations: _RightHandSide, run: _Run, t1: float, cpu: float) -> Result:
     n = equations.system.n_q
     evaluations = int(equations.counters[0])
     t = np.array(run.t)
     states = np.array(run.y).reshape(-1, 2 * n).T
     a, lam = equations.at_points(t, states, equations.alpha)
     message = f"{method} reached the end, t = {t1:g}."
-    if run.failure:
+    if run.limit.exceeded:
+        message = run.limit.message(method, run.ends[-1], "take looser tolerances or another method")
+    elif run.failure:
         message = (
             f"{method} failed after t = {run.ends[-1]:.10g}: {run.failure.rstrip('.')}. "
             "Look for a discontinuity, a singular position or a value that is not finite near this time, or try other "

@@ -1,6 +1,9 @@
 """The public face, run as the design prints it."""
 
+import pydoc
+
 import numpy as np
+import pytest
 
 import twoloop
 from tests.problems import pendulum_state, worst
@@ -84,3 +87,12 @@ def test_ones_own_mechanism_as_printed():
 def test_all_that_is_promised_can_be_imported():
     for name in twoloop.__all__:
         assert getattr(twoloop, name).__doc__, name
+
+
+@pytest.mark.parametrize("name", twoloop.__all__)
+def test_help_leaves_the_names_of_types_as_they_are(name):
+    text = pydoc.render_doc(getattr(twoloop, name), renderer=pydoc.plaintext)
+    assert "_array_like" not in text and "Union[" not in text
+    if name == "solve_dae":
+        signature = text.splitlines()[2]
+        assert "q0: 'ArrayLike'" in signature and "t_eval: 'ArrayLike | None' = None" in signature

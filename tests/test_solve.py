@@ -222,7 +222,7 @@ def test_counts_are_consistent(default_four_bar, method):
 def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, method, monkeypatch):
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
     whole = run(default_four_bar, 3.0, **options)
-    monkeypatch.setattr("twoloop.solve.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
+    monkeypatch.setattr("twoloop.run.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
     stats = whole.stats
     assert whole.rejected_error.sum() == stats.n_rejected_error
     assert whole.rejected_convergence.sum() == stats.n_rejected_convergence

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twoloop.checks import check_size
-from twoloop.plan import INNER_TOL, OUTER_SHARE, OUTER_TOL_FIXED, Plan, check_tolerances
+from twoloop.plan import INNER_TOL, Plan, check_tolerances, outer_tolerance
 
 BDF_HIGHEST = 5  # order; the formula of order 6 is next to unstable, those beyond are
 
@@ -72,9 +72,7 @@ class BDF:
         from twoloop.kernels import bdf as kernels
 
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
-        outer_tol = self.outer_tol
-        if outer_tol is None:
-            outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * min(rtol, atol)
+        outer_tol = outer_tolerance(rtol, atol, fixed) if self.outer_tol is None else self.outer_tol
         return Plan(
             kernels.bdf_step,
             kernels.options_array(self.max_order, inner_tol, outer_tol),

@@ -93,3 +93,10 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
                 f"{times[off][0]!r} is not one"
             )
     return times
+
+
+def check_tolerance(name, value, n):
+    check = np.array(value, dtype=float)
+    if check.ndim == 0:
+        check_positive(name, value)
+    return np.broadcast_to(check, (n,)).copy()

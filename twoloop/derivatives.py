@@ -179,3 +179,7 @@ def _compare(
         f"{kind} of {system.name!r} is not {what}: entry {entry} is {values[0]:.6g}, by differences it is "
         f"{values[1]:.6g} (t = {t:g}, near the start, velocities chosen at random). Mend its formula{hint}"
     )
+
+
+def wrong_derivative(system, t, q, v):
+    return None

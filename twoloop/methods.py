@@ -8,7 +8,7 @@ import numpy as np
 from twoloop.bdf import BDF
 from twoloop.checks import check_number
 from twoloop.dop853 import DOP853
-from twoloop.plan import INNER_TOL, LEAST_ERROR, OUTER_SHARE, OUTER_TOL_FIXED, Method, Plan, check_tolerances
+from twoloop.plan import INNER_TOL, LEAST_ERROR, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
@@ -107,9 +107,8 @@ class RungeKutta:
         tableau = self.tableau
         outer_tol = self.outer_tol
         if outer_tol is None:
-            outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * min(rtol, atol)
-            if fixed and self.outer == "newton":
-                outer_tol = NEWTON_TOL_FIXED
+            own_rule = fixed and self.outer == "newton"
+            outer_tol = NEWTON_TOL_FIXED if own_rule else outer_tolerance(rtol, atol, fixed)
         options = options_array(
             tableau.A,
             tableau.b,
@@ -155,8 +154,10 @@ class Newmark:
         Parameters of (12), in which beta = 1/4 is the average-acceleration method. Other gamma than 1/2, and beta
         near 1/6, for which the error estimate vanishes, go with fixed steps only.
     error_tol : float, optional
-        err_out of the paper: a step is accepted when |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this. None:
-        the same estimate as a root mean square weighted by atol + rtol |q|.
+        err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this; the error
+        of a run then goes with error_tol^(2/3). None: when the largest component of e / h, the error per unit step, is
+        at most r atol + rtol |v|, so that the error of a run is proportional to the tolerance; 1 / r is the shortest
+        time scale so far, on which velocities and accelerations change the coordinates.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
     outer_tol : float, optional
@@ -199,12 +200,10 @@ class Newmark:
             )
         if self.outer_tol is not None:
             outer_tol = self.outer_tol
-        elif fixed:
-            outer_tol = OUTER_TOL_FIXED
-        elif self.error_tol is not None:
+        elif self.error_tol is not None and not fixed:
             outer_tol = NEWMARK_OUTER_SHARE * self.error_tol
         else:
-            outer_tol = OUTER_SHARE * min(rtol, atol)
+            outer_tol = outer_tolerance(rtol, atol, fixed)
         options = np.zeros(kernels.N_OPTIONS)
         options[kernels.BETA] = self.beta
         options[kernels.GAMMA] = self.gamma
@@ -214,8 +213,8 @@ class Newmark:
         return Plan(
             kernels.newmark_step,
             options,
-            np.zeros(1 + n_q),
-            exponent=1.0 / 3.0,
+            np.zeros(kernels.N_MEMORY_SCALARS + n_q),
+            exponent=1.0 / 2.0 if self.error_tol is None else 1.0 / 3.0,
             factor_min=0.5,
             limit_start=1.0 if self.error_tol is not None else np.inf,
         )

@@ -15,6 +15,7 @@ INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,16 @@ class Plan:
     symmetric: bool = False
     predictive: bool = False
     least_error: float = LEAST_ERROR
+
+
+def least_tolerance(rtol: float, atol: float) -> float:
+    """The smaller of the two, but not below rounding."""
+    return max(min(rtol, atol), LEAST_TOLERANCE)
+
+
+def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
+    """Where the outer loop stops unless a method has its own rule."""
+    return OUTER_TOL_FIXED if fixed else OUTER_SHARE * least_tolerance(rtol, atol)
 
 
 class Method(Protocol):

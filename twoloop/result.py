@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class Status(IntEnum):
-    """How a run ended: 0 reached the end, 1 an event, negative a failure."""
+    """How a run ended: 0 reached the end, 1 an event, negative a failure; in words in `MEANINGS`."""
 
     REACHED_END = 0
     EVENT = 1
@@ -21,6 +21,24 @@ class Status(IntEnum):
     NOT_FINITE = -4
     RANK_LOST = -5
     SOLVER_FAILED = -6
+    INTERRUPTED = -7
+    STAGNATED = -8
+    WRONG_DERIVATIVE = -9
+
+
+MEANINGS: dict[Status, str] = {
+    Status.REACHED_END: "the end of t_span was reached",
+    Status.EVENT: "an event ended the run",
+    Status.STEP_TOO_SMALL: "the step size fell below the spacing of floating-point numbers",
+    Status.MAX_STEPS: "max_steps accepted steps were taken",
+    Status.NOT_CONVERGED: "a step of fixed size did not converge, or gamma by differences misses the tolerance",
+    Status.NOT_FINITE: "a callback returned a value that is not finite, or the state overflowed",
+    Status.RANK_LOST: "the constraint Jacobian lost rank: no choice of independent coordinates exists",
+    Status.SOLVER_FAILED: "a solver of another project failed, or reached its time limit",
+    Status.INTERRUPTED: "the run was interrupted from the keyboard",
+    Status.STAGNATED: "the steps became so short that the end is out of reach",
+    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong at a state of the run",
+}
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """The problem: M(t, q) q'' + C_q^T lam = Q(t, q, v) with C(t, q) = 0, as compiled callbacks, sizes and parameters."""
 
+from __future__ import annotations  # ArrayLike stays a word in help()
+
 import copy
 import math
 from collections.abc import Callable
@@ -126,7 +128,7 @@ class ConstrainedSystem:
         bandwidth: int | None = None,
         name: str = "system",
         **functions: Any,
-    ) -> "ConstrainedSystem":
+    ) -> ConstrainedSystem:
         """Make a system of plain Python functions, each of which takes arrays and returns one.
 
         Parameters
@@ -235,12 +237,12 @@ class ConstrainedSystem:
         """C_q v + C_t, (n_c,): zero for consistent velocities (eq. (4))."""
         return self.jacobian(t, q) @ np.asarray(v, dtype=np.float64) + self.constraint_rate(t, q)
 
-    def __copy__(self) -> "ConstrainedSystem":
+    def __copy__(self) -> ConstrainedSystem:
         other = object.__new__(type(self))
         vars(other).update(vars(self), within_bounds=set(self.within_bounds))
         return other
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ConstrainedSystem":
+    def __deepcopy__(self, memo: dict[int, Any]) -> ConstrainedSystem:
         other = memo[id(self)] = copy.copy(self)
         other.parameters = self.parameters.copy()
         if self._python is not None:  # numbers of its own for functions of its own

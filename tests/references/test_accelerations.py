@@ -68,3 +68,12 @@ def test_singular_matrices():
     assert worst(a[:, 1], [0.0, -9.81]) == 0.0 and lam[0, 1] == 0.0
     with pytest.raises(ValueError, match="mass of 'pendulum' must be positive definite"):
         accelerations(pendulum(mass=lambda t, q: np.diag([1.0, 0.0])), [0.0], [[1.0], [0.0]], np.zeros((2, 1)))
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(TypeError, match=r"give problem\.system"):
+        accelerations(four_bar(), [0.0], np.zeros((9, 1)), np.zeros((9, 1)))
+    with pytest.raises(ValueError, match="a column of 2 for each of the 1 times"):
+        accelerations(pendulum(), [0.0], np.zeros(2), np.zeros(2))
+    with pytest.raises(TypeError, match="q must be an array of real numbers"):
+        accelerations(pendulum(), [0.0], "q", np.zeros((2, 1)))

@@ -1,5 +1,7 @@
 """The beam without constraints: against other solvers, against a two-loop procedure, and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -43,5 +45,11 @@ def test_the_constrained_beam_moves_alike(problem):
 )
 def test_wrong_input_is_named(problem, change, words):
     arguments = {"problem": problem, "t_eval": TIMES, "tol": 1e-8, "solver": "DOP853"}
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(TypeError if "problem" in change else ValueError, match=words):
         reduced_motion(**{**arguments, **change})
+
+
+def test_a_start_that_is_not_finite_is_an_error(problem):
+    moving = replace(problem, v0=np.full(problem.v0.size, np.nan))
+    with pytest.raises(RuntimeError, match=r"DOP853 .* cannot start: the accelerations are not finite"):
+        reduced_motion(moving, TIMES, 1e-8)

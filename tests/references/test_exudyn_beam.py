@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from references.exudyn_beam import MODELS, solve_exudyn_beam
-from references.exudyn_four_bar import solve_exudyn
+from references.exudyn_four_bar import SOLVERS, solve_exudyn
 from references.ida import solve_ida
 from twoloop.mechanisms import ancf_beam, four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height
@@ -110,7 +110,7 @@ def test_beams_meet_as_the_section_gets_slender():
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("solver", ["GeneralizedAlpha", "TrapezoidalIndex2"])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_result_is_in_our_order_and_on_the_base(model, solver):
     problem = moderately_stiff_beam(4)
     result = solve_exudyn_beam(problem, 0.2, 400, model, solver=solver)

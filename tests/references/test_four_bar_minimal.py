@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
+from references import four_bar_minimal
 from references.four_bar_minimal import MinimalFourBar, trajectory
 from twoloop.mechanisms import four_bar
 
@@ -86,6 +87,42 @@ def test_wrong_geometry_is_named():
         MinimalFourBar((1.0, 1.0, 1.0), 4.0, 0.0, -1, 1.0, 9.81)
     with pytest.raises(ValueError, match="equilibrium"):
         MinimalFourBar((1.0, 2.0, 1.5), 3.0, 0.0, -1, 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "words"),
+    [
+        ({"lengths": (1.0, 2.0)}, ValueError, "lengths must have shape"),
+        ({"lengths": (1.0, -2.0, 1.5)}, ValueError, "lengths must be positive"),
+        ({"lengths": (1.0, np.nan, 1.5)}, ValueError, "lengths must be finite"),
+        ({"ground": 0.0}, ValueError, "ground must be positive"),
+        ({"density": 0.0}, ValueError, "density must be positive"),
+        ({"theta3": np.nan}, ValueError, "theta3 must be finite"),
+        ({"gravity": np.inf}, ValueError, "gravity must be finite"),
+        ({"gravity": "9.81"}, TypeError, "gravity must be a number"),
+        ({"branch": 0}, ValueError, "branch must be 1 or -1; given 0"),
+        ({"gravity": 1e200}, ValueError, "equation of motion cannot be integrated: Required step size"),
+        ({"gravity": 1e-6}, ValueError, "does not come to rest within 1000 s"),
+    ],
+)
+def test_wrong_arguments_are_named(changed, error, words):
+    given = {"lengths": (1.0, 2.0, 1.5), "ground": 3.0, "theta3": 0.0, "branch": -1, "density": 1.0, "gravity": 9.81}
+    with np.errstate(all="ignore"), pytest.raises(error, match=words):
+        MinimalFourBar(**{**given, **changed})
+
+
+def test_the_search_for_the_period_and_the_integration_end(monkeypatch):
+    for most in (100, 2000):  # the search takes fewer than 2000, the integration more
+        monkeypatch.setattr(four_bar_minimal, "MOST_EVALUATIONS", most)
+        with pytest.raises(ValueError, match=f"not come to rest after {most} evaluations"):
+            MinimalFourBar.from_parameters(PROBLEMS[0].parameters)
+
+
+def test_an_equation_of_motion_that_is_not_finite_is_an_error(monkeypatch):
+    monkeypatch.setattr(four_bar_minimal, "_tangent_rate", lambda *_: np.full(3, np.nan))
+    rate = four_bar_minimal._counted(minimal_form(0)._rate)
+    with pytest.raises(ValueError, match=r"gives values that are not finite at t = 0\.5 s"):
+        rate(0.5, np.array([0.1, 0.2, 0.3, 1.0]))
 
 
 def _period_by_quadrature(problem):

@@ -5,7 +5,7 @@ import pytest
 
 from references.ida import solve_ida
 from references.ida_c import solve_ida_c
-from references.ida_options import ERROR_TESTS
+from references.ida_options import ERROR_TESTS, SETTINGS
 from references.index1 import solve_index1
 from tests.problems import without_tangent
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
@@ -152,3 +152,15 @@ def test_orders_and_error_test_reach_ida(driver):
 
     assert steps(max_order=1) > 10 * steps(max_order=2) > 20 * steps()
     assert steps(error_test="positions") < 0.8 * steps()
+
+
+def test_the_named_settings_are_both_drivers_and_the_best_one_is_far_cheaper_on_the_stiff_beam():
+    problem = CASES["stiff"]
+    arguments = problem.system, (0.0, 0.2), problem.q0, problem.v0
+    steps = {
+        name: solve_ida_c(*arguments, 1e-3, 1e-3, **options).stats.n_accepted for name, options in SETTINGS.items()
+    }
+    assert set(steps) == {"default", "best"} and 10 * steps["best"] < steps["default"], steps
+    assert solve_ida_c(*arguments, 1e-3, 1e-3).stats.n_accepted == steps["default"]
+    through_python = solve_ida(*arguments, "stabilised", 1e-3, 1e-3, **SETTINGS["best"])
+    assert 0.5 * steps["best"] < through_python.stats.n_accepted < 2.0 * steps["best"]

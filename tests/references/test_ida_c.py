@@ -186,6 +186,7 @@ def test_a_force_that_fails_comes_back_as_a_row(kind, flag, capfd):
 
 def test_too_many_steps_end_the_run(monkeypatch):
     monkeypatch.setattr(ida_c, "MOST_STEPS", 20)
+    monkeypatch.setattr(ida_c, "STEPS_A_CALL", 10)
     result = run(10.0, 1e-8, t_eval=[1e-6, 10.0])
     assert result.status is Status.SOLVER_FAILED and "IDA_TOO_MUCH_WORK (-1)" in result.message
     assert result.t.tolist() == [1e-6]

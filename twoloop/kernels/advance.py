@@ -6,8 +6,11 @@
 import numpy as np
 
 from twoloop.kernels.common import (
+    DEPARTURE,
     DONE,
+    FAULT_KIND,
     FUNCTIONS,
+    GAMMA_GIVEN,
     INNER_DIVERGED,
     INTEGERS,
     MATRIX,
@@ -16,6 +19,8 @@ from twoloop.kernels.common import (
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
     NOT_FINITE,
+    ORIENTATION,
+    ORIENTATION_NEW,
     SINGULAR,
     VECTOR,
     WORK,
@@ -24,12 +29,14 @@ from twoloop.kernels.common import (
     i8,
     kernel,
 )
-from twoloop.kernels.inner import accelerations, factor_dependent, factor_mass
+from twoloop.kernels.differences import representable
+from twoloop.kernels.inner import accelerations, factor_mass
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.partition import CHANGED, partition, partition_is_worn, partition_of_midpoint
+from twoloop.kernels.partition import CHANGED, partition_is_worn, partition_of_midpoint
+from twoloop.kernels.predictor import renew_partition
 
-# what advance() returns
-ALL_OUTPUT_DONE, BUFFER_FULL, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
+# what advance() returns; PAUSED: a buffer is full, or MAX_ATTEMPTS were made
+ALL_OUTPUT_DONE, PAUSED, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
 
 KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
@@ -50,8 +57,10 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is worn
     PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson), see also KEPT
     LEAST_ERROR,  # what an error below it counts as in the trend (Hairer & Wanner II, IV.8)
+    MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
+    SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
     N_CONTROL,
-) = range(15)
+) = range(17)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far
 H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
@@ -80,10 +89,10 @@ def start(f, w, t, state):
     q, v = state[:n], state[n : 2 * n]
     code = factor_mass(f, w, t, q)
     if code == DONE:
-        code = partition(f, w, t, q)
+        code = renew_partition(f, w, t, q)
     if code == DONE:
-        code = factor_dependent(f, w, t, q)
-    if code == DONE:
+        code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -119,6 +128,8 @@ def advance(
 ):
     """Step on from (clock, state) until every time in `outputs` is reached; steps are shortened to land on them.
 
+    Times are floating-point numbers: a step is the difference of two of them, so that the sum of the steps is the time.
+
     Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
     out_t / out_state and those of out_steps, every accepted step, that this call wrote.
     """
@@ -127,36 +138,51 @@ def advance(
     retried = np.inf  # where a step of fixed size was tried again with a new partition
     filled[0] = 0
     filled[1] = 0
+    attempts = 0.0
     while True:
-        if filled[0] == out_t.size or filled[1] == out_steps.shape[0]:
-            return BUFFER_FULL
+        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or attempts == control[MAX_ATTEMPTS]:
+            return PAUSED
+        attempts += 1.0
         if w.counters[N_ACCEPTED] >= control[MAX_STEPS]:
             return MAX_STEPS_REACHED
         t = clock[T]
         target = outputs[int(clock[NEXT_OUTPUT])]
         h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
         left = target - t
-        near = NEAR * np.spacing(max(abs(t), abs(target)))
         size = h
+        in_grid = 1.0  # steps of the grid that this one is
         if fixed:
             # times are counted, not added up; an output time within a millionth of a step of the grid is on it
-            end = clock[T_START] + (clock[N_FIXED] + 1.0) * h
-            lands = end >= target - max(1e-6 * h, near)
-            if abs(t + h - end) > near:
+            rounding = NEAR * np.spacing(max(abs(t), abs(target)))
+            near = max(1e-6 * h, rounding)
+            if target <= clock[T_START] + clock[N_FIXED] * h + near:
+                in_grid = 0.0  # a second output time beside the same point of the grid
+            end = clock[T_START] + (clock[N_FIXED] + in_grid) * h
+            lands = end >= target - near
+            if abs(t + h - end) > rounding:
                 size = end - t  # back to the grid after such an output time
+            shortened = lands
         else:
             lands = h >= left * (1.0 - 1e-10)
-            if not lands and h > 0.5 * left:
+            shortened = lands or h > 0.5 * left
+            if shortened and not lands:
                 size = 0.5 * left  # two equal steps rather than a long and a tiny one
+            size = representable(t, size)
+            if size > control[MAX_STEP]:
+                size = representable(t, size - np.spacing(t + size))
         if lands:
             size = left
-        if size <= near:
+        elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
             return STEP_TOO_SMALL
+        w.notes[DEPARTURE] = 0.0
+        w.notes[ORIENTATION_NEW] = 0.0
+        w.notes[FAULT_KIND] = -1.0
         code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
             code = partition_of_midpoint(f, w, t + 0.5 * size, state, new_state)
             if code == CHANGED:
                 memory[0] = 0.0  # what the step keeps is of one that is not taken
+                w.notes[DEPARTURE] = 0.0
                 code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and not np.isfinite(error):
             code = NOT_FINITE
@@ -170,14 +196,14 @@ def advance(
                 # the step keeps its size; only a partition that went bad within it may be the reason
                 if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
                     return FIXED_STEP_FAILED
-                if partition(f, w, t, state[:n]) != DONE:
+                if renew_partition(f, w, t, state[:n]) != DONE:
                     return RANK_LOST
                 retried = t
                 continue
             clock[H_LIMIT] = control[LIMIT_FACTOR] * size
             clock[LIMIT_AGE] = 0.0
             clock[H_NEXT] = 0.5 * size
-            if code in (SINGULAR, INNER_DIVERGED) and partition(f, w, t, state[:n]) != DONE:
+            if code in (SINGULAR, INNER_DIVERGED) and renew_partition(f, w, t, state[:n]) != DONE:
                 return RANK_LOST
             continue
         factor = control[FACTOR_MAX]
@@ -198,12 +224,13 @@ def advance(
         w.counters[N_ACCEPTED] += 1
         clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
         clock[FAILURE_CODE] = DONE
-        clock[N_FIXED] += 1.0
+        clock[N_FIXED] += in_grid
         if lands:
             clock[T] = target
         else:
             clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
         copy(new_state, state)
+        w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
         out_steps[filled[1], H] = size
         out_steps[filled[1], ERRORS] = w.counters[N_REJECTED_ERROR]
         out_steps[filled[1], FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
@@ -214,7 +241,7 @@ def advance(
             copy(state, out_state[filled[0]])
             filled[0] += 1
         # a step cut short by an output time says little about the next
-        clock[H_NEXT] = proposal if size == h else max(proposal, h)
+        clock[H_NEXT] = max(proposal, h) if shortened else proposal
         clock[LIMIT_AGE] += 1.0
         if clock[LIMIT_AGE] > control[LIMIT_MEMORY]:
             clock[H_LIMIT] = control[LIMIT_START]
@@ -223,5 +250,5 @@ def advance(
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
-        if control[SYMMETRIC] == 0.0 and partition_is_worn(w) and partition(f, w, clock[T], state[:n]) != DONE:
+        if control[SYMMETRIC] == 0.0 and partition_is_worn(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
             return RANK_LOST

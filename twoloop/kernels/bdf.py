@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, inlined, kernel
 from twoloop.kernels.inner import accelerations, evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
+from twoloop.kernels.predictor import departure
 from twoloop.kernels.runge_kutta import sweep_accelerations
 from twoloop.kernels.stages import options_array as gauss_options
 from twoloop.tableaux import gauss
@@ -169,6 +170,9 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
         copy(a_new, a1)
         # the first sweep evaluates the prediction, never to be accepted: extrapolation alone is unstable
         if sweep > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
+            for k in range(w.dependent.size):
+                m = w.dependent[k]
+                w.predicted[k] = prediction[m] + c * (prediction[n + m] + c * (a1[m] - rate[n + m]) - rate[m])
             return DONE
         if not change <= before:
             return OUTER_DIVERGED
@@ -179,9 +183,10 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
 @compiled
 def _norm(tolerances, y, y1, d, sign, difference):
     """Largest component of d + sign * difference over atol + rtol |y|."""
+    n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
-        scale = tolerances[ATOL] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
+        scale = tolerances[ATOL + m % n_q] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
         largest = max(largest, abs(d[m] + sign * difference[m]) / scale)
     return largest
 
@@ -243,7 +248,7 @@ def _extend(memory, trial, y1, d):
 
 
 @compiled
-def _gauss_step(f, w, options, t, h, state, new_state, scratch):
+def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     """A step of the starter, of order 6."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
@@ -253,7 +258,7 @@ def _gauss_step(f, w, options, t, h, state, new_state, scratch):
     for j in range(s):
         copy(state[2 * n : 3 * n], A_stage[j])
     code = sweep_accelerations(
-        f, w, options[N_SCALARS:], t, h, state[:n], state[n : 2 * n], A_stage, Q_stage, V_stage, q1, v1
+        f, w, options[N_SCALARS:], tolerances, t, h, state[:n], state[n : 2 * n], A_stage, Q_stage, V_stage, q1, v1
     )
     if code == DONE:
         code = accelerations(f, w, t + h, q1, v1, new_state[2 * n : 3 * n], new_state[3 * n :])
@@ -278,7 +283,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     length = memory[LEAD] + h
     _predict(memory, differences, trial, length, prediction, rate)
     if fixed and k < options[HIGHEST]:
-        code = _gauss_step(f, w, options, t, h, state, new_state, scratch)
+        code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
     else:
         code = _correct(f, w, options, t + h, length, k, prediction, rate, new_state, scratch[:n])
     if code != DONE:
@@ -291,6 +296,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[NEXT_ORDER] = min(k + 1, int(options[HIGHEST]))
     else:
         error = _judge(options, memory, tolerances, trial, y, y1, d)
+        error = max(error, departure(w, tolerances, length, y[:n], y[n:], y1[:n]))
     if after_accepted and length < SHORT * _coefficients(memory, SPANS)[0]:
         memory[TRIAL] = AHEAD
         memory[NEXT_LEAD] = length

@@ -60,7 +60,8 @@ class Work(NamedTuple):
     x: Any  # (n_q) scratch
     C: Any  # (n_c) constraint, and corrections
     Ct: Any  # (n_c) constraint rate
-    Qd: Any  # (n_c) right side of Cq a = Qd
+    Qd: Any  # (n_c) right-hand side of Cq a = Qd
+    Qd_tried: Any  # (2, n_c) the same by differences over a double length, and with the length tried before
     g: Any  # (n_c) scratch
     lam: Any  # (n_c) multipliers of an evaluation that nobody keeps
     dependent: Any  # (n_c) columns of the dependent coordinates
@@ -69,11 +70,12 @@ class Work(NamedTuple):
     order: Any  # (n_q) scratch: column order of the full pivoting
     counters: Any  # (N_COUNTERS) see below
     lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
-    sensitivity: Any  # (1) max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
+    predicted: Any  # (n_c) dependent positions that the integration formula gives, before the constraints restore them
+    notes: Any  # (N_NOTES) see below
 
 
 _INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters", "lapack")
-_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx", "Cq_of_S")
+_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx", "Cq_of_S", "Qd_tried")
 WORK = types.NamedTuple(
     [MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields],
     Work,
@@ -93,15 +95,31 @@ WORK = types.NamedTuple(
     N_COUNTERS,
 ) = range(10)
 
+# places in Work.notes
+(
+    SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
+    DEPARTURE,  # how far the predicted dependents were off in this attempt, see predictor.py
+    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
+    ORIENTATION_NEW,  # ... and at the end of this attempt
+    FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
+    FAULT_TIME,  # ... and when
+    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see differences.py
+    GAMMA_SHARE,  # of the longest length over which to difference
+    GAMMA_ACCURACY,  # reached when that share was chosen
+    GAMMA_SCALE,  # largest entry of Q_d so far
+    N_NOTES,
+) = range(11)
+
 # what a kernel returns: DONE, or why it could not
-DONE, OUTER_DIVERGED, INNER_DIVERGED, SINGULAR, NOT_FINITE, MASS_NOT_DEFINITE = range(6)
+DONE, OUTER_DIVERGED, INNER_DIVERGED, SINGULAR, NOT_FINITE, MASS_NOT_DEFINITE, GAMMA_INACCURATE = range(7)
 
 # (functions, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
 STEP = types.Tuple((i8, f8))(FUNCTIONS, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
 StepFunction = types.FunctionType(STEP)
 
-# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step
-ATOL, RTOL, ESTIMATE, N_TOLERANCES = range(4)
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance; from
+# ATOL on stands the absolute tolerance of each coordinate and its velocity
+RTOL, ESTIMATE, LEAST, ATOL = range(4)
 
 
 @cache
@@ -130,8 +148,11 @@ def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
 _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+    "nogil": True,
     "_nrt": False,
 }
+# a helper whose floating-point operations keep their order; said outright, because a callee inherits its caller's flags
+exact = njit(**{**_OPTIONS, "fastmath": False})
 compiled = njit(**_OPTIONS)  # a helper that kernels call
 # a helper that vanishes in its caller: a call would pass the thirty fields of Functions and Work by value
 inlined = njit(**_OPTIONS, inline="always")
@@ -153,6 +174,7 @@ def make_work(n_q: int, n_c: int) -> Work:
         C=np.zeros(n_c),
         Ct=np.zeros(n_c),
         Qd=np.zeros(n_c),
+        Qd_tried=np.zeros((2, n_c)),
         g=np.zeros(n_c),
         lam=np.zeros(n_c),
         dependent=np.zeros(n_c, dtype=np.int64),
@@ -161,5 +183,6 @@ def make_work(n_q: int, n_c: int) -> Work:
         order=np.zeros(n_q, dtype=np.int64),
         counters=np.zeros(N_COUNTERS, dtype=np.int64),
         lapack=np.zeros(N_ROUTINES, dtype=np.int64),
-        sensitivity=np.zeros(1),
+        predicted=np.zeros(n_c),
+        notes=np.zeros(N_NOTES),
     )

@@ -7,9 +7,10 @@ inner loop restores the dependents of every stage, so that the step never leaves
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, RTOL, STEP, compiled, inlined, kernel
-from twoloop.kernels.inner import accelerations, evaluate, restore
+from twoloop.kernels.common import ATOL, DEPARTURE, DONE, ESTIMATE, N_OUTER, RTOL, STEP, compiled, inlined, kernel
+from twoloop.kernels.inner import accelerations, evaluate
 from twoloop.kernels.linalg import copy
+from twoloop.kernels.predictor import restore_predicted
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, N_SCALARS = range(3)
@@ -84,7 +85,7 @@ def _largest(tolerances, h, weights, y, y1, slopes, estimate):
     _weighted(weights, slopes, estimate)
     largest = 0.0
     for m in range(y.size):
-        scale = tolerances[ATOL] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
+        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
         largest = max(largest, abs(h * estimate[m]) / scale)
     return largest
 
@@ -130,7 +131,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, estimate)
         if not error <= 1.0:
             return DONE, error
-    code = restore(f, w, t + h, q1, v1, options[INNER_TOL])
+    code = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
     if code == DONE:
         code = accelerations(f, w, t + h, q1, v1, a1, lam1)
-    return code, error
+    return code, max(error, w.notes[DEPARTURE])

@@ -10,7 +10,10 @@ from twoloop.kernels.common import (
     CONSTANT_MASS,
     DIAGONAL_MASS,
     DONE,
+    FAULT_KIND,
+    FAULT_TIME,
     GAMMA_GIVEN,
+    GAMMA_SCALE,
     INNER_DIVERGED,
     MASS_NOT_DEFINITE,
     N_EVALUATIONS,
@@ -18,17 +21,22 @@ from twoloop.kernels.common import (
     N_INNER,
     NOT_FINITE,
     SINGULAR,
+    Functions,
     compiled,
     inlined,
 )
+from twoloop.kernels.differences import gamma_by_differences
 from twoloop.kernels.linalg import copy, invert_definite, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.partition import RANK_TOLERANCE
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
-DIFFERENCE, SHORTEST = 2e-4, 1e-4  # see difference_step
 ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
 ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
+
+_MASS, _FORCE, _CONSTRAINT, _JACOBIAN, _RATE, _GAMMA = (
+    Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
+)
 
 
 @compiled
@@ -49,6 +57,32 @@ def _equal(A, B):
     return True
 
 
+@compiled
+def _not_finite(notes, kind, t, q):
+    """Note which callback gave a value that is not finite, for the message; none where q itself is not finite."""
+    notes[FAULT_KIND] = kind if _finite_vector(q) else -1.0
+    notes[FAULT_TIME] = t
+    return NOT_FINITE
+
+
+@compiled
+def _finite_vector(x):
+    for j in range(x.size):
+        if not np.isfinite(x[j]):
+            return False
+    return True
+
+
+@compiled
+def _which_acceleration(Ct, Qd, Q):
+    """Place in Functions of the callback that gave a value that is not finite; -1: none of these three."""
+    if not _finite_vector(Ct):
+        return _RATE
+    if not _finite_vector(Qd):
+        return _GAMMA
+    return _FORCE if not _finite_vector(Q) else -1
+
+
 @inlined
 def factor_dependent(f, w, t, q):
     """C_q at (t, q), and the LU factors of its dependent columns."""
@@ -61,7 +95,7 @@ def factor_dependent(f, w, t, q):
     ratio = lu_factor(w.Cqd, w.pivots)
     w.counters[N_FACTORIZATIONS] += 1
     if not ratio > RANK_TOLERANCE:
-        return SINGULAR if _finite(w.Cq) else NOT_FINITE
+        return SINGULAR if _finite(w.Cq) else _not_finite(w.notes, _JACOBIAN, t, q)
     return DONE
 
 
@@ -82,7 +116,7 @@ def _positions(f, w, t, q, tolerance):
             q[w.dependent[k]] -= w.C[k]
             correction = max(correction, abs(w.C[k]))
             if not np.isfinite(w.C[k]):
-                return NOT_FINITE
+                return _not_finite(w.notes, _CONSTRAINT, t, q)
         if correction <= tolerance:
             return DONE
         if correction > CONTRACTION * before:
@@ -117,35 +151,6 @@ def _velocities(f, w, t, q, v):
 
 
 @inlined
-def _velocity_constraint(f, w, t, q, v, g):
-    """g = C_q(t, q) v + C_t(t, q) at a displaced point."""
-    w.Cqx[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.Cqx)
-    g[:] = 0.0
-    f.constraint_rate(t, q, f.p, g)
-    for i in range(g.size):
-        total = g[i]
-        for j in range(v.size):
-            total += w.Cqx[i, j] * v[j]
-        g[i] = total
-
-
-@inlined
-def difference_step(q, v):
-    """Seconds over which to difference along the motion: DIFFERENCE, or until q moves by DIFFERENCE max|q|.
-
-    But at least DIFFERENCE SHORTEST.
-    """
-    size = 0.0
-    speed = 0.0
-    for j in range(v.size):
-        size = max(size, abs(q[j]))
-        speed = max(speed, abs(v[j]))
-    size = max(size, SHORTEST * speed)  # where all coordinates pass through zero
-    return DIFFERENCE * size / speed if speed > size else DIFFERENCE
-
-
-@inlined
 def rounding_floor(q):
     """Relative change below which a sweep that stops shrinking has converged: rounding of q moves accelerations."""
     size = 0.0
@@ -155,28 +160,15 @@ def rounding_floor(q):
 
 
 @inlined
-def gamma_by_differences(f, w, t, q, v):
-    """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, central differences of order 4."""
-    step = difference_step(q, v)
-    w.Qd[:] = 0.0
-    for k in range(4):
-        shift = (-2.0, -1.0, 1.0, 2.0)[k] * step
-        weight = (-1.0, 8.0, -8.0, 1.0)[k] / (12.0 * step)
-        for j in range(q.size):
-            w.x[j] = q[j] + shift * v[j]
-        _velocity_constraint(f, w, t + shift, w.x, v, w.g)
-        for i in range(w.g.size):
-            w.Qd[i] += weight * w.g[i]
-
-
-@inlined
 def acceleration_constraint(f, w, t, q, v):
-    """The right side Q_d of C_q a = Q_d, into w.Qd."""
+    """The right-hand side Q_d of C_q a = Q_d, into w.Qd; DONE, or why it cannot be had."""
+    code = DONE
     if f.flags[GAMMA_GIVEN] == 1:
         w.Qd[:] = 0.0
         f.gamma(t, q, v, f.p, w.Qd)
     else:
-        gamma_by_differences(f, w, t, q, v)
+        code = gamma_by_differences(f, w, t, q, v)
+    return code
 
 
 @inlined
@@ -193,7 +185,7 @@ def factor_mass(f, w, t, q):
         code = DONE if definite else MASS_NOT_DEFINITE
     if code == DONE:
         return DONE
-    return MASS_NOT_DEFINITE if _finite(w.M) else NOT_FINITE
+    return MASS_NOT_DEFINITE if _finite(w.M) else _not_finite(w.notes, _MASS, t, q)
 
 
 @inlined
@@ -272,7 +264,9 @@ def _accelerations(f, w, t, q, v, a, lam):
         code = factor_mass(f, w, t, q)
         if code != DONE:
             return code
-    acceleration_constraint(f, w, t, q, v)
+    code = acceleration_constraint(f, w, t, q, v)
+    if code != DONE:
+        return code
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
     code = _factor_schur_complement(f, w)
@@ -300,7 +294,13 @@ def _accelerations(f, w, t, q, v, a, lam):
         _times_inverse_mass(f, w, a, a)  # (8)
     for j in range(n_q):
         if not np.isfinite(a[j]):
-            return NOT_FINITE
+            return _not_finite(w.notes, _which_acceleration(w.Ct, w.Qd, w.Q), t, q)
+    if f.flags[GAMMA_GIVEN] == 0:
+        for i in range(n_c):
+            total = 0.0
+            for j in range(n_q):
+                total += abs(w.Cq[i, j] * a[j])
+            w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], total)
     return DONE
 
 

@@ -56,6 +56,16 @@ def lu_factor(A, pivots):
 
 
 @inlined
+def lu_sign(A, pivots):
+    """Sign of the determinant of a real matrix, from the factors of `lu_factor`."""
+    sign = 1.0
+    for k in range(A.shape[0]):
+        if (A[k, k] < 0.0) != (pivots[k] != k):
+            sign = -sign
+    return sign
+
+
+@inlined
 def lu_solve(A, pivots, x):
     """Solve with the factors of `lu_factor`; x is overwritten."""
     n = A.shape[0]

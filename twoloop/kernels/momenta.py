@@ -15,6 +15,7 @@ import numpy as np
 
 from twoloop.kernels.common import (
     CONSTANT_MASS,
+    DEPARTURE,
     DONE,
     ESTIMATE,
     MASS_NOT_DEFINITE,
@@ -28,15 +29,16 @@ from twoloop.kernels.common import (
     inlined,
     kernel,
 )
+from twoloop.kernels.differences import longest_difference
 from twoloop.kernels.inner import (
     acceleration_constraint,
     accelerations,
     dependent_positions,
-    difference_step,
     factor_dependent,
     rounding_floor,
 )
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_solve
+from twoloop.kernels.predictor import departure, keep_predicted
 from twoloop.kernels.runge_kutta import GROWTH, MAX_SWEEPS, PATIENCE, conclude
 from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
@@ -148,7 +150,7 @@ def _velocities(w, tangent, reduced, u, p, v):
 @compiled
 def _mass_rate(f, w, t, q, v, shifted, y):
     """y += M' v, M differenced along the motion (central, order 4); w.L is free where M is not constant."""
-    step = difference_step(q, v)
+    step = longest_difference(q, v)
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * step
         weight = (1.0, -8.0, 8.0, -1.0)[k] / (12.0 * step)
@@ -177,22 +179,26 @@ def _momentum_rates(f, w, t, q, v, tangent, Mv, shifted, rate):
             total += tangent[k, j] * w.Q[j]
         for j in range(n_q):
             shifted[j] = v[j] - tangent[k, j]
-        acceleration_constraint(f, w, t, q, shifted)
+        code = acceleration_constraint(f, w, t, q, shifted)
         for i in range(n_c):
             w.C[i] = -w.Qd[i]
         for j in range(n_q):
             shifted[j] = v[j] + tangent[k, j]
-        acceleration_constraint(f, w, t, q, shifted)
+        if code == DONE:
+            code = acceleration_constraint(f, w, t, q, shifted)
+        if code != DONE:
+            return code
         for i in range(n_c):
             w.C[i] = 0.25 * (w.C[i] + w.Qd[i])  # -C_q' T_k
         lu_solve(w.Cqd, w.pivots, w.C)
         for i in range(n_c):
             total += w.C[i] * Mv[w.dependent[i]]
         rate[w.independent[k]] = total
+    return DONE
 
 
 @compiled
-def _sweep(f, w, options, memory, t, h, q, p, V_stage, R_stage, q1, p1, v1):
+def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, q1, p1, v1):
     """One step of size h from (q, p) by sweeps; V_stage, R_stage hold predicted velocities and rates of p on entry.
 
     On return they have converged, and q1, p1, v1 are the end of the step, on the constraints.
@@ -238,7 +244,9 @@ def _sweep(f, w, options, memory, t, h, q, p, V_stage, R_stage, q1, p1, v1):
             if code != DONE:
                 return code
             _velocities(w, tangent, reduced, u, P_stage[j], v)
-            _momentum_rates(f, w, t + c[j] * h, Q_stage[j], v, tangent, Mv, shifted, R_stage[j])
+            code = _momentum_rates(f, w, t + c[j] * h, Q_stage[j], v, tangent, Mv, shifted, R_stage[j])
+            if code != DONE:
+                return code
             for m in w.independent:
                 difference = abs(v[m] - V_stage[j, m])
                 change = max(change, difference / max(abs(v[m]), 1.0))
@@ -271,8 +279,10 @@ def _sweep(f, w, options, memory, t, h, q, p, V_stage, R_stage, q1, p1, v1):
         for k in range(s):
             in_p += b[k] * R_stage[k, m]
         p1[m] = p[m] + h * in_p
+    keep_predicted(w, q1)
     code = dependent_positions(f, w, t + h, q1, options[INNER_TOL])
     if code == DONE:
+        w.notes[DEPARTURE] = max(w.notes[DEPARTURE], departure(w, tolerances, h, q, v0, q1))
         code = _tangents(f, w, t + h, q1, tangent, reduced, u)
     if code == DONE:
         _velocities(w, tangent, reduced, u, p1, v1)
@@ -319,11 +329,13 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 1.0 + ratio * c[j], v_previous, weights, v_trial[j])
             interpolate(c, 1.0 + ratio * c[j], r_previous, weights, r_trial[j])
     else:
-        _momentum_rates(f, w, t, q, v, tangent, Mv, _vector(memory, s, n, SHIFTED), rate)
+        code = _momentum_rates(f, w, t, q, v, tangent, Mv, _vector(memory, s, n, SHIFTED), rate)
+        if code != DONE:
+            return code, np.inf
         for j in range(s):
             copy(v, v_trial[j])
             copy(rate, r_trial[j])
-    code = _sweep(f, w, options, memory, t, h, q, p, v_trial, r_trial, q1, p1, v1)
+    code = _sweep(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -333,13 +345,16 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         for j in range(s):
             interpolate(c, 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 * c[j], r_trial, weights, r_half[j])
-        code = _sweep(f, w, options, memory, t, 0.5 * h, q, p, v_half, r_half, q_mid, p_mid, v_mid)
+        w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
+        code = _sweep(f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid)
         if code != DONE:
             return code, np.inf
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 + 0.5 * c[j], r_trial, weights, r_half[j])
-        code = _sweep(f, w, options, memory, t + 0.5 * h, 0.5 * h, q_mid, p_mid, v_half, r_half, q1, p1, v1)
+        code = _sweep(
+            f, w, options, memory, tolerances, t + 0.5 * h, 0.5 * h, q_mid, v_mid, p_mid, v_half, r_half, q1, p1, v1
+        )
         if code != DONE:
             return code, np.inf
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
@@ -348,4 +363,4 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
-    return code, error
+    return code, max(error, w.notes[DEPARTURE])

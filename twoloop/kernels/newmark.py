@@ -5,27 +5,44 @@ import numpy as np
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, kernel
 from twoloop.kernels.inner import evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
+from twoloop.kernels.predictor import departure
 
 MAX_SWEEPS = 60
+TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
+
+# places in `memory` before the new accelerations; the first is advance()'s
+RATE, N_MEMORY_SCALARS = range(1, 3)
 
 # places in `options`
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
 @compiled
-def _error(options, tolerances, h, q, a, a1):
-    """|beta - 1/6| h^2 |a1 - a|: the leading local error of q, for any beta and gamma = 1/2.
-
-    With ERROR_TOL > 0 the 2-norm over ERROR_TOL (the paper's err_out); else the weighted root mean square.
-    """
-    factor = abs(options[BETA] - 1.0 / 6.0) * h * h
-    total = 0.0
+def _rate(q, v, a):
+    """Reciprocal of the time in which velocities and accelerations change the coordinates as a whole."""
+    size, speed, acceleration = 0.0, 0.0, 0.0
     for m in range(q.size):
-        scale = 1.0 if options[ERROR_TOL] > 0.0 else tolerances[ATOL] + tolerances[RTOL] * abs(q[m])
-        total += ((a1[m] - a[m]) / scale) ** 2
-    if options[ERROR_TOL] > 0.0:
-        return factor * np.sqrt(total) / options[ERROR_TOL]
-    return factor * np.sqrt(total / q.size)
+        size = max(size, abs(q[m]))
+        speed = max(speed, abs(v[m]))
+        acceleration = max(acceleration, abs(a[m]))
+    return max(speed / size, np.sqrt(acceleration / size)) if size > 0.0 else 0.0
+
+
+@compiled
+def _error(options, tolerances, rate, h, q, v, a, a1):
+    """Of e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for any beta and gamma = 1/2.
+
+    The largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 as the global error
+    is. With ERROR_TOL > 0 the 2-norm of e over ERROR_TOL (the paper's err_out).
+    """
+    factor = abs(options[BETA] - 1.0 / 6.0) * h
+    total = 0.0
+    largest = 0.0
+    for m in range(q.size):
+        e = factor * abs(a1[m] - a[m])
+        total += (h * e) ** 2
+        largest = max(largest, e / (rate * tolerances[ATOL + m] + tolerances[RTOL] * abs(v[m]) + TINY))
+    return np.sqrt(total) / options[ERROR_TOL] if options[ERROR_TOL] > 0.0 else largest
 
 
 @kernel(STEP)
@@ -35,7 +52,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     beta, gamma = options[BETA], options[GAMMA]
-    a_new = memory[1 : 1 + n]  # memory[0] is advance()'s
+    a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
     for m in range(n):
         a1[m] = a[m]
         q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: where Newton starts
@@ -55,7 +72,15 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
         if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
-            error = _error(options, tolerances, h, q, a, a1) if tolerances[ESTIMATE] == 1.0 else 0.0
+            error = 0.0
+            if tolerances[ESTIMATE] == 1.0:
+                memory[RATE] = max(memory[RATE], _rate(q, v, a), _rate(q1, v1, a1))
+                error = _error(options, tolerances, memory[RATE], h, q, v, a, a1)
+                if options[ERROR_TOL] == 0.0:  # not in the paper
+                    for k in range(w.dependent.size):
+                        m = w.dependent[k]
+                        w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
+                    error = max(error, departure(w, tolerances, h, q, v, q1))
             return DONE, error
         if not change <= before:
             return OUTER_DIVERGED, np.inf

@@ -19,8 +19,10 @@ from twoloop.kernels import newton_banded, newton_dense
 from twoloop.kernels.common import (
     ATOL,
     BANDWIDTH,
+    DEPARTURE,
     DONE,
     ESTIMATE,
+    LEAST,
     N_OUTER,
     N_PARTITIONS,
     OUTER_DIVERGED,
@@ -29,7 +31,7 @@ from twoloop.kernels.common import (
     compiled,
     kernel,
 )
-from twoloop.kernels.inner import accelerations, evaluate, restore
+from twoloop.kernels.inner import accelerations, evaluate
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.newton_memory import (
     A_MID,
@@ -62,9 +64,11 @@ from twoloop.kernels.newton_memory import (
     eigen_place,
     vector,
 )
+from twoloop.kernels.predictor import restore_predicted
 from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 MAX_ITERATIONS = 15
+SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
 STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
@@ -177,7 +181,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     before = 0.0
     floor = STAGNATION_FIXED
     if tolerances[ESTIMATE] == 1.0:
-        floor = STAGNATION * min(tolerances[ATOL], tolerances[RTOL])
+        floor = STAGNATION * tolerances[LEAST]
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for j in range(s):
@@ -266,8 +270,8 @@ def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
     for i in range(m):
         j = w.independent[i]
         in_q = e_q[i] + h * gamma0 * e_v[i]
-        error = max(error, abs(in_q) / (tolerances[ATOL] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
-        error = max(error, abs(e_v[i]) / (tolerances[ATOL] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
+        error = max(error, abs(in_q) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
+        error = max(error, abs(e_v[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
     return error
 
 
@@ -309,7 +313,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             memory[HAS_JACOBIAN] = 1.0
             memory[FRESH] = 1.0
             memory[H_FACTORED] = 0.0
-        if memory[H_FACTORED] != h:
+        if abs(memory[H_FACTORED] - h) > SAME_STEP * h:
             code = _factor(f, w, options, memory, s, h)
             if code != DONE:
                 memory[HAS_JACOBIAN] = 0.0
@@ -334,12 +338,13 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             in_v += b[k] * trial[k, m]
         q1[m] = q[m] + h * v[m] + h * h * in_q
         v1[m] = v[m] + h * in_v
-    code = restore(f, w, t + h, q1, v1, options[INNER_TOL])
+    code = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
     if code != DONE:
         return code, np.inf
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _estimate(f, w, options, memory, h, tolerances, q, v, a, trial, q1, v1)
+        error = max(error, w.notes[DEPARTURE])
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h

@@ -1,6 +1,6 @@
 """LU coordinate partitioning: which coordinates are independent."""
 
-from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, SINGULAR, compiled, inlined
+from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, ORIENTATION, SENSITIVITY, SINGULAR, compiled, inlined
 from twoloop.kernels.linalg import lu_solve
 
 RANK_TOLERANCE = 1e-11  # a pivot below this fraction of the largest one counts as zero
@@ -63,7 +63,8 @@ def _take_order(w):
     # ascending, so that the same set is always the same partition
     _insert_sorted(w.order[:n_c], w.dependent)
     _insert_sorted(w.order[n_c:], w.independent)
-    w.sensitivity[0] = 0.0
+    w.notes[SENSITIVITY] = 0.0
+    w.notes[ORIENTATION] = 0.0
 
 
 @compiled
@@ -127,6 +128,6 @@ def partition_is_worn(w):
         lu_solve(w.Cqd, w.pivots, w.g)
         for i in range(w.g.size):
             largest = max(largest, abs(w.g[i]))
-    if w.sensitivity[0] == 0.0:  # first look at a new partition
-        w.sensitivity[0] = max(largest, 1.0)
-    return not largest <= WORSE * w.sensitivity[0]
+    if w.notes[SENSITIVITY] == 0.0:  # first look at a new partition
+        w.notes[SENSITIVITY] = max(largest, 1.0)
+    return not largest <= WORSE * w.notes[SENSITIVITY]

@@ -8,6 +8,7 @@ import numpy as np
 
 from twoloop.kernels.common import (
     ATOL,
+    DEPARTURE,
     DONE,
     ESTIMATE,
     N_OUTER,
@@ -20,6 +21,7 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.inner import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.linalg import copy
+from twoloop.kernels.predictor import restore_predicted
 from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 MAX_SWEEPS = 60
@@ -51,12 +53,12 @@ def _vector(memory, s, n, which):
 
 
 @compiled
-def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
+def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
     """One step of size h from (q, v) by sweeps on the stage accelerations; A_stage holds their prediction on entry.
 
     Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
     undamped systems the sweep's rate is the square of the first-order one. On return A_stage has converged and
-    (q1, v1) is the end of the step, on the constraints.
+    (q1, v1) is the end of the step, on the constraints; w.notes[DEPARTURE] grows to how far its prediction was off.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -116,7 +118,7 @@ def sweep_accelerations(f, w, options, t, h, q, v, A_stage, Q_stage, V_stage, q1
             in_v += b[k] * A_stage[k, m]
         q1[m] = q[m] + h * v[m] + h * h * in_q
         v1[m] = v[m] + h * in_v
-    return restore(f, w, t + h, q1, v1, tolerance)
+    return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
 @compiled
@@ -189,11 +191,11 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
     Its largest component, or the root mean square (27).
     """
-    atol = tolerances[ATOL]
     rtol = tolerances[RTOL]
     total = 0.0
     top = 0.0
     for m in range(q.size):
+        atol = tolerances[ATOL + m]
         in_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
         in_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
         total += in_q * in_q + in_v * in_v
@@ -246,7 +248,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code = sweep_accelerations(f, w, options, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
+    code = sweep_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -255,12 +257,14 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(v1, v_full)
         for j in range(s):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
-        code = sweep_accelerations(f, w, options, t, 0.5 * h, q, v, half, Q_stage, V_stage, q_mid, v_mid)
+        w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
+        g = 0.5 * h
+        code = sweep_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid)
         if code != DONE:
             return code, np.inf
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
-        code = sweep_accelerations(f, w, options, t + 0.5 * h, 0.5 * h, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
+        code = sweep_accelerations(f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
         if code != DONE:
             return code, np.inf
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
@@ -269,7 +273,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
-    return code, error
+    return code, max(error, w.notes[DEPARTURE])
 
 
 @kernel(STEP)

@@ -1,0 +1,355 @@
+"""One run: its arrays, the chunks that the compiled `advance` returns, and what to say of how it ended."""
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.consistency import _NOTHING_FOUND, dependent_rows, not_finite
+from twoloop.derivatives import wrong_derivative
+from twoloop.kernels import common
+from twoloop.kernels.banded import banded_pays
+from twoloop.kernels.lapack import addresses
+from twoloop.plan import Plan, least_tolerance
+from twoloop.result import Result, Statistics, Status
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+BUFFER_ROWS = 1024
+BUFFER_STEPS = 4096
+FIRST_CHUNK = 32  # attempts before Python looks for the first time; twice as many each time up to BUFFER_STEPS
+CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
+FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
+SHORTEST_STEP = 1e-16  # of the first step
+GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
+STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
+STAGNATION_PACE = 1e-3  # ... against the best pace of the run before, and ...
+STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
+LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
+
+
+class Run:
+    """The arrays of one run, and the loop over its chunks.
+
+    Raises
+    ------
+    ValueError
+        If the accelerations at the start cannot be found.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        plan: Plan,
+        t0: float,
+        q0: Array,
+        v0: Array,
+        rtol: float,
+        atol: Array,
+        step_size: float | None,
+    ):
+        from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
+
+        self.a = advance
+        self.system, self.plan, self.t0 = system, plan, t0
+        self.work = common.make_work(system.n_q, system.n_c)
+        self.work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
+        self.work.notes[common.GAMMA_SHARE] = 1.0
+        flags = system.functions.flags.copy()
+        if system.constant_mass:
+            mass = system.mass(t0, q0)
+            flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+        if system.bandwidth is not None and banded_pays(system.n_q, system.n_c, system.bandwidth):
+            flags[common.BANDWIDTH] = system.bandwidth
+            self.work.lapack[:] = addresses()
+        self.functions = system.functions._replace(flags=flags)
+        self.state = np.concatenate([q0, v0, np.zeros(system.n_q + system.n_c)])
+        self.new_state = np.zeros_like(self.state)
+        self.tolerances = np.zeros(common.ATOL + system.n_q)
+        self.tolerances[common.RTOL] = rtol
+        self.tolerances[common.ESTIMATE] = step_size is None
+        self.tolerances[common.LEAST] = least_tolerance(rtol, float(atol.min()))
+        self.tolerances[common.ATOL :] = atol
+        self.control = np.zeros(advance.N_CONTROL)
+        self.control[advance.SAFETY] = plan.safety
+        self.control[advance.FACTOR_MIN] = plan.factor_min
+        self.control[advance.FACTOR_MAX] = plan.factor_max
+        self.control[advance.EXPONENT] = plan.exponent
+        self.control[advance.MAX_STEP] = np.inf
+        self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
+        self.control[advance.LIMIT_START] = plan.limit_start
+        self.control[advance.LIMIT_FACTOR] = plan.limit_factor
+        self.control[advance.LIMIT_MEMORY] = plan.limit_memory
+        self.control[advance.SYMMETRIC] = plan.symmetric
+        self.control[advance.PREDICTIVE] = plan.predictive
+        self.control[advance.LEAST_ERROR] = plan.least_error
+        self.control[advance.MAX_STEPS] = np.inf
+        self.control[advance.MAX_ATTEMPTS] = FIRST_CHUNK
+        self.clock = np.zeros(advance.N_CLOCK)
+        self.clock[advance.T] = self.clock[advance.T_START] = t0
+        self.clock[advance.H_LIMIT] = plan.limit_start
+        self._begin()
+
+    def _begin(self) -> None:
+        code = self.a.start(self.functions, self.work, self.t0, self.state)
+        if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
+            required = self.work.notes[common.GAMMA_REQUIRED]
+            self.work.notes[common.GAMMA_REQUIRED] = np.inf
+            code = self.a.start(self.functions, self.work, self.t0, self.state)
+            self.work.notes[common.GAMMA_REQUIRED] = required
+        if code == common.DONE:
+            return
+        n = self.system.n_q
+        if code == common.MASS_NOT_DEFINITE:
+            eigenvalues = np.linalg.eigvalsh(self.system.mass(self.t0, self.state[:n]))
+            raise ValueError(
+                f"mass of {self.system.name!r} must be positive definite; its smallest eigenvalue at t = {self.t0!r} "
+                f"is {eigenvalues.min():.3g}"
+            )
+        if code == common.SINGULAR:
+            raise ValueError(
+                f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: the constraint "
+                f"Jacobian has lost rank there ({dependent_rows(self.system, self.t0, self.state[:n])}). Start from "
+                "another position"
+            )
+        raise ValueError(
+            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {self._not_finite()}"
+        )
+
+    def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
+        """Set the first and the largest step, s."""
+        span = t1 - self.t0
+        first = min(self._first_step(span) if first_step is None else first_step, span)
+        self.clock[self.a.H_NEXT] = first
+        self.control[self.a.SHORTEST] = SHORTEST_STEP * first
+        self.control[self.a.MAX_STEP] = max_step
+
+    def _first_step(self, span: float) -> float:
+        """A share of the time in which the initial velocities and accelerations change the coordinates as a whole."""
+        n = self.system.n_q
+        q, v, a = (float(np.abs(self.state[k * n : (k + 1) * n]).max()) for k in range(3))
+        q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
+        scales = [span]
+        if v > 0.0:
+            scales.append(q / v)
+        if a > 0.0:
+            scales.append(float(np.sqrt(q / a)))
+        if v > 0.0 and a > 0.0 and v / a > FIRST_STEP * min(scales):  # not at what is next to rest
+            scales.append(v / a)
+        return FIRST_STEP * min(scales)
+
+    def go(self, t1: float, times: Array | None, report: Any, check_derivatives: bool) -> Result:
+        """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
+        a, system = self.a, self.system
+        every_step = times is None
+        outputs = np.array([t1]) if times is None else np.append(times[times > self.t0], t1)
+        if len(outputs) > 1 and outputs[-2] == t1:
+            outputs = outputs[:-1]
+        self.control[a.STORE_ALL] = every_step
+        first_row = every_step or (times is not None and times[0] == self.t0)
+        t_parts = [np.array([self.t0])] if first_row else []
+        rows = [self.state.copy()[None, :]] if first_row else []
+        step_parts = [np.array([[0.0, 0.0, 0.0, 1.0]])]  # the first partition of a run is not a renewal
+        out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
+        out_state = np.empty((BUFFER_ROWS, len(self.state)))
+        filled = np.zeros(2, dtype=np.int64)
+        pace = _Pace(self.t0)
+        cpu = 0.0
+        code = a.PAUSED
+        while code == a.PAUSED:
+            filled[:] = 0
+            began = time.process_time()
+            try:
+                code = a.advance(
+                    self.functions,
+                    self.work,
+                    self.plan.step,
+                    self.plan.options,
+                    self.plan.memory,
+                    self.tolerances,
+                    self.control,
+                    self.clock,
+                    self.state,
+                    self.new_state,
+                    outputs,
+                    out_t,
+                    out_state,
+                    out_steps,
+                    filled,
+                )
+            except KeyboardInterrupt:
+                code = INTERRUPTED
+            spent = time.process_time() - began
+            cpu += spent
+            t_parts.append(out_t[: filled[0]].copy())
+            rows.append(out_state[: filled[0]].copy())
+            step_parts.append(out_steps[: filled[1]].copy())
+            if spent < CHUNK_TIME:
+                self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], BUFFER_STEPS)
+            if code == a.PAUSED and self.control[a.MAX_STEPS] == np.inf and pace.stagnates(self.clock[a.T], filled[1], t1):
+                code = STAGNATED
+            report(self.clock[a.T])
+        t = np.concatenate(t_parts)
+        table = np.concatenate(rows)
+        if times is not None and times[-1] != t1 and len(t) > 0 and t[-1] == t1:
+            t, table = t[:-1], table[:-1]
+        n = system.n_q
+        steps = np.concatenate(step_parts)
+        errors, failures, partitions = np.diff(steps[:, a.ERRORS :], axis=0).astype(np.int64).T
+        status, message = self._outcome(code, t1, pace)
+        if check_derivatives and status is not Status.INTERRUPTED:
+            status, message = self._check_again(t, table, status, message)
+        return Result(
+            t=t,
+            q=table[:, :n].T,
+            v=table[:, n : 2 * n].T,
+            a=table[:, 2 * n : 3 * n].T,
+            lam=table[:, 3 * n :].T,
+            h=steps[1:, a.H],
+            status=status,
+            message=message,
+            stats=self._statistics(cpu),
+            rejected_error=errors,
+            rejected_convergence=failures,
+            partitioned=partitions,
+        )
+
+    def _statistics(self, cpu: float) -> Statistics:
+        c = self.work.counters
+        return Statistics(
+            n_accepted=int(c[common.N_ACCEPTED]),
+            n_rejected_error=int(c[common.N_REJECTED_ERROR]),
+            n_rejected_convergence=int(c[common.N_REJECTED_CONVERGENCE]),
+            n_outer=int(c[common.N_OUTER]),
+            n_inner=int(c[common.N_INNER]),
+            n_evaluations=int(c[common.N_EVALUATIONS]),
+            n_partitions=int(c[common.N_PARTITIONS]),
+            n_factorizations=int(c[common.N_FACTORIZATIONS]),
+            n_jacobians=int(c[common.N_JACOBIANS]),
+            cpu_time=cpu,
+        )
+
+    def _outcome(self, code: int, t1: float, pace: "_Pace") -> tuple[Status, str]:
+        """Status and message for how the run ended."""
+        a, t = self.a, float(self.clock[self.a.T])
+        stopped = f"Stopped at t = {t:.10g}"
+        failure = int(self.clock[a.FAILURE_CODE])
+        if code == a.ALL_OUTPUT_DONE:
+            return Status.REACHED_END, f"Reached the end, t = {t:g}."
+        if code == INTERRUPTED:
+            return (
+                Status.INTERRUPTED,
+                f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.",
+            )
+        if code == a.MAX_STEPS_REACHED:
+            return (
+                Status.MAX_STEPS,
+                f"{stopped} after max_steps = {int(self.control[a.MAX_STEPS])} accepted steps. Raise max_steps, loosen "
+                "rtol and atol, or shorten t_span.",
+            )
+        if code == STAGNATED:
+            return (
+                Status.STAGNATED,
+                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.last:.2g} s long on average, where steps of "
+                f"{pace.best:.2g} s were taken before, and the rest would take {(t1 - t) / pace.last:.1g} of them. Look "
+                "for a singular position or a stiff force near this time, or take another method; with max_steps the "
+                "run goes on up to that number of steps.",
+            )
+        if failure == common.NOT_FINITE:
+            return (
+                Status.NOT_FINITE,
+                f"{stopped}: {self._not_finite()}. The result holds what was computed before.",
+            )
+        if code == a.RANK_LOST or failure == common.SINGULAR:
+            rows = dependent_rows(self.system, t, self.state[: self.system.n_q])
+            return (
+                Status.RANK_LOST,
+                f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
+                "coordinates exists. Redundant constraints and singular positions are not handled yet: end t_span "
+                "before, or change the geometry.",
+            )
+        if failure == common.GAMMA_INACCURATE:
+            reached, required = self.work.notes[common.GAMMA_ACCURACY], self.work.notes[common.GAMMA_REQUIRED]
+            return (
+                Status.NOT_CONVERGED,
+                f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
+                f"and rtol asks for {required:.1g}. Give gamma, or loosen rtol.",
+            )
+        reason = _REASONS[failure]
+        if code == a.FIXED_STEP_FAILED:
+            return (
+                Status.NOT_CONVERGED,
+                f"{stopped}: with the fixed step_size = {self.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
+                "step_size, or leave it out for step-size control.",
+            )
+        return (
+            Status.STEP_TOO_SMALL,
+            f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
+            "Look for a discontinuity or a singular position near this time, loosen rtol and atol, or use coordinates "
+            "of similar scale.",
+        )
+
+    def _check_again(self, t: Array, table: Array, status: Status, message: str) -> tuple[Status, str]:
+        """Status and message, unless a derivative is wrong where the run went."""
+        n = self.system.n_q
+        places = np.unique(np.linspace(0, len(t), LATER_CHECKS + 1).astype(int)[1:] - 1) if len(t) else []
+        states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in places]
+        states.append((float(self.clock[self.a.T]), self.state[:n], self.state[n : 2 * n]))
+        for instant, q, v in states:
+            wrong = wrong_derivative(self.system, instant, q, v)
+            if wrong is not None:
+                return Status.WRONG_DERIVATIVE, f"At t = {instant:.10g} of the run {wrong} {message}"
+        return status, message
+
+    def _not_finite(self) -> str:
+        """Which callback returned a value that is not finite, and when, as far as it is known."""
+        kind, at = int(self.work.notes[common.FAULT_KIND]), float(self.work.notes[common.FAULT_TIME])
+        if kind >= 0:
+            name = self.functions._fields[kind]
+            return f"{name} of {self.system.name!r} returned a value that is not finite at t = {at:.10g}"
+        n, t = self.system.n_q, float(self.clock[self.a.T])
+        q, v = self.state[:n], self.state[n : 2 * n]
+        end = t + float(self.clock[self.a.H_FAILED])
+        for instant in (t, end):
+            found = not_finite(self.system, instant, q, v)
+            if found != _NOTHING_FOUND:
+                return f"{found} at t = {instant:.10g}"
+        return (
+            "the state became larger than floating-point numbers can be, or a callback returned a value that is not "
+            "finite at a state within the step; none does at its start"
+        )
+
+
+INTERRUPTED, STAGNATED = -1, -2  # beside what advance() returns
+
+
+class _Pace:
+    """Mean length of the accepted steps, over windows, to see that a run does not get anywhere."""
+
+    def __init__(self, t0: float):
+        self.t, self.window_t, self.window_n = t0, t0, 0
+        self.best = self.last = 0.0
+
+    def stagnates(self, t: float, n: int, t1: float) -> bool:
+        """Whether the run has come to a standstill, after a chunk of n accepted steps that ended at t."""
+        if n >= FIRST_CHUNK // 2:
+            self.best = max(self.best, (t - self.t) / n)
+        self.t = t
+        self.window_n += n
+        if self.window_n < STAGNATION_STEPS:
+            return False
+        self.last = (t - self.window_t) / self.window_n
+        self.window_t, self.window_n = t, 0
+        return self.last < STAGNATION_PACE * self.best and t1 - t > STAGNATION_LEFT * self.last
+
+
+_REASONS = {
+    common.DONE: "the error estimate stayed above the tolerances",
+    common.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    common.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
+    common.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
+    common.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
+    common.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
+}
