@@ -6,10 +6,6 @@ import numpy as np
 import pytest
 from numba import njit
 
-from references.gear import solve_gear
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import solve_index1
 from tests.problems import pendulum
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
@@ -42,10 +38,6 @@ def system(**changed):
 ENTRIES = {
     "solve_dae": lambda system: solve_dae(system, (0.0, 0.1), Q, V),
     "consistent_state": lambda system: consistent_state(system, 0.0, Q, V),
-    "solve_gear": lambda system: solve_gear(system, (0.0, 0.1), Q, V, 0.01),
-    "solve_ida": lambda system: solve_ida(system, (0.0, 0.1), Q, V),
-    "solve_ida_c": lambda system: solve_ida_c(system, (0.0, 0.1), Q, V),
-    "solve_index1": lambda system: solve_index1(system, (0.0, 0.1), Q, V, "DOP853"),
 }
 
 
@@ -121,6 +113,7 @@ MODULE = types.ModuleType("helpers")
 MODULE.fill = fill
 
 
+@pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
 @pytest.mark.parametrize(
     "force",
     [enclosing(fill), enclosing(pass_on), enclosing(countdown), of_module(MODULE), of_tuple((pass_on,))],
