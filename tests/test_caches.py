@@ -22,6 +22,7 @@ from twoloop import callback
 import constants, helpers
 from constants import *
 from helpers import *
+from own_caches import *
 
 class Callbacks:
     pass
@@ -64,6 +65,7 @@ class Folder:
         self.cache = path / "cache"
         self.write("constants", "")
         self.write("helpers", "")
+        self.write("own_caches", "")
 
     def write(self, name, text):
         (self.path / f"{name}.py").write_text(text)
@@ -113,6 +115,8 @@ VALUES = {
     "the_default_of_a_helper": "with_default()",
     "the_helper_of_a_helper": "outer(q[0])",
     "the_global_of_a_helper": "named(q[0])",
+    "what_a_helper_with_a_cache_of_its_own_calls": "own_cache(q[0])",
+    "the_same_compiled_at_once": "own_cache_at_once(q[0])",
     "an_enclosed_value": "enclosed;FLOAT",
     "an_enclosed_helper": "enclosed(q[0]);helper",
     "nothing": "q[0]",
@@ -141,11 +145,22 @@ def outer(x):
 def named(x):
     return constants.FLOAT * x
 """
+OWN_CACHES = """
+import numba
+from inner import inner
+@numba.njit(cache=True)
+def own_cache(x):
+    return inner(x)
+@numba.njit("f8(f8)", cache=True)
+def own_cache_at_once(x):
+    return inner(x)
+"""
 INNER = "import numba\n@numba.njit\ndef inner(x):\n    return {0}.0 * x\n"
 
 
 def test_what_changes_in_other_files_makes_machine_code_stale(folder):
     folder.mechanism(**VALUES)
+    folder.write("own_caches", OWN_CACHES)  # does not change
     for factor in (1, 2):
         for name, text in {"constants": CONSTANTS, "helpers": HELPERS, "inner": INNER}.items():
             folder.write(name, text.format(factor))

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.types import Type
 
@@ -74,7 +74,8 @@ class _Cache(FunctionCache):
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         super().__init__(function)
         source = self._cache_file._source_stamp
-        self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, (source, stamp))
+        name = f"{self._impl.filename_base}.watched"  # numba cannot read our files, and may have its own beside them
+        self._cache_file = _CheckedFile(self._cache_path, name, (source, stamp))
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -148,6 +149,19 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     return code.hash.hexdigest(), enclosed.hash.hexdigest()
 
 
+def _take_over(helper: Dispatcher) -> None:
+    """Put our cache in the place of one of numba, which does not see what a helper calls in other files."""
+    if not isinstance(helper._cache, FunctionCache) or isinstance(helper._cache, _Cache):
+        return
+    watched = watch(helper.py_func)
+    try:
+        helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
+    except RuntimeError:
+        helper._cache = NullCache()
+    if helper.stats.cache_hits:  # what numba has read already may be out of date
+        helper.recompile()
+
+
 def _enclosed(function: Any) -> list[Any]:
     return [cell.cell_contents for cell in function.__closure__ or ()]
 
@@ -201,6 +215,7 @@ class _Digest:
 
     def _add_helper(self, helper: Dispatcher) -> None:
         if self._is_new(helper):
+            _take_over(helper)
             self.add(sorted(helper.targetoptions.items()))
             self.add_function(helper.py_func)
 
