@@ -187,15 +187,22 @@ DAMAGES = {
 }
 
 
-@pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_damaged_files_are_made_anew(folder, ending):
+def test_damaged_files_are_made_anew(folder):
     folder.mechanism(**{name: "q[0]" for name in DAMAGES})
     folder.values()
     for name, damage in DAMAGES.items():
-        (file,) = folder.cache.glob(f"*/mechanism.{name}-*.{ending}")
+        (file,) = folder.cache.glob(f"*/mechanism.{name}-*.nbc")
         file.write_bytes(damage(file.read_bytes()))
     assert folder.values() == {name: (1.0, 0) for name in DAMAGES}
     assert folder.values() == {name: (1.0, 1) for name in DAMAGES}
+
+
+def test_a_file_of_another_function_is_made_anew(folder):
+    folder.mechanism(one="q[0]", two="2.0 * q[0]")
+    folder.values()
+    (one,), (two,) = (list(folder.cache.glob(f"*/mechanism.{name}-*.nbc")) for name in ("one", "two"))
+    one.write_bytes(two.read_bytes())
+    assert folder.values() == {"one": (1.0, 0), "two": (2.0, 1)}
 
 
 def block_caches(folder):

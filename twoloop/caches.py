@@ -6,20 +6,24 @@ can be written and when a file is damaged.
 """
 
 import enum
+import glob
 import hashlib
 import inspect
 import pickle
 import sys
 import types
+import uuid
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 from numba import njit
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
 from numba.core.types import Type
 
 UNWRITABLE = (
@@ -74,8 +78,7 @@ class _Cache(FunctionCache):
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         super().__init__(function)
         source = self._cache_file._source_stamp
-        name = f"{self._impl.filename_base}.watched"  # numba cannot read our files, and may have its own beside them
-        self._cache_file = _CheckedFile(self._cache_path, name, (source, stamp))
+        self._cache_file = _Files(self._cache_path, self._impl.filename_base, (source, stamp))
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -97,35 +100,46 @@ class _Cache(FunctionCache):
             say_once(UNWRITABLE)
 
 
-class _CheckedFile(IndexDataCacheFile):
-    """Numba's index and data files, each behind its checksum: a damaged one is as good as none."""
+class _Files:
+    """The files of one function, one for each key, each behind its checksum.
 
-    def _load_index(self) -> dict[Any, str]:
+    A file that is damaged, or was made of something else, is as good as none. Numba's own keep an index, through which
+    two processes that write at the same time may lead one function to the machine code of another.
+    """
+
+    def __init__(self, folder: str, name: str, stamp: Any):
+        self.folder, self.name = Path(folder), name
+        self.made_of = numba.__version__, stamp
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write what numba made for a key, in the place of what was there."""
+        content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
+        path = self._path(key)
+        unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
         try:
-            version, stamp, overloads = pickle.loads(self._read(self._index_path))
-        except Exception:  # none, damaged, or of numba alone
-            return {}
-        return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
+            unfinished.write_bytes(hashlib.sha256(content).digest() + content)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
 
-    def _save_index(self, overloads: dict[Any, str]) -> None:
-        self._write(self._index_path, self._dump((self._version, self._source_stamp, overloads)))
+    def load(self, key: Any) -> Any:
+        """What numba made for a key; None if it is to be made anew."""
+        try:
+            content = self._path(key).read_bytes()
+        except OSError:
+            return None
+        if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
+            return None
+        made_of, data = pickle.loads(content[CHECKSUM:])
+        return pickle.loads(data) if made_of == repr((*self.made_of, key)) else None
 
-    def _load_data(self, name: str) -> Any:
-        return pickle.loads(self._read(self._data_path(name)))
+    def flush(self) -> None:
+        """Remove the files of all keys."""
+        for path in self.folder.glob(f"{glob.escape(self.name)}.*.nbc"):
+            path.unlink(missing_ok=True)
 
-    def _save_data(self, name: str, data: Any) -> None:
-        self._write(self._data_path(name), self._dump(data))
-
-    def _read(self, path: str) -> bytes:
-        content = Path(path).read_bytes()
-        checksum, data = content[:CHECKSUM], content[CHECKSUM:]
-        if hashlib.sha256(data).digest() != checksum:
-            raise OSError(f"{path} is damaged")
-        return data
-
-    def _write(self, path: str, data: bytes) -> None:
-        with self._open_for_write(path) as file:
-            file.write(hashlib.sha256(data).digest() + data)
+    def _path(self, key: Any) -> Path:
+        return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
 
 @cache
@@ -149,7 +163,7 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     return code.hash.hexdigest(), enclosed.hash.hexdigest()
 
 
-def _take_over(helper: Dispatcher) -> None:
+def _take_over(helper: Any) -> None:
     """Put our cache in the place of one of numba, which does not see what a helper calls in other files."""
     if not isinstance(helper._cache, FunctionCache) or isinstance(helper._cache, _Cache):
         return
