@@ -15,6 +15,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import check_system
+from twoloop.bounds import check_bounds
 from twoloop.checks import check_real
 from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.kernels.linalg import ldl_factor, ldl_solve
@@ -59,6 +60,7 @@ def accelerations(system: ConstrainedSystem, t: ArrayLike, q: ArrayLike, v: Arra
             f"q and v must have a column of {system.n_q} for each of the {t.size} times; together they have shape "
             f"{states.shape}"
         )
+    check_bounds(system, float(t[0]), *np.split(states[:, 0], 2))
     return Equations(system, float(t[0]), states[: system.n_q, 0]).at_points(t, states)
 
 

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from references.accelerations import accelerations
 from references.driver import TimeLimit, check_choice, check_run
 from references.index1 import solve_index1
+from twoloop.caches import compile_kept, watch
 from twoloop.checks import check_positive, check_size, check_times
 from twoloop.consistency import check_start
-from twoloop.kernels import common, linalg
-from twoloop.kernels.common import FUNCTIONS, INTEGERS, MATRIX, Functions
+from twoloop.kernels.common import FUNCTIONS, INTEGERS, MATRIX
 from twoloop.kernels.linalg import lu_factor, lu_solve
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -53,7 +52,7 @@ _REASONS = {
 }
 NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # places in the counters
 _INTEGRATE = types.int64(
-    *FUNCTIONS.types,
+    FUNCTIONS,
     types.int64,
     MATRIX,
     MATRIX,
@@ -176,7 +175,7 @@ def solve_gear(
         called = time.monotonic()
         last = min(made + stride, n_steps)
         code = _integrate(
-            *system.functions,
+            system.functions,
             system.n_q,
             given,
             past,
@@ -359,29 +358,13 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
 
 
 def _compile_now(function: Callable[..., Any]) -> Any:
-    """Compile for `_INTEGRATE` and keep the machine code on disk until one of its sources changes."""
-    dispatcher: Any = njit(cache=True, error_model="numpy")(function)
-    # numba itself watches only the file the function stands in; see twoloop.kernels.common.kernel
-    sources = [Path(name).stat() for name in (__file__, common.__file__, linalg.__file__)]
-    dispatcher._cache._cache_file._source_stamp = [(source.st_mtime, source.st_size) for source in sources]
-    dispatcher.compile(_INTEGRATE)
-    dispatcher.disable_compile()
-    return dispatcher
+    """Compile for `_INTEGRATE` and keep the machine code on disk until it or something that it calls changes."""
+    return compile_kept(function, _INTEGRATE, watch(function), error_model="numpy")
 
 
 @_compile_now
 def _integrate(  # type: ignore[no-untyped-def]
-    mass,
-    force,
-    constraint,
-    jacobian,
-    constraint_rate,
-    gamma,
-    force_by_q,
-    force_by_v,
-    reaction_by_q,
-    p,
-    flags,
+    f,
     n,
     given,
     past,
@@ -400,9 +383,6 @@ def _integrate(  # type: ignore[no-untyped-def]
 
     `given`, `past` and `rows` hold states [q v a lam]: of the start, of step i in row i % HIGHEST, those stored.
     """
-    f = Functions(
-        mass, force, constraint, jacobian, constraint_rate, gamma, force_by_q, force_by_v, reaction_by_q, p, flags
-    )
     m = given.shape[1] - 3 * n
     w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))
     r, there, J, pivots = np.zeros(n + m), np.zeros(n + m), np.zeros((n + m, n + m)), np.zeros(n + m, dtype=np.int64)

@@ -27,7 +27,7 @@ from references.ida_options import (
     own_tangent,
     tolerances,
 )
-from twoloop.callbacks import no_tangent
+from twoloop.callbacks import stand_in
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -339,7 +339,7 @@ def _iteration_matrix(
     What is differenced is the residual, without the force where there is a tangent.
     """
     exact = tangent is not None
-    add_tangent = no_tangent if tangent is None else tangent
+    add_tangent = stand_in("force_by_q") if tangent is None else tangent
 
     @njit(_JACOBIAN, error_model="numpy")
     def iteration_matrix(t, y, yp, cj, JJ, n, m, p):  # type: ignore[no-untyped-def]

@@ -22,7 +22,6 @@ from references.driver import TimeLimit, check_run, check_system, check_toleranc
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials import LONG, POINTER, REAL, library
-from twoloop.callbacks import python_force
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -103,7 +102,7 @@ def solve_ida_c(
         If scikit-sundae is not the one that this was written for.
     """
     check_system(system)
-    if system.functions.force is python_force:
+    if system.called_in_python:
         raise ValueError(
             f"system must have compiled callbacks, as Python cannot run inside; those of {system.name!r} are Python "
             "functions. Make it with from_python(..., compile=True) or of functions made by @callback, or take "

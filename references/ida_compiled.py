@@ -10,7 +10,7 @@ from numba.core.dispatcher import Dispatcher
 
 from references.ida_options import no_force
 from references.sundials import library
-from twoloop.callbacks import no_tangent
+from twoloop.callbacks import stand_in
 
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 
@@ -138,7 +138,7 @@ def iteration_matrix_at(
     IDA zeroes J. With a tangent, what is differenced is the residual without the force.
     """
     exact = tangent is not None
-    add_tangent = no_tangent if tangent is None else tangent
+    add_tangent = stand_in("force_by_q") if tangent is None else tangent
     differenced = residual_at(
         mass, no_force if exact else force, constraint, jacobian, constraint_rate, n, m, constant_mass
     )

@@ -39,7 +39,7 @@ def sweeps(problem: Problem, state: tuple[float, Array, Array], h: float, depth:
     A, c = tableau.A, tableau.c
     w = common.make_work(n, system.n_c)
     start = np.concatenate([q, v, np.zeros(n + system.n_c)])
-    if advance.start(*system.functions, w, t, start) != common.DONE:
+    if advance.start(system.functions, w, t, start) != common.DONE:
         return float("inf")
     free, a0 = w.independent, start[2 * n : 3 * n]
     x = np.tile(a0, (s, 1))

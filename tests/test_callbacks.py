@@ -1,13 +1,17 @@
-"""The decorator of compiled callbacks, and the doors for plain Python functions."""
+"""The table of callbacks and what follows from it, the decorator, and what becomes of plain Python functions."""
 
+import inspect
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
-from twoloop.callbacks import KINDS
+from twoloop.callbacks import KINDS, OPTIONAL
+from twoloop.kernels.common import FUNCTIONS, GIVEN, Functions
 
 SOURCE = """
 import numpy as np
@@ -110,6 +114,18 @@ def test_a_function_that_numba_cannot_compile_says_why():
             Q[0] = undefined_name  # noqa: F821
 
 
+def test_what_numba_cannot_compile_takes_two_lines():
+    def force(t, q, v):
+        return np.linalg.solve(q, v, 3.0)
+
+    with pytest.raises(TypeError, match=r"'force'.*test_callbacks\.py, line") as caught:
+        pendulum(compile=True, force=force)
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 2
+    assert lines[1].startswith("Numba says: TypingError: No implementation of function Function(<function solve")
+    assert caught.value.__suppress_context__  # nor are numba's own hundred lines shown below
+
+
 @pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"])
 def test_plain_functions_are_sent_to_from_python(kind):
     with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):
@@ -119,3 +135,62 @@ def test_plain_functions_are_sent_to_from_python(kind):
 def test_a_callback_of_another_kind_is_refused():
     with pytest.raises(TypeError, match=r"mass must be compiled by @twoloop.callback\('mass'\)"):
         ConstrainedSystem(**{**PENDULUM, "mass": gravity})
+
+
+# --- what follows from an entry of the table
+
+MAKERS = {"the class": ConstrainedSystem, "from_python": ConstrainedSystem.from_python}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_kind_is_known_everywhere(kind):
+    entry = KINDS[kind]
+    assert f'"{kind}" ({", ".join(entry.arguments)})' in callback.__doc__
+    assert (kind in GIVEN) == (kind in OPTIONAL)
+    place = Functions._fields.index(kind)
+    assert FUNCTIONS.types[place].signature == entry.signature
+    for name, maker in MAKERS.items():
+        assert f"{kind} : " in maker.__doc__, name
+        parameter = inspect.signature(maker).parameters[kind]
+        assert (parameter.default is None) == (kind in OPTIONAL)
+    method = inspect.signature(getattr(pendulum(), kind))
+    assert tuple(method.parameters) == ("t", *entry.state)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_contributing_has_a_row_for_each_kind(kind):
+    entry = KINDS[kind]
+    rows = [line for line in CONTRIBUTING.splitlines() if f'`"{kind}"`' in line]
+    assert len(rows) == 1
+    assert f"`{', '.join(entry.arguments)}`" in rows[0]
+    assert entry.size in rows[0]
+
+
+CONTRIBUTING = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
+
+
+@pytest.mark.parametrize("maker", MAKERS.values(), ids=MAKERS)
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"gama": heavy}, "a system has no argument 'gama'; its callbacks are mass, force, .*reaction_by_q"),
+        ({}, "a system needs mass, force, constraint: not given"),
+    ],
+)
+def test_callbacks_that_are_unknown_or_missing_are_named(maker, changed, words):
+    with pytest.raises(TypeError, match=words):
+        maker(n_q=2, n_c=1, **changed)
+
+
+@pytest.mark.parametrize("kind", ["constraint_rate", "force_by_q", "force_by_v", "reaction_by_q"])
+def test_what_is_left_out_leaves_zeros(kind):
+    system = pendulum()
+    state = [np.ones(1) if name == "lam" else np.ones(2) for name in KINDS[kind].state]
+    assert kind not in system.given
+    assert not getattr(system, kind)(0.0, *state).any()
+    assert getattr(system, kind)(0.0, *state).shape == system.shape_of(kind)
+
+
+def test_gamma_left_out_cannot_be_called():
+    with pytest.raises(ValueError, match="'pendulum' was given no gamma"):
+        pendulum(gamma=False).gamma(0.0, np.ones(2), np.ones(2))

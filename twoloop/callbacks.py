@@ -1,34 +1,141 @@
-"""The callbacks of a mechanism: the decorator for compiled ones, and the door for plain Python functions."""
+"""The kinds of callback that a mechanism may have, in one table, and the decorator that compiles one.
 
-import hashlib
+All that is said of a kind anywhere follows from its entry in `KINDS`: the signature that numba compiles, the fields of
+`Functions` that the kernels see, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain
+Python functions.
+"""
+
 import inspect
-import itertools
+import re
 from collections.abc import Callable
-from typing import Any, ClassVar
-from weakref import WeakValueDictionary
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
-import numpy as np
-from numba import njit, objmode
+import numba
 from numba.core.dispatcher import Dispatcher
-from numba.core.errors import NumbaError
-from numpy.typing import NDArray
 
-from twoloop.kernels.common import CONSTRAINT_CALLBACK, FORCE_CALLBACK, MATRIX_CALLBACK, TANGENT_CALLBACK
+from twoloop.caches import compile_kept, watch
 
-Array = NDArray[np.float64]
+f8 = numba.types.float64
+VECTOR = numba.types.float64[::1]
+MATRIX = numba.types.float64[:, ::1]
 
-# kind: (arguments, signature)
-KINDS: dict[str, tuple[tuple[str, ...], Any]] = {
-    "mass": (("t", "q", "p", "M"), MATRIX_CALLBACK),
-    "force": (("t", "q", "v", "p", "Q"), FORCE_CALLBACK),
-    "constraint": (("t", "q", "p", "C"), CONSTRAINT_CALLBACK),
-    "jacobian": (("t", "q", "p", "Cq"), MATRIX_CALLBACK),
-    "constraint_rate": (("t", "q", "p", "Ct"), CONSTRAINT_CALLBACK),
-    "gamma": (("t", "q", "v", "p", "Qd"), FORCE_CALLBACK),
-    "force_by_q": (("t", "q", "v", "p", "K"), TANGENT_CALLBACK),
-    "force_by_v": (("t", "q", "v", "p", "D"), TANGENT_CALLBACK),
-    "reaction_by_q": (("t", "q", "lam", "p", "R"), TANGENT_CALLBACK),
+# what callbacks depend on beside t and p, and the size of each
+STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is known of one kind of callback.
+
+    Attributes
+    ----------
+    state : tuple of str
+        What it depends on beside t and p, keys of `STATE`.
+    output : str
+        Name of the array that it fills.
+    shape : tuple of str
+        Sizes of that array: attributes of a system.
+    meaning : str
+        What it fills the array with, in a few words, for messages.
+    note : str
+        What else there is to know, for the documentation.
+    absent : str
+        What is in its place where it is left out. "": it must be given; "zeros": a callback that leaves zeros;
+        "differences": one that differences C, see `jacobian.py`; "kernels": nothing that could be called, as the
+        kernels take differences of their own.
+    """
+
+    state: tuple[str, ...]
+    output: str
+    shape: tuple[str, ...]
+    meaning: str
+    note: str = ""
+    absent: str = ""
+
+    @property
+    def optional(self) -> bool:
+        """Whether it may be left out."""
+        return self.absent != ""
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Names of the arguments of a callback that works in place."""
+        return ("t", *self.state, "p", self.output)
+
+    @property
+    def signature(self) -> Any:
+        """What numba compiles a callback for."""
+        filled = VECTOR if len(self.shape) == 1 else MATRIX
+        return numba.types.void(f8, *[VECTOR] * len(self.state), VECTOR, filled)
+
+    @property
+    def size(self) -> str:
+        """The shape of the array, in words."""
+        return f"({', '.join(self.shape)}{',' if len(self.shape) == 1 else ''})"
+
+
+KINDS = {
+    "mass": Kind(("q",), "M", ("n_q", "n_q"), "the mass matrix M", "Symmetric and positive definite."),
+    "force": Kind(("q", "v"), "Q", ("n_q",), "the force Q"),
+    "constraint": Kind(("q",), "C", ("n_c",), "the constraints C"),
+    "jacobian": Kind(
+        ("q",),
+        "Cq",
+        ("n_c", "n_q"),
+        "C_q, the derivative of constraint with respect to q",
+        "None: by differences of C, of order 8. That costs 8 n_q calls of constraint for each Jacobian (more where the "
+        "constraint bends on a scale far below max(1, |q_j|)), and constraint must be defined within 1/16 of "
+        "max(1, |q_j|) about q. Entries are good to about 1e-13 of the largest term in the constraint; differences of "
+        "differences, that is, gamma left out too, to about 1e-9.",
+        absent="differences",
+    ),
+    "constraint_rate": Kind(
+        ("q",),
+        "Ct",
+        ("n_c",),
+        "C_t, the derivative of constraint with respect to t",
+        "None: the constraints do not depend on time.",
+        absent="zeros",
+    ),
+    "gamma": Kind(
+        ("q", "v"),
+        "Qd",
+        ("n_c",),
+        "Q_d = -((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = Q_d",
+        "None: by differences of C_q and C_t along the motion.",
+        absent="kernels",
+    ),
+    "force_by_q": Kind(
+        ("q", "v"),
+        "K",
+        ("n_q", "n_q"),
+        "dQ/dq, the derivative of force with respect to q",
+        "A tangent for Newton's method as the outer loop, as are the two that follow. With it the force is not "
+        "differenced; it must not depend on v then unless force_by_v is given too. None: all by differences. What the "
+        "stiff part does not need is left out then (how M, and the directions that constraints allow, change with q): "
+        "at a tolerance steps are the same, but fixed steps in which bodies turn far may fail to converge.",
+        absent="zeros",
+    ),
+    "force_by_v": Kind(
+        ("q", "v"),
+        "D",
+        ("n_q", "n_q"),
+        "dQ/dv, the derivative of force with respect to v",
+        "None beside force_by_q: the force does not depend on v.",
+        absent="zeros",
+    ),
+    "reaction_by_q": Kind(
+        ("q", "lam"),
+        "R",
+        ("n_q", "n_q"),
+        "d(C_q^T lam)/dq with lam held, the derivative of the reactions with respect to q",
+        "None: by differences of C_q, none where C_q does not change.",
+        absent="zeros",
+    ),
 }
+OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
 
 
 def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
@@ -43,12 +150,12 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
             Cq[0, 0] = q[0]
             Cq[0, 1] = q[1]
 
+    Its machine code is kept on disk until it, a helper that it calls, or a global that one of them names, changes.
+
     Parameters
     ----------
     kind : str
-        "mass" (t, q, p, M), "force" (t, q, v, p, Q), "constraint" (t, q, p, C), "jacobian" (t, q, p, Cq),
-        "constraint_rate" (t, q, p, Ct), "gamma" (t, q, v, p, Qd), "force_by_q" (t, q, v, p, K), "force_by_v"
-        (t, q, v, p, D) or "reaction_by_q" (t, q, lam, p, R).
+        {kinds}.
 
     Raises
     ------
@@ -61,207 +168,73 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
         raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {kind!r}")
-    arguments, signature = KINDS[kind]
 
     def decorate(function: Callable[..., None]) -> Dispatcher:
-        given = tuple(inspect.signature(function).parameters)
-        if given != arguments:
+        wanted, given = KINDS[kind].arguments, tuple(inspect.signature(function).parameters)
+        if given != wanted:
             raise TypeError(
                 f"{function.__name__} is declared as the callback {kind!r}, whose arguments are "
-                f"({', '.join(arguments)}); it has ({', '.join(given)})"
+                f"({', '.join(wanted)}); it has ({', '.join(given)})"
             )
-        try:
-            try:
-                dispatcher = njit(cache=True, error_model="numpy")(function)
-                keeper: Any = dispatcher._cache._cache_file  # type: ignore[attr-defined]
-                keeper._source_stamp = (keeper._source_stamp, _globals_digest(function))
-            except RuntimeError:  # numba has nowhere to keep what is typed at a prompt
-                dispatcher = njit(error_model="numpy")(function)
-            dispatcher.compile(signature)
-        except NumbaError as error:
-            raise TypeError(_why_not(kind, function, error)) from error
-        dispatcher.disable_compile()
-        return dispatcher
+        return compile_callback(kind, function, watch(function))
 
     return decorate
 
 
-def _globals_digest(function: Callable[..., Any]) -> str:
-    """What a function takes from its module, for the stamp of its machine code: numba freezes it and forgets it."""
-    digest = hashlib.sha256()
-    for name in sorted(function.__code__.co_names):
-        value = function.__globals__.get(name)
-        if isinstance(value, Dispatcher):
-            value = (value.py_func.__code__.co_code, value.py_func.__code__.co_consts)
-        if isinstance(value, np.ndarray):
-            digest.update(name.encode() + value.tobytes())
-        elif isinstance(value, (bool, int, float, str, tuple)):
-            digest.update(f"{name}={value!r}".encode())
-    return digest.hexdigest()
-
-
-def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    name = getattr(function, "__name__", "?")
-    return (
-        f"{kind}: numba cannot compile the function {name!r}. It must use numbers, numpy arrays and functions that "
-        f"numba knows (helpers need numba.njit), with arrays of one type (1.0 beside 0.5, not 1) and of the shape that "
-        f"{kind} asks for. Numba says:\n{type(error).__name__}: {error}"
+if callback.__doc__:  # not so with python -OO
+    callback.__doc__ = callback.__doc__.format(
+        kinds=",\n        ".join(f'"{name}" ({", ".join(kind.arguments)})' for name, kind in KINDS.items())
     )
 
 
-class PythonFunctions:
-    """Plain Python functions of one system, called through the compiled wrappers below."""
+def compile_callback(
+    kind: str, function: Callable[..., Any], watched: tuple[str, str] | None, named: Callable[..., Any] | None = None
+) -> Dispatcher:
+    """Compile a function that works in place for the signature of its kind, or say in two lines why it cannot be.
 
-    _count = itertools.count(1)
-    registry: ClassVar[WeakValueDictionary[int, "PythonFunctions"]] = WeakValueDictionary()
-
-    def __init__(self, name: str, functions: dict[str, Callable[..., Any]]):
-        self.name = name
-        self.functions = functions
-        self.handle = next(self._count)
-        self.registry[self.handle] = self
-
-    def call(self, kind: str, arguments: tuple[Any, ...], out: Array) -> None:
-        """Call one function with copies of the arrays, check what comes back and write it to `out`."""
-        t = arguments[0]
-        try:
-            value = self.functions[kind](*arguments)
-        except Exception as error:
-            error.add_note(f"raised by {kind} of system {self.name!r} at t = {t!r}")
-            raise
-        store(kind, self.name, t, value, out)
-
-
-def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
-    """Write what a Python function returned to `out`, or say what is wrong with it."""
+    `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
+    """
     try:
-        array = np.asarray(value)
-        real = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
-    except ValueError:
-        real = False
-    if not real:
-        raise TypeError(
-            f"{kind} of system {name!r} must return a real array of shape {out.shape}; "
-            f"at t = {t!r} it returned {value!r}"
-        )
-    if array.shape != out.shape:
-        raise ValueError(
-            f"{kind} of system {name!r} must return an array of shape {out.shape}; at t = {t!r} it returned shape "
-            f"{array.shape}"
-        )
-    out[...] = array
-
-
-def _call_with_two(kind: str, t: float, q: Array, p: Array, out: Array) -> None:
-    PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy()), out)
-
-
-def _call_with_three(kind: str, t: float, q: Array, x: Array, p: Array, out: Array) -> None:
-    PythonFunctions.registry[int(p[0])].call(kind, (t, q.copy(), x.copy()), out)
-
-
-@callback("mass")
-def python_mass(t, q, p, M):
-    with objmode():
-        _call_with_two("mass", t, q, p, M)
-
-
-@callback("force")
-def python_force(t, q, v, p, Q):
-    with objmode():
-        _call_with_three("force", t, q, v, p, Q)
-
-
-@callback("constraint")
-def python_constraint(t, q, p, C):
-    with objmode():
-        _call_with_two("constraint", t, q, p, C)
-
-
-@callback("jacobian")
-def python_jacobian(t, q, p, Cq):
-    with objmode():
-        _call_with_two("jacobian", t, q, p, Cq)
-
-
-@callback("constraint_rate")
-def python_constraint_rate(t, q, p, Ct):
-    with objmode():
-        _call_with_two("constraint_rate", t, q, p, Ct)
-
-
-@callback("gamma")
-def python_gamma(t, q, v, p, Qd):
-    with objmode():
-        _call_with_three("gamma", t, q, v, p, Qd)
-
-
-@callback("force_by_q")
-def python_force_by_q(t, q, v, p, K):
-    with objmode():
-        _call_with_three("force_by_q", t, q, v, p, K)
-
-
-@callback("force_by_v")
-def python_force_by_v(t, q, v, p, D):
-    with objmode():
-        _call_with_three("force_by_v", t, q, v, p, D)
-
-
-@callback("reaction_by_q")
-def python_reaction_by_q(t, q, lam, p, R):
-    with objmode():
-        _call_with_three("reaction_by_q", t, q, lam, p, R)
-
-
-@callback("constraint_rate")
-def no_rate(t, q, p, Ct):
-    """Constraints that do not depend on time."""
-
-
-@callback("gamma")
-def no_gamma(t, q, v, p, Qd):
-    """Stands where gamma is differenced; no kernel calls it."""
-
-
-@callback("force_by_q")
-def no_tangent(t, q, v, p, K):
-    """Stands where a tangent is not given, and leaves zeros; no kernel calls it."""
-
-
-def check_arguments(kind: str, function: Callable[..., Any]) -> None:
-    """Raise if a function that returns its array names its arguments t, q, v, but in another order."""
-    wanted = KINDS[kind][0][:-2]
-    try:
-        given = tuple(inspect.signature(function).parameters)
-    except (TypeError, ValueError):  # built-in functions have none to look at
-        return
-    if sorted(given) == sorted(wanted) and given != wanted:
-        raise TypeError(
-            f"{kind} is called as {kind}({', '.join(wanted)}); the function given takes ({', '.join(given)})"
-        )
-
-
-def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
-    """Compile a function that returns its array, and wrap it to the in-place signature of its kind."""
-    arguments, signature = KINDS[kind]
-    user = function if isinstance(function, Dispatcher) else njit(function)
-    message = f"{kind} returned an array of the wrong shape"
-
-    def with_three(t, q, x, p, out):
-        value = user(t, q, x)
-        if value.shape != out.shape:
-            raise ValueError(message)
-        out[:] = value
-
-    def with_two(t, q, p, out):
-        value = user(t, q)
-        if value.shape != out.shape:
-            raise ValueError(message)
-        out[:] = value
-
-    in_place = with_three if len(arguments) == 5 else with_two
-    try:
-        return njit(signature, error_model="numpy")(in_place)
+        return compile_kept(function, KINDS[kind].signature, watched, error_model="numpy")
     except Exception as error:  # numba lets some of its own assertions through
-        raise TypeError(_why_not(kind, function, error)) from error
+        raise TypeError(_why_not(kind, named or function, error)) from None
+
+
+@cache
+def stand_in(kind: str) -> Dispatcher:
+    """What stands in the place of an optional callback that is not given: it leaves zeros."""
+
+    def leaves_zeros(t, q, p, out):
+        pass
+
+    def leaves_zeros_too(t, q, x, p, out):
+        pass
+
+    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_zeros_too
+    return compile_callback(kind, function, ("leaves zeros", ""))
+
+
+def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
+    """Which function numba cannot compile, and the line of numba's message that says most."""
+    name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
+    where = f" ({code.co_filename}, line {code.co_firstlineno})" if code else ""
+    return (
+        f"{kind}: numba cannot compile the function {name!r}{where}; it must use numbers, numpy arrays of one type and "
+        f"of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
+        f"Numba says: {_telling_line(error)}"
+    )
+
+
+# lines of numba's messages that only lead to another, or show source
+_LEADING = re.compile(
+    r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
+    r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|\^|Enable logging"
+)
+
+
+def _telling_line(error: Exception) -> str:
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    plain = re.sub(r":\s*>>> ", ": ", plain)  # a signature that was not found
+    lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
+    telling = [line for line in lines if line and not _LEADING.match(line) and not line.startswith("def ")]
+    return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"

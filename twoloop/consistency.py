@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
+from twoloop.bounds import check_bounds
 from twoloop.checks import check_number, check_vector
 from twoloop.derivatives import check_derivatives
 from twoloop.kernels.common import GAMMA_GIVEN
@@ -42,6 +43,7 @@ def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: Array
     t = check_number("t", t)
     q = check_vector("q", q, system.n_q)
     v = check_vector("v", v, system.n_q)
+    check_bounds(system, t, q, v)
     system.check_returned(t, q, v)
     blame = not_finite(system, t, q, v)
     if blame != _NOTHING_FOUND:
@@ -78,6 +80,7 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, deri
     TypeError, ValueError
         Naming the callback or the argument, what was found and what to do.
     """
+    check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
     matrix = system.mass(t0, q0)
     jacobian = system.jacobian(t0, q0)

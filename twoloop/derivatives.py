@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.callbacks import KINDS
 from twoloop.kernels.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, GAMMA_GIVEN, REACTION_BY_Q_GIVEN
 from twoloop.system import ConstrainedSystem
 
@@ -29,7 +28,6 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     """
     if system.checked:
         return
-    _check_bounds(system, t, q)
     size = float(np.abs(q).max()) or 1.0
     generic = np.random.default_rng(1)
     v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
@@ -181,25 +179,6 @@ def _compare(
         f"{kind} of {system.name!r} is not {what}: entry {entry} is {values[0]:.6g}, by differences it is "
         f"{values[1]:.6g} (t = {t:g}, near the start, velocities chosen at random). Mend its formula{hint}"
     )
-
-
-def _check_bounds(system: ConstrainedSystem, t: float, q: Array) -> None:
-    """Run compiled callbacks once in Python, where an index out of bounds is an error and not another's memory."""
-    if system.called_in_python:
-        return
-    for kind, (arguments, _) in KINDS.items():
-        known = {"q": q.copy(), "v": np.zeros(system.n_q), "lam": np.zeros(system.n_c)}
-        state = [known[name] for name in arguments[1:-2]]
-        out = np.zeros(system.shape_of(kind))
-        try:
-            getattr(system.functions, kind).py_func(t, *state, system.parameters.copy(), out)
-        except IndexError as error:
-            raise ValueError(
-                f"{kind} of {system.name!r} goes out of bounds: {error}. q and v have n_q = {system.n_q} entries, p "
-                f"has {system.parameters.size}, {arguments[-1]} has shape {out.shape}"
-            ) from error
-        except Exception:  # what only works compiled cannot be looked at in this way
-            continue
 
 
 def wrong_derivative(system, t, q, v):

@@ -94,11 +94,11 @@ class Run:
         self._begin()
 
     def _begin(self) -> None:
-        code = self.a.start(*self.functions, self.work, self.t0, self.state)
+        code = self.a.start(self.functions, self.work, self.t0, self.state)
         if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
             required = self.work.notes[common.GAMMA_REQUIRED]
             self.work.notes[common.GAMMA_REQUIRED] = np.inf
-            code = self.a.start(*self.functions, self.work, self.t0, self.state)
+            code = self.a.start(self.functions, self.work, self.t0, self.state)
             self.work.notes[common.GAMMA_REQUIRED] = required
         if code == common.DONE:
             return
@@ -167,7 +167,7 @@ class Run:
             began = time.process_time()
             try:
                 code = a.advance(
-                    *self.functions,
+                    self.functions,
                     self.work,
                     self.plan.step,
                     self.plan.options,

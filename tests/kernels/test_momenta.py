@@ -113,7 +113,7 @@ def test_momentum_rates_are_the_derivative_of_the_momenta_along_the_motion():
     run = solve_dae(system, (0.0, 4 * h), q, v, "Gauss12", 1e-12, 1e-12, t_eval=h * np.arange(5))
     work = common.make_work(4, 2)
     state = np.concatenate([run.q[:, 2], run.v[:, 2], np.zeros(6)])
-    assert advance.start(*system.functions, work, 0.0, state) == common.DONE
+    assert advance.start(system.functions, work, 0.0, state) == common.DONE
     i, d = work.independent, work.dependent
 
     def momentum(k):

@@ -56,7 +56,7 @@ def test_the_chosen_partition_of_the_linkage_is_well_conditioned_everywhere(thet
     system = problem.system
     work = common.make_work(9, 8)
     state = np.concatenate([problem.q0, problem.v0, np.zeros(17)])
-    assert advance.start(*system.functions, work, 0.0, state) == common.DONE
+    assert advance.start(system.functions, work, 0.0, state) == common.DONE
     assert sorted([*work.dependent, *work.independent]) == list(range(9))
     Cq = system.jacobian(0.0, problem.q0)
     rates = np.linalg.solve(Cq[:, work.dependent], Cq[:, work.independent])

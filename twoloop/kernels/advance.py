@@ -24,7 +24,6 @@ from twoloop.kernels.common import (
     SINGULAR,
     VECTOR,
     WORK,
-    Functions,
     StepFunction,
     f8,
     i8,
@@ -83,27 +82,9 @@ H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
 ) = range(12)
 
 
-@kernel(i8(*FUNCTIONS, WORK, f8, VECTOR))
-def start(
-    mass,
-    force,
-    constraint,
-    jacobian,
-    constraint_rate,
-    gamma,
-    force_by_q,
-    force_by_v,
-    reaction_by_q,
-    p,
-    flags,
-    w,
-    t,
-    state,
-):
+@kernel(i8(FUNCTIONS, WORK, f8, VECTOR))
+def start(f, w, t, state):
     """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
-    f = Functions(
-        mass, force, constraint, jacobian, constraint_rate, gamma, force_by_q, force_by_v, reaction_by_q, p, flags
-    )
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     code = factor_mass(f, w, t, q)
@@ -117,7 +98,7 @@ def start(
 
 
 _ADVANCE = i8(
-    *FUNCTIONS,  # the functions come one by one: only so does numba take them as first-class functions
+    FUNCTIONS,
     WORK,
     StepFunction,
     *(VECTOR,) * 9,
@@ -129,17 +110,7 @@ _ADVANCE = i8(
 
 @kernel(_ADVANCE)
 def advance(
-    mass,
-    force,
-    constraint,
-    jacobian,
-    constraint_rate,
-    gamma,
-    force_by_q,
-    force_by_v,
-    reaction_by_q,
-    p,
-    flags,
+    f,
     w,
     step,
     options,
@@ -162,9 +133,6 @@ def advance(
     Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
     out_t / out_state and those of out_steps, every accepted step, that this call wrote.
     """
-    f = Functions(
-        mass, force, constraint, jacobian, constraint_rate, gamma, force_by_q, force_by_v, reaction_by_q, p, flags
-    )
     fixed = control[FIXED_STEP] > 0.0
     n = w.Q.size
     retried = np.inf  # where a step of fixed size was tried again with a new partition

@@ -4,7 +4,8 @@ Every callback of a mechanism has one fixed signature and works in place, so tha
 and takes any mechanism (and any method) as a first-class function.
 """
 
-import sys
+import hashlib
+from collections import namedtuple
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -13,70 +14,34 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, types
 from numba.core.dispatcher import Dispatcher
+from numba.extending import typeof_impl
 
+from twoloop.caches import compile_kept
+from twoloop.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
 from twoloop.kernels.lapack import N_ROUTINES
 
-f8 = types.float64
 i8 = types.int64
-VECTOR = types.float64[::1]
-MATRIX = types.float64[:, ::1]
 INTEGERS = types.int64[::1]
 
-# (t, q, p, M), (t, q, v, p, Q), (t, q, p, C), (t, q, v, p, K): the four shapes that the callbacks have
-MATRIX_CALLBACK = types.void(f8, VECTOR, VECTOR, MATRIX)
-FORCE_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR, VECTOR)
-CONSTRAINT_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR)
-TANGENT_CALLBACK = types.void(f8, VECTOR, VECTOR, VECTOR, MATRIX)
-
-MatrixFunction = types.FunctionType(MATRIX_CALLBACK)
-ForceFunction = types.FunctionType(FORCE_CALLBACK)
-ConstraintFunction = types.FunctionType(CONSTRAINT_CALLBACK)
-TangentFunction = types.FunctionType(TANGENT_CALLBACK)
+# the callbacks of a mechanism, its parameters and its flags, as the kernels see them
+Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore[misc]
+FUNCTIONS = types.NamedTuple(
+    [*(types.FunctionType(kind.signature) for kind in KINDS.values()), VECTOR, INTEGERS], Functions
+)
 
 
-class Functions(NamedTuple):
-    """The callbacks of a mechanism, its parameters and its flags, as the kernels see them."""
-
-    mass: Any
-    force: Any
-    constraint: Any
-    jacobian: Any
-    constraint_rate: Any
-    gamma: Any
-    force_by_q: Any
-    force_by_v: Any
-    reaction_by_q: Any
-    p: Any
-    flags: Any
+@typeof_impl.register(Functions)
+def _type_of_functions(value: Any, context: Any) -> Any:
+    """What numba takes any `Functions` for: without this, each system's own functions, and it would compile anew."""
+    return FUNCTIONS
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense
-(
-    CONSTANT_MASS,
-    DIAGONAL_MASS,
-    GAMMA_GIVEN,
-    BANDWIDTH,
-    FORCE_BY_Q_GIVEN,
-    FORCE_BY_V_GIVEN,
-    REACTION_BY_Q_GIVEN,
-    N_FLAGS,
-) = range(8)
-
-FUNCTIONS = types.NamedTuple(
-    [
-        MatrixFunction,
-        ForceFunction,
-        ConstraintFunction,
-        MatrixFunction,
-        ConstraintFunction,
-        ForceFunction,
-        TangentFunction,
-        TangentFunction,
-        TangentFunction,
-        VECTOR,
-        INTEGERS,
-    ],
-    Functions,
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH = range(3)
+GIVEN = {name: place for place, name in enumerate(OPTIONAL, start=3)}  # whether an optional callback is given
+N_FLAGS = 3 + len(GIVEN)
+GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN = (
+    GIVEN[name] for name in ("gamma", "force_by_q", "force_by_v", "reaction_by_q")
 )
 
 
@@ -157,37 +122,23 @@ StepFunction = types.FunctionType(STEP)
 RTOL, ESTIMATE, LEAST, ATOL = range(4)
 
 
-def _package_stamp() -> tuple[float, int]:
-    """Time and size of all kernel sources: numba itself watches only the file a function stands in."""
-    files = [path.stat() for path in Path(__file__).parent.glob("*.py")]
-    return max(f.st_mtime for f in files), sum(f.st_size for f in files)
-
-
-_STAMP = _package_stamp()
-
-
 @cache
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def _stamp() -> str:
+    """A digest of what kernels depend on: all their sources, and the table of callbacks."""
+    digest = hashlib.sha256(repr((FUNCTIONS, GIVEN)).encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
-def _announce(index: str) -> None:
-    """Say, once a process, why the first run ever takes so long."""
-    if not Path(index).exists():
-        _say("twoloop: compiling the integrator, two or three minutes; later processes read it from the disk")
+_ANNOUNCEMENT = "twoloop: compiling the integrator, two or three minutes; later processes read it from the disk"
 
 
 def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     """Compile a function of the integrator for `signature` and keep the machine code on disk."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
-        dispatcher = njit(cache=True, **_OPTIONS)(function)
-        # without this, an edit of linalg.py would leave a stale advance.py in the cache
-        dispatcher._cache._cache_file._source_stamp = _STAMP
-        _announce(dispatcher._cache._cache_file._index_path)
-        dispatcher.compile(signature)
-        dispatcher.disable_compile()
-        return dispatcher
+        return compile_kept(function, signature, (_stamp(), ""), announcement=_ANNOUNCEMENT, **_OPTIONS)
 
     return compile_now
 

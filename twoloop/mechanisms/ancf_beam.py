@@ -9,6 +9,7 @@ stiff in bending as Euler and Bernoulli say, however fine the mesh. It belongs t
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from twoloop.mechanisms.ancf_element import (
     force,
     mass,
 )
-from twoloop.mechanisms.problem import Problem
+from twoloop.mechanisms.problem import Array, Problem
 from twoloop.system import ConstrainedSystem
 
 __all__ = [
@@ -70,6 +71,20 @@ def constraint_rate(t, q, p, Ct):
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
     Qd[0] = -p[AMPLITUDE] * p[FREQUENCY] ** 2 * math.sin(p[FREQUENCY] * t)
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Kinetic, elastic and gravitational energy of a beam, J, as a function of t, q and v."""
+
+    M: Array
+    p: Array
+
+    def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = np.asarray(q), np.asarray(v)
+        weight = self.p[FALL] * self.M[1::6].sum(axis=0)
+        return 0.5 * (v * (self.M @ v)).sum(axis=0) + elastic_energy(q, self.p) + weight @ q
 
 
 def ancf_beam(
@@ -184,12 +199,6 @@ def ancf_beam(
     v0 = np.zeros((n_elements + 1, 6))
     v0[: 1 if start == "node" else None, 0] = amplitude * angular_frequency
     M = system.mass(0.0, q0.ravel())
-    weight = gravity * M[1::6].sum(axis=0)
-
-    def energy(t, q, v):  # type: ignore[no-untyped-def]
-        """Kinetic, elastic and gravitational energy, J."""
-        q, v = np.asarray(q), np.asarray(v)
-        return 0.5 * (v * (M @ v)).sum(axis=0) + elastic_energy(q, p) + weight @ q
 
     return Problem(
         name=name,
@@ -197,7 +206,7 @@ def ancf_beam(
         q0=q0.ravel(),
         v0=v0.ravel(),
         t_span=(0.0, 2.0),
-        energy=energy,
+        energy=Energy(M, p),
         parameters={"n_elements": n_elements, "start": start, **parameters},
         note=f"start assumed, the paper's text does not tell it: straight along x, gravity across it, {STARTS[start]}",
     )

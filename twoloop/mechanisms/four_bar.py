@@ -6,8 +6,11 @@ axis along the chain. (35) of the paper is printed with a cosine of th3 where a 
 """
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from twoloop.callbacks import callback
 from twoloop.checks import check_vector
@@ -83,6 +86,21 @@ def gamma(t, q, v, p, Qd):
         Qd[7] -= ddx
 
 
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Kinetic plus potential energy of the rods, J, as a function of t, q and v."""
+
+    lengths: Array
+
+    def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = np.asarray(q), np.asarray(v)
+        masses = DENSITY * self.lengths
+        inertias = masses * self.lengths**2 / 12.0
+        kinetic = masses @ (v[0::3] ** 2 + v[1::3] ** 2) + inertias @ v[2::3] ** 2
+        return 0.5 * kinetic + GRAVITY * (masses @ q[1::3])
+
+
 def four_bar(
     lengths: tuple[float, float, float] = DEFAULT_LENGTHS,
     ground: float = DEFAULT_GROUND,
@@ -141,22 +159,13 @@ def four_bar(
         constant_mass=True,
         name="four-bar",
     )
-    masses = DENSITY * lengths_array
-
-    def energy(t, q, v):  # type: ignore[no-untyped-def]
-        """Kinetic plus potential energy, J."""
-        q, v = np.asarray(q), np.asarray(v)
-        inertias = masses * lengths_array**2 / 12.0
-        kinetic = masses @ (v[0::3] ** 2 + v[1::3] ** 2) + inertias @ v[2::3] ** 2
-        return 0.5 * kinetic + GRAVITY * (masses @ q[1::3])
-
     return Problem(
         name=f"four-bar {L1:g}, {L2:g}, {L3:g} m on {ground:g} m",
         system=system,
         q0=q0,
         v0=np.zeros(9),
         t_span=(0.0, 100.0),
-        energy=energy,
+        energy=Energy(lengths_array),
         parameters={
             "L1": L1,
             "L2": L2,

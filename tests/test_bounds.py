@@ -1,0 +1,197 @@
+"""Indices out of bounds are found before machine code writes to the memory of others, at every entry point."""
+
+import types
+
+import numpy as np
+import pytest
+from numba import njit
+
+from tests.problems import pendulum
+from tests.test_callbacks import PENDULUM
+from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
+from twoloop.callbacks import KINDS
+
+FAR = 10**7  # a write so far out would end the process
+Q, V = [-1.0, 0.0], [0.0, 0.0]
+
+
+@callback("force_by_q")
+def constant_force(t, q, v, p, K):
+    pass
+
+
+NO_TANGENT = {"force_by_q": constant_force}
+
+
+def beyond(kind):
+    """A callback that writes beyond the end of its array."""
+    entry, scope = KINDS[kind], {"FAR": FAR}
+    index = "0, FAR" if len(entry.shape) == 2 else "FAR"
+    exec(f"def beyond({', '.join(entry.arguments)}):\n    {entry.output}[{index}] = 1.0", scope)
+    return callback(kind)(scope["beyond"])
+
+
+def system(**changed):
+    return ConstrainedSystem(**{**PENDULUM, "parameters": [2.0], "name": "far", **changed})
+
+
+ENTRIES = {
+    "solve_dae": lambda system: solve_dae(system, (0.0, 0.1), Q, V),
+    "consistent_state": lambda system: consistent_state(system, 0.0, Q, V),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_callback_is_watched_when_it_is_called_alone(kind):
+    tangents = NO_TANGENT if kind in ("force_by_v", "reaction_by_q") else {}
+    state = [V if name == "v" else [1.0] if name == "lam" else Q for name in KINDS[kind].state]
+    with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR} .*n_q = 2, n_c = 1"):
+        getattr(system(**tangents, **{kind: beyond(kind)}), kind)(0.0, *state)
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "gamma", "reaction_by_q"])
+def test_every_entry_point_watches_every_callback(entry, kind):
+    tangents = NO_TANGENT if kind == "reaction_by_q" else {}
+    with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
+        ENTRIES[entry](system(**tangents, **{kind: beyond(kind)}))
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_too_few_parameters_are_reported_as_such(entry):
+    with pytest.raises(ValueError, match=r"(?s)of 'far' goes out of bounds.*p has 0.*Give more `parameters`"):
+        ENTRIES[entry](system(parameters=[]))
+
+
+def test_the_message_shows_the_line():
+    with pytest.raises(
+        ValueError, match=r"index 0 is out of bounds.*in `.* = p\[0\]` \(.*test_callbacks.py, line \d+\)"
+    ):
+        system(parameters=[]).mass(0.0, Q)
+
+
+@njit
+def fill(out, place):
+    out[place] = 1.0
+
+
+@njit
+def pass_on(out, place):
+    fill(out, place)
+
+
+@njit
+def countdown(out, place):
+    if place > FAR:
+        countdown(out, place - 1)
+    else:
+        fill(out, place)
+
+
+def enclosing(helper):
+    def force(t, q, v, p, Q):
+        helper(Q, FAR + 3)
+
+    return force
+
+
+def of_module(module):
+    def force(t, q, v, p, Q):
+        module.fill(Q, FAR)
+
+    return force
+
+
+def of_tuple(helpers):
+    def force(t, q, v, p, Q):
+        helpers[0](Q, FAR)
+
+    return force
+
+
+MODULE = types.ModuleType("helpers")
+MODULE.fill = fill
+
+
+@pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
+@pytest.mark.parametrize(
+    "force",
+    [enclosing(fill), enclosing(pass_on), enclosing(countdown), of_module(MODULE), of_tuple((pass_on,))],
+    ids=["helper", "helper of a helper", "recursive", "module", "tuple"],
+)
+def test_helpers_are_watched(force):
+    with pytest.raises(
+        ValueError, match=r"force of 'far' goes out of bounds: index 1000000\d is .*`out\[place\] = 1.0`"
+    ):
+        system(force=callback("force")(force)).force(0.0, Q, V)
+
+
+def test_what_runs_only_compiled_is_watched_too():
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[FAR] = 1.0 / (0.0 * t)  # an exception in Python, where t is a float, and an infinity when compiled
+
+    with pytest.raises(ValueError, match=r"force of 'far' goes out of bounds: index is out of bounds"):
+        system(force=force).force(0.0, Q, V)
+
+
+def test_functions_compiled_by_from_python_are_watched():
+    def force(t, q, v):
+        return np.array([q[FAR], 0.0])
+
+    with pytest.raises(ValueError, match=rf"force of 'pendulum' goes out of bounds: index {FAR}.*q\[FAR\]"):
+        pendulum(compile=True, force=force).force(0.0, Q, V)
+
+
+def test_a_callback_is_looked_at_once_and_changes_nothing():
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[1] = -9.81 * q.size
+
+    given = system(force=force)
+    q, v = np.array(Q), np.array(V)
+    for _ in range(3):
+        assert given.force(0.0, q, v).tolist() == [0.0, -19.62]
+    assert given.within_bounds == {"force"}
+    force.py_func = None  # what is looked at again would fail now
+    given.force(0.0, q, v)
+    assert q.tolist() == Q
+    assert v.tolist() == V
+
+
+def test_negative_indices_count_from_the_end_as_in_python():
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[-1] = -9.81 * q[-2]
+
+    assert system(force=force).force(0.0, Q, V).tolist() == [0.0, 9.81]
+
+
+# --- what the caller passes
+
+
+@pytest.mark.parametrize("make", [system, pendulum], ids=["compiled", "plain"])
+@pytest.mark.parametrize(
+    ("kind", "arguments", "error", "words"),
+    [
+        ("jacobian", (0.0, [0.0]), ValueError, r"q must have shape \(2,\), as n_q = 2 in '\w+'; given shape \(1,\)"),
+        ("jacobian", (0.0, [[0.0, 1.0]]), ValueError, r"q must have shape \(2,\).*given shape \(1, 2\)"),
+        ("constraint", (0.0, 1.0), ValueError, r"q must have shape \(2,\).*given shape \(\)"),
+        ("force", (0.0, Q, [0.0] * 3), ValueError, r"v must have shape \(2,\).*given shape \(3,\)"),
+        ("reaction_by_q", (0.0, Q, V), ValueError, r"lam must have shape \(1,\), as n_c = 1.*given shape \(2,\)"),
+        ("mass", (np.nan, Q), ValueError, "t must be finite; given nan"),
+        ("mass", (np.inf, Q), ValueError, "t must be finite; given inf"),
+        ("mass", ("now", Q), TypeError, "t must be a number; given 'now'"),
+        ("mass", (0.0, ["left", "down"]), TypeError, "q must be an array of real numbers"),
+        ("force", (0.0, Q), TypeError, r"force\(t, q, v\): missing a required argument: 'v'"),
+        ("force", (0.0, Q, V, V), TypeError, r"force\(t, q, v\): too many positional arguments"),
+    ],
+)
+def test_arguments_of_single_callbacks_are_checked(make, kind, arguments, error, words):
+    with pytest.raises(error, match=words):
+        getattr(make(), kind)(*arguments)
+
+
+def test_arguments_of_single_callbacks_may_be_named():
+    assert pendulum().force(t=0.0, q=Q, v=V).tolist() == [0.0, -9.81]
+    assert pendulum().force(0.0, v=V, q=np.array([Q, Q]).T[:, 0]).tolist() == [0.0, -9.81]

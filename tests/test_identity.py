@@ -1,0 +1,192 @@
+"""Copied, deep-copied, pickled and sent to another process, a system keeps its own functions, or says why it cannot."""
+
+import copy
+import multiprocessing
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.problems import pendulum
+from tests.test_callbacks import PENDULUM
+from twoloop import ConstrainedSystem, callback, solve_dae
+from twoloop.adapters import PythonFunctions
+from twoloop.mechanisms import four_bar, very_flexible_beam
+
+Q, V = [-0.6, -0.8], [0.4, -0.3]
+LOADS = np.diag([2.0, 3.0])
+
+
+def mass(t, q):
+    return np.eye(2)
+
+
+def light(t, q, v):
+    return np.array([0.0, -9.81])
+
+
+def heavy(t, q, v):
+    return np.array([0.0, -98.1])
+
+
+def constraint(t, q):
+    return np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)])
+
+
+def jacobian(t, q):
+    return q.reshape((1, 2))
+
+
+def made(force=light, **changed):
+    functions = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian}
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, **{**functions, "name": "own", **changed})
+
+
+SYSTEMS = {
+    "plain": made,
+    "plain, array mass": lambda: made(mass=LOADS),
+    "compile=True": lambda: made(compile=True),
+    "compile=True, array mass": lambda: made(mass=LOADS, compile=True),
+    "compiled": lambda: ConstrainedSystem(**PENDULUM, parameters=[3.0], constant_mass=True, name="own"),
+    "four-bar": lambda: four_bar().system,
+}
+
+
+def observed(system):
+    """What tells one system from another; at the top level, for other processes."""
+    q = np.linspace(0.1, 0.9, system.n_q)
+    arrays = [system.mass(0.0, q), system.force(0.0, q, q), system.constraint(0.0, q), system.jacobian(0.0, q)]
+    flags = system.functions.flags.tolist()
+    return [array.tolist() for array in arrays], flags, system.name, system.constant_mass, system.called_in_python
+
+
+def observed_beside_another(system):
+    """In a process where other systems were made first, whose numbers a foreign one must not meet."""
+    others = [made(force=heavy) for _ in range(5)]
+    return observed(system), [other.force(0.0, Q, V).tolist() for other in others]
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda system: pickle.loads(pickle.dumps(system))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_a_copy_works_when_the_original_is_gone(name, copied):
+    system = SYSTEMS[name]()
+    expected = observed(system)
+    other = copied(system)
+    del system
+    assert observed(other) == expected
+    if other.called_in_python:
+        assert int(other.parameters[0]) in PythonFunctions.registry
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_systems_keep_their_functions_in_other_processes(method):
+    systems = [make() for make in SYSTEMS.values()]
+    with multiprocessing.get_context(method).Pool(1) as pool:
+        for system in systems:
+            there, others = pool.apply(observed_beside_another, (system,))
+            assert there == observed(system)
+            assert others == [[0.0, -98.1]] * 5
+
+
+def test_a_forked_system_that_is_not_pickled_keeps_its_functions():
+    system = pendulum(force=lambda t, q, v: np.array([1.0, 2.0]))
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    process = context.Process(target=lambda: queue.put(system.force(0.0, Q, V).tolist()))
+    process.start()
+    assert queue.get(timeout=60) == [1.0, 2.0]
+    process.join()
+
+
+def test_a_pickle_read_in_a_new_process_does_not_run_the_functions_of_another_system(tmp_path):
+    file = tmp_path / "system.pickle"
+    file.write_bytes(pickle.dumps(made()))
+    source = (
+        "import pickle, numpy as np\n"
+        "from tests.test_identity import made, heavy\n"
+        "others = [made(force=heavy) for _ in range(3)]\n"
+        f"print(pickle.load(open({str(file)!r}, 'rb')).force(0.0, [0.0, 1.0], [0.0, 0.0]).tolist())"
+    )
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", source], cwd=root, capture_output=True, text=True, timeout=300)
+    assert done.stdout.strip() == "[0.0, -9.81]", done.stderr
+
+
+def test_pickled_systems_solve_alike():
+    system = made()
+    runs = [solve_dae(each, (0.0, 0.5), Q, [0.8, -0.6]) for each in (system, pickle.loads(pickle.dumps(system)))]
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)
+
+
+def test_changed_parameters_travel():
+    system = SYSTEMS["compiled"]()
+    system.parameters[0] = 5.0
+    for other in (copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
+        assert other.mass(0.0, Q)[0, 0] == 5.0
+        other.parameters[0] = 1.0
+        assert system.mass(0.0, Q)[0, 0] == 5.0
+
+
+def test_a_compiled_callback_at_the_top_level_travels_by_name():
+    copied = pickle.loads(pickle.dumps(SYSTEMS["compiled"]()))
+    assert copied.functions.force is PENDULUM["force"]
+
+
+def test_a_compiled_callback_within_a_function_travels_with_its_source():
+    factor = 3.0
+
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[1] = factor * p[0]
+
+    system = ConstrainedSystem(**{**PENDULUM, "force": force}, parameters=[2.0])
+    assert pickle.loads(pickle.dumps(system)).force(0.0, Q, V).tolist() == [0.0, 6.0]
+
+
+def enclosing():
+    def force(t, q, v):
+        return np.zeros(2)
+
+    return force
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("force", [lambda t, q, v: np.zeros(2), enclosing()], ids=["lambda", "closure"])
+def test_functions_without_a_name_of_their_own_say_so(force, compiled):
+    system = made(force=force, compile=compiled)
+    words = r"(?s)force of 'own', .*(<lambda>|enclosing.<locals>.force), cannot be pickled.*top level of a module"
+    with pytest.raises(TypeError, match=words):
+        pickle.dumps(system)
+    assert copy.deepcopy(system).force(0.0, Q, V).tolist() == [0.0, 0.0]  # needs no name
+
+
+@pytest.mark.parametrize("problem", [four_bar(), four_bar(theta3=0.3), very_flexible_beam()], ids=lambda p: p.name)
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda problem: pickle.loads(pickle.dumps(problem))])
+def test_problems_can_be_copied(problem, copied):
+    other = copied(problem)
+    assert observed(other.system) == observed(problem.system)
+    assert other.energy(0.0, other.q0, other.v0) == problem.energy(0.0, problem.q0, problem.v0)
+    assert (other.q0 == problem.q0).all()
+    assert (other.name, other.note, other.parameters) == (problem.name, problem.note, problem.parameters)
+
+
+def test_numbers_that_lead_to_no_function_are_refused():
+    system = made()
+    callbacks = {kind: getattr(system.functions, kind) for kind in ("mass", "force", "constraint", "jacobian")}
+    stale = ConstrainedSystem(n_q=2, n_c=1, **callbacks, parameters=[12345.0])
+    with pytest.raises(RuntimeError, match="of a system that is not in this process, or no longer"):
+        stale.force(0.0, Q, V)
+
+
+def test_handles_cannot_be_guessed_and_fit_a_float():
+    handles = {int(made().parameters[0]) for _ in range(50)}
+    assert len(handles) == 50
+    assert max(handles) < 2**52
+    assert max(handles) - min(handles) > 2**40

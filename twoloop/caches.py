@@ -1,0 +1,270 @@
+"""Machine code on disk: where numba keeps it, when it is out of date, and what happens where it cannot be kept.
+
+Everything that touches numba's private parts is in this file. Numba watches the file in which a function stands, and
+nothing else: not the helpers in other files, and not the values of globals, which it freezes. It raises when no folder
+can be written and when a file is damaged.
+"""
+
+import enum
+import glob
+import hashlib
+import inspect
+import pickle
+import sys
+import types
+import uuid
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba import njit
+from numba.core.caching import FunctionCache, NullCache
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+from numba.core.types import Type
+
+UNWRITABLE = (
+    "twoloop: machine code cannot be kept on disk, so every process compiles anew. Set NUMBA_CACHE_DIR to a folder "
+    "that can be written"
+)
+CHECKSUM = hashlib.sha256().digest_size
+
+# libraries whose functions are told apart by name; the versions of numba and numpy are part of every index and digest
+LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
+
+
+def compile_kept(
+    function: Callable[..., Any],
+    signature: Any,
+    watched: tuple[str, str] | None,
+    *,
+    announcement: str = "",
+    **options: Any,
+) -> Dispatcher:
+    """Compile a function for one signature, or read its machine code from the disk.
+
+    Parameters
+    ----------
+    function : callable
+        What numba compiles.
+    signature : numba signature
+        The only one that it will have.
+    watched : (str, str) or None
+        What the machine code depends on beside the file of the function, see `watch`: when the first changes, all is
+        made anew; the second tells functions apart that share their source. None: the machine code is not kept.
+    announcement : str
+        Said on stderr, once a process, before it compiles.
+    **options
+        Of numba.njit.
+    """
+    dispatcher = njit(**options)(function)
+    if watched is not None:
+        try:
+            dispatcher._cache = _Cache(function, *watched, announcement)
+        except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
+            if Path(inspect.getfile(function)).exists():
+                say_once(UNWRITABLE)
+    dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    return dispatcher
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of one function, with our stamp; what goes wrong in it costs time and raises nothing."""
+
+    def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
+        super().__init__(function)
+        source = self._cache_file._source_stamp
+        self._cache_file = _Files(self._cache_path, self._impl.filename_base, (source, stamp))
+        self._key, self._announcement = key, announcement
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return sig, codegen.magic_tuple(), self._key
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            found = super().load_overload(sig, target_context)
+        except Exception:  # a file of another installation; it is compiled again and overwritten
+            found = None
+        if found is None and self._announcement:
+            say_once(self._announcement)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError:
+            say_once(UNWRITABLE)
+
+
+class _Files:
+    """The files of one function, one for each key, each behind its checksum.
+
+    A file that is damaged, or was made of something else, is as good as none. Numba's own keep an index, through which
+    two processes that write at the same time may lead one function to the machine code of another.
+    """
+
+    def __init__(self, folder: str, name: str, stamp: Any):
+        self.folder, self.name = Path(folder), name
+        self.made_of = numba.__version__, stamp
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write what numba made for a key, in the place of what was there."""
+        content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
+        path = self._path(key)
+        unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
+        try:
+            unfinished.write_bytes(hashlib.sha256(content).digest() + content)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def load(self, key: Any) -> Any:
+        """What numba made for a key; None if it is to be made anew."""
+        try:
+            content = self._path(key).read_bytes()
+        except OSError:
+            return None
+        if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
+            return None
+        made_of, data = pickle.loads(content[CHECKSUM:])
+        return pickle.loads(data) if made_of == repr((*self.made_of, key)) else None
+
+    def flush(self) -> None:
+        """Remove the files of all keys."""
+        for path in self.folder.glob(f"{glob.escape(self.name)}.*.nbc"):
+            path.unlink(missing_ok=True)
+
+    def _path(self, key: Any) -> Path:
+        return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+
+
+@cache
+def say_once(text: str) -> None:
+    """Print a line on stderr, once a process."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
+    """Digests of all that the machine code of a function depends on, and of what it encloses.
+
+    The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
+    names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
+    """
+    code, enclosed = _Digest(), _Digest()
+    try:
+        code.add_function(function, enclosed=False)
+        enclosed.add(_enclosed(function))
+    except _CannotBeWatched:
+        return None
+    return code.hash.hexdigest(), enclosed.hash.hexdigest()
+
+
+def _take_over(helper: Any) -> None:
+    """Put our cache in the place of one of numba, which does not see what a helper calls in other files."""
+    if not isinstance(helper._cache, FunctionCache) or isinstance(helper._cache, _Cache):
+        return
+    watched = watch(helper.py_func)
+    try:
+        helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
+    except RuntimeError:
+        helper._cache = NullCache()
+    if helper.stats.cache_hits:  # what numba has read already may be out of date
+        helper.recompile()
+
+
+def _enclosed(function: Any) -> list[Any]:
+    return [cell.cell_contents for cell in function.__closure__ or ()]
+
+
+class _CannotBeWatched(Exception):
+    """A value that may change unseen."""
+
+
+class _Digest:
+    """A hash that takes values of many types, and follows functions to whatever they name."""
+
+    def __init__(self) -> None:
+        self.hash = hashlib.sha256(np.__version__.encode())
+        self.names: set[str] = set()  # of globals and attributes in the code that is being looked at
+        self.seen: set[tuple[int, str]] = set()
+
+    def add(self, value: Any) -> None:
+        self.hash.update(f"<{type(value).__qualname__}>".encode())
+        if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
+            self.hash.update(repr(value).encode())
+        elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
+            self.hash.update(f"{value.dtype.descr}{value.shape}".encode() + value.tobytes())
+        elif isinstance(value, (tuple, list)):
+            self.hash.update(f"{len(value)}{getattr(value, '_fields', '')}".encode())
+            for each in value:
+                self.add(each)
+        elif isinstance(value, (set, frozenset)):
+            self.hash.update(repr(sorted(map(repr, value))).encode())
+        elif isinstance(value, dict):
+            self.add(list(value.items()))
+        elif isinstance(value, enum.Enum):
+            self.add((value.name, value.value))
+        elif isinstance(value, types.CodeType):
+            self.hash.update(value.co_code + value.co_exceptiontable)
+            self.add([value.co_consts, value.co_names, value.co_freevars])
+        elif isinstance(value, types.ModuleType):
+            self._add_module(value)
+        elif isinstance(value, Dispatcher):
+            self._add_helper(value)
+        else:
+            self._add_name(value)
+
+    def add_function(self, function: Any, enclosed: bool = True) -> None:
+        outer, self.names = self.names, names_in(function.__code__)
+        self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
+        if enclosed:
+            self.add(_enclosed(function))
+        for name in sorted(self.names & set(function.__globals__)):
+            self.add([name, function.__globals__[name]])
+        self.names = outer
+
+    def _add_helper(self, helper: Dispatcher) -> None:
+        if self._is_new(helper):
+            _take_over(helper)
+            self.add(sorted(helper.targetoptions.items()))
+            self.add_function(helper.py_func)
+
+    def _add_module(self, module: types.ModuleType) -> None:
+        self.hash.update(module.__name__.encode())
+        if not _of_library(module.__name__):
+            for name in sorted(self.names & set(vars(module))):
+                if self._is_new(module, name):
+                    self.add([name, vars(module)[name]])
+
+    def _add_name(self, value: Any) -> None:
+        """Functions and types of the libraries stand for themselves by their names; nothing else does."""
+        if isinstance(value, type) and hasattr(value, "_fields"):
+            self.hash.update(f"{value.__qualname__}{value._fields}".encode())
+            return
+        module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
+        if type(value) is np.ufunc:
+            module, name = "numpy", value.__name__
+        if module is None or name is None or not _of_library(module):
+            raise _CannotBeWatched
+        self.hash.update(f"{module}.{name}".encode())
+
+    def _is_new(self, value: Any, name: str = "") -> bool:
+        key = (id(value), name)
+        if key in self.seen:
+            return False
+        self.seen.add(key)
+        return True
+
+
+def names_in(code: types.CodeType) -> set[str]:
+    """Names of globals and attributes in a code and the functions within it."""
+    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    return set(code.co_names).union(*map(names_in, inner))
+
+
+def _of_library(module: str) -> bool:
+    return module.partition(".")[0] in LIBRARIES
