@@ -1,0 +1,32 @@
+"""The paper's first example, the four-bar linkage, in two geometries; its motion is known apart from all solvers."""
+
+from functools import partial
+
+from references.four_bar_minimal import MinimalFourBar
+from studies.bench import Case
+from studies.reference_motion import ReferenceMotion
+from twoloop.mechanisms import Problem, four_bar
+
+Y3 = 7  # place of y3, the height of bar 3's centre, by which the paper shows the motion
+FLOOR = 1e-11  # m, rad; the one-coordinate solution is good to about 1e-12 after 100 s
+STEPS = (1e-2, 4e-3, 2e-3, 1e-3, 4e-4, 1e-4)  # s
+NOTE = "Lengths, masses and start are assumed: Table 2 of the paper is lost."
+
+
+def _known(problem: Problem) -> ReferenceMotion:
+    motion = MinimalFourBar.from_parameters(problem.parameters)
+    source = "one-coordinate formulation of its own (references/four_bar_minimal.py), DOP853 at 1e-13"
+    return ReferenceMotion(motion.states, FLOOR, source)
+
+
+def case(problem: Problem, name: str, t_end: float) -> Case:
+    """A linkage from `four_bar(...)`, released from rest."""
+    known = partial(_known, problem)
+    return Case(name, problem, t_end, known, watched=(Y3,), step_sizes=STEPS, tags=("smooth",), note=NOTE)
+
+
+def cases(quick: bool) -> list[Case]:
+    """Both geometries over 100 s; quick: 10 s."""
+    t_end = 10.0 if quick else 100.0
+    second = four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)
+    return [case(four_bar(), "four-bar", t_end), case(second, "four-bar, second", t_end)]
