@@ -101,7 +101,6 @@ def report(call: Call, output: Output, case: Case, rows: pd.DataFrame, line: str
     """Write findings, figure and report."""
     rows = tables.medians(rows)
     findings = findings_of(rows, case, errors)
-    # not looked up in a redrawn report's rows: the source is a text, and the motion is there already
     published = check_published(case.problem, case.reference, case.t_end)
     findings |= {"source": case.reference.source, "published": published}
     output.save_findings(findings)

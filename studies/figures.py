@@ -37,7 +37,7 @@ mpl.rcParams.update(
 
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, RED, PINK, GREY = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F"
+YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
 
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "DOP853 (two-loop)": (RED, "o"),
@@ -56,7 +56,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "IDA from C, order 2, positions tested": (BLUE, ">"),
     "IDA, stabilised": (GREY, "<"),
     "IDA, index1": (SKY, "<"),
-    "LSODA, index 1": (GREEN, "p"),
+    "LSODA, index 1": (BROWN, "p"),
     "DOP853, index 1": (SKY, "*"),
     "DOP853, projected": (ORANGE, "*"),
     "Radau, index 1": (PINK, "d"),

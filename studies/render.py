@@ -29,7 +29,7 @@ def number(value: Any, digits: int = 2) -> str:
         return f"{value}".replace("-", "−")
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     place = int(exponent)
-    if -3 <= place <= 3:
+    if -2 <= place <= 3:
         text = f"{float(f'{mantissa}e{place}'):.{max(digits - 1 - place, 0)}f}"
     else:
         mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
