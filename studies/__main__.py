@@ -1,4 +1,4 @@
-"""List the studies (`python -m studies`), run one (`python -m studies table3 --quick`) or all (`python -m studies all`)."""
+"""List the studies (`python -m studies`), run one (`python -m studies table3`) or all (`python -m studies all`)."""
 
 import importlib
 import sys

@@ -31,7 +31,6 @@ Array = NDArray[np.float64]
 
 INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed
-TIMED = 0.1  # s of CPU time: a shorter run is timed by calling it again, for some systems count CPU time in ticks of 4 ms
 MOST_CALLS = 500
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
 
@@ -69,6 +68,9 @@ class Case:
         s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
     time_limit : float
         CPU seconds that a run may use.
+    timed : float
+        s of CPU time: a shorter run is timed by calling it again until it has used so much, because some systems count
+        CPU time in ticks of 4 ms.
     tags : tuple of str
         Class of the problem, "smooth", "stiff", "long", for tables over several cases.
     note : str
@@ -85,6 +87,7 @@ class Case:
     watched: tuple[int, ...] | None = None
     step_sizes: tuple[float, ...] | None = None
     time_limit: float = 60.0
+    timed: float = 0.1
     tags: tuple[str, ...] = ()
     note: str = ""
 
@@ -121,7 +124,7 @@ class Solver:
     called_from : str
         What calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call.
     keeps_constraints : bool
-        Whether positions and velocities are on the constraints to the solver's tolerance at all times; False: they drift.
+        Whether positions and velocities stay on the constraints to the solver's tolerance; False: they drift.
     setting : str
         What the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s).
     run : callable
@@ -180,9 +183,7 @@ class Run:
 Measure = Callable[[Run, Result], dict[str, Any]]
 
 
-def collect(
-    runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None, processes: int = 1
-) -> pd.DataFrame:
+def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None, processes: int = 1) -> pd.DataFrame:
     """Make the rows of all runs that are not kept yet: one row a repetition.
 
     The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
@@ -294,7 +295,7 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
 def _timed(run: Run, k: int, first: float) -> Row:
     """CPU time of a call in s, the mean of `calls` of them where one is too short for the clock."""
     spent = [first]
-    while 0.0 <= sum(spent) < TIMED and len(spent) < MOST_CALLS:
+    while sum(spent) < run.case.timed and len(spent) < MOST_CALLS:
         again = attempt(run, k)[0]
         if again is None:
             break

@@ -101,8 +101,11 @@ def report(call: Call, output: Output, case: Case, rows: pd.DataFrame, line: str
     """Write findings, figure and report."""
     rows = tables.medians(rows)
     findings = findings_of(rows, case, errors)
-    published = check_published(case.problem, case.reference, case.t_end)
-    findings |= {"source": case.reference.source, "published": published}
+    if call.redraw:  # without making the reference again
+        findings |= {key: output.load_findings().get(key) for key in ("source", "published")}
+    else:
+        published = check_published(case.problem, case.reference, case.t_end)
+        findings |= {"source": case.reference.source, "published": published}
     output.save_findings(findings)
     lines = figures.cheapest_lines(rows, errors)
     findings["drawn"] = lines
@@ -126,13 +129,15 @@ def report(call: Call, output: Output, case: Case, rows: pd.DataFrame, line: str
     middle = errors[len(errors) // 2]
     output.write(
         f"{call.study}.md",
-        render("compare", findings, ready, stamp=line, study=call.study, quick=call.quick, middle=middle, note=case.note),
+        render("compare", findings, ready, stamp=line, quick=call.quick, middle=middle, note=case.note),
     )
 
 
 def _work(words: Sequence[str] | None) -> None:
     parser = cli.parser("compare", __doc__)
-    parser.add_argument("where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem")
+    parser.add_argument(
+        "where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem"
+    )
     parser.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     parser.add_argument("--solvers", nargs="+", metavar="NAME", help=f"of {', '.join(CATALOGUE)}")
     parser.add_argument("--errors", nargs="+", type=float, default=list(ERRORS), help="errors to compare the cost at")
@@ -147,7 +152,7 @@ def _work(words: Sequence[str] | None) -> None:
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
     if not t_end > 0.0:
         raise StudyError(f"--t-end must be positive; given {t_end:g}")
-    case = Case(problem.name, problem, t_end, note=problem.note)
+    case = Case(problem.name, problem, t_end, note=problem.note, timed=0.02 if given.quick else 0.1)
     call, errors = cli.call_of("compare", given, words), sorted(given.errors, reverse=True)
     with Output(call) as output:
         if call.redraw:

@@ -127,7 +127,9 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str) -> Fi
     for axes, what in ((left, "CPU time (s)"), (right, "evaluations")):
         _log_axes(axes, "largest position error over the run (m, rad)", what)
     handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", title="filled: keeps constraints\n[c] compiled, [P] Python")
+    figure.legend(
+        handles, labels, loc="outside right upper", title="filled: keeps constraints\n[c] compiled, [P] Python"
+    )
     figure.suptitle(title, fontsize=10)
     return figure
 

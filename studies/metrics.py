@@ -1,10 +1,14 @@
 """What a run is measured by, for any mechanism: errors, violations at three levels, energy, multipliers.
 
-Sampling is the same for all solvers. None lands on the sampling instants: each takes its own steps (solvers that store
-few instants by their own interpolants say so: IDA, SciPy with t_eval). The deviation from the reference is taken at
-these own instants, where no interpolant of ours enters, and the deviation, not the motion, is interpolated to the common
-instants: by cubics in the deviations of q and v for positions, linearly for velocities. A solver with long steps is thus
-not charged with an interpolation that it did not do.
+Sampling is the same for all solvers: none lands on the sampling instants, each takes its own steps. The deviation from
+the reference is taken at the steps' ends, and the deviation, not the motion, is interpolated to the common instants: by
+cubics in the deviations of q and v for positions, linearly for velocities. A solver with long steps is thus not charged
+with an interpolation that it did not do. IDA alone tells its states at the common instants, by its own interpolant of
+the order of its method, because storing every step would cost it more than the integration.
+
+Measured once (four-bar, 10 s; SunRadau5, Gauss12, DOP853 and BDF of twoloop at 1e-5 and 1e-9): this error is 0.999 to
+1.015 of the largest at the steps' own ends. Landing on 1000 instants instead multiplies the evaluations by 1.06 to 5.6
+and the error by anything from 2e-6 (DOP853 at 1e-5, whose steps it cuts short) to 44 (BDF at 1e-5).
 """
 
 from collections.abc import Callable
@@ -75,7 +79,7 @@ def correct_digits(deviation: Array, truth: Array, mixed: bool = False) -> float
 def violations(system: ConstrainedSystem, result: Result, most: int = CHECKED) -> tuple[Array, dict[str, Array]]:
     """Times, and at each the largest residual of the constraints in position, velocity and acceleration.
 
-    At no more than `most` of the stored instants, evenly chosen; "a" is C_q a - Q_d with the solver's own accelerations.
+    At no more than `most` of the stored instants, evenly chosen; "a" is C_q a - Q_d with the solver's accelerations.
     """
     chosen = np.unique(np.linspace(0, result.t.size - 1, most).astype(int))
     gamma, p = compiled_gamma(system), system.functions.p
@@ -165,9 +169,10 @@ def measure(
         return row
     dq, dv = deviation(result, motion, instants)
     q_end, v_end = (state[:, 0] for state in motion.states(np.array([end])))
-    last, truth = np.concatenate([q[:, -1] - q_end, v[:, -1] - v_end]), np.concatenate([q_end, v_end])
+    last_q, last_v = q[:, -1] - q_end, v[:, -1] - v_end
+    last, truth = np.concatenate([last_q, last_v]), np.concatenate([q_end, v_end])
     row["error_q"], row["error_v"] = float(np.abs(dq).max()), float(np.abs(dv).max())
-    row["error_end"], row["error_v_end"] = float(np.abs(last[: q_end.size]).max()), float(np.abs(last[q_end.size :]).max())
+    row["error_end"], row["error_v_end"] = float(np.abs(last_q).max()), float(np.abs(last_v).max())
     row["scd"], row["mescd"] = correct_digits(last, truth), correct_digits(last, truth, mixed=True)
     row["error_lam"] = _error_lam(system, result, motion)
     row["lost"] = scale.kinetic is not None and abs(row["energy"]) > LOST * scale.kinetic

@@ -71,11 +71,11 @@ def two_loop(method: str | Method, problem: Problem, t_end: float, tolerance: fl
     return solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=tolerance, atol=tolerance)
 
 
-def _start(case: Case) -> tuple[Any, tuple[float, float], Any, Any]:
+def _start(case: Case) -> tuple[Any, Any, Any, Any]:
     return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
 
 
-def _time_limit(solve: Callable[..., Result], case: Case) -> dict[str, float]:
+def _time_limit(solve: Callable[..., Result], case: Case) -> dict[str, Any]:
     known = "time_limit" in inspect.signature(solve).parameters
     return {"time_limit": case.time_limit} if known else {}
 
@@ -118,24 +118,24 @@ def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int
     if case.problem.system.called_in_python:
         raise NotApplicable("IDA from C needs compiled functions; this mechanism is plain Python (see IDA, stabilised)")
     rtol = tolerance * (1.0 + NUDGE * repeat)
-    limit = _time_limit(solve_ida_c, case)
-    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=_with_start(case), **options, **limit)
+    more = {**options, **_time_limit(solve_ida_c, case)}
+    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=_with_start(case), **more)
 
 
 def _with_start(case: Case) -> Any:
     return np.append(0.0, case.instants)
 
 
-def _index1(
-    method: str, stabilisation: str, alpha: float | None, case: Case, tolerance: float, repeat: int
-) -> Result:
+def _index1(method: str, stabilisation: str, alpha: float | None, case: Case, tolerance: float, repeat: int) -> Result:
     options: dict[str, Any] = {"stabilisation": stabilisation, "alpha": alpha, **_time_limit(solve_index1, case)}
     return solve_index1(*_start(case), method, tolerance, tolerance, **options)
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
     if "L3" not in case.problem.parameters:  # of the four-bar linkage
-        raise NotApplicable(f"Exudyn needs a model of its own for every mechanism; it has none of {case.problem.name!r}")
+        raise NotApplicable(
+            f"Exudyn needs a model of its own for every mechanism; it has none of {case.problem.name!r}"
+        )
     from references.exudyn_four_bar import solve_exudyn
 
     n_steps = round(case.t_end / step)
@@ -189,11 +189,13 @@ def _all() -> Iterator[CatalogueSolver]:
         keeps, run = form == "stabilised", partial(_ida, form)
         yield entry(f"IDA, {form}", "SUNDIALS", "Python", keeps, "tol", run, TOLERANCES, own_accelerations=True)
     loose = {"max_order": 2, "error_test": "positions"}
-    for name, options in ((IDA_C, {}), (IDA_C_ORDER_2, loose)):
+    for name, options in ((IDA_C, dict[str, Any]()), (IDA_C_ORDER_2, loose)):
         run = partial(_ida_c, options)
         yield entry(name, "SUNDIALS", "compiled", True, "tol", run, TOLERANCES, own_accelerations=True)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
-        yield entry(f"{name}, index 1", "SciPy", "Python", False, "tol", partial(_index1, name, "none", None), TOLERANCES)
+        yield entry(
+            f"{name}, index 1", "SciPy", "Python", False, "tol", partial(_index1, name, "none", None), TOLERANCES
+        )
     for name in ("DOP853", "RK45"):
         run = partial(_index1, name, "projection", None)
         yield entry(f"{name}, projected", "SciPy", "Python", True, "tol", run, TOLERANCES)

@@ -128,6 +128,17 @@ class Output:
         text = json.dumps(plain(findings), indent=1, allow_nan=False, ensure_ascii=False)
         self.write(f"{self.call.study}.json", text + "\n")
 
+    def load_findings(self) -> dict[str, Any]:
+        """Read what `save_findings` wrote."""
+        path = self.file(f"{self.call.study}.json")
+        try:
+            found = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise StudyError(f"{path} cannot be read: {error}") from None
+        if not isinstance(found, dict):
+            raise StudyError(f"{path} does not hold findings")
+        return found
+
     def save_series(self, series: Mapping[str, NDArray[Any]]) -> None:
         """Write named arrays, of which figures are drawn, to NAME_series.npz."""
         stream = BytesIO()

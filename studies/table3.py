@@ -19,8 +19,18 @@ from studies.cli import Call, StudyError
 from studies.index import put_in_index
 from studies.metrics import ASTRAY, LOST
 from studies.render import number, power, render, table
-from studies.solvers import CATALOGUE, IDA_C, IDA_FORMS, IRK, IRK_LINE, NEWMARK, OWN_EXPLICIT, QUARTER
-from studies.solvers import paper_irk_at, paper_newmark_at
+from studies.solvers import (
+    CATALOGUE,
+    IDA_C,
+    IDA_FORMS,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    OWN_EXPLICIT,
+    QUARTER,
+    paper_irk_at,
+    paper_newmark_at,
+)
 from studies.store import Output
 from studies.table3_causes import FAMILIES, TOLERANCES, causes, machine, printed
 from twoloop import Result, RungeKutta, solve_dae

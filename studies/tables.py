@@ -21,14 +21,15 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
         order = run["error_q"].astype(float).fillna(np.inf).argsort(kind="stable")
         row = run.iloc[order.iloc[len(run) // 2]].copy()
         times = run["cpu_s"].astype(float).dropna()
-        quartiles = np.percentile(times, (25, 50, 75)) if len(times) else np.full(3, np.nan)
-        row["cpu_q1"], row["cpu_s"], row["cpu_q3"], row["repeats"] = *quartiles, len(run)
+        for name, share in (("cpu_q1", 25), ("cpu_s", 50), ("cpu_q3", 75)):
+            row[name] = np.percentile(times, share) if len(times) else np.nan
+        row["repeats"] = len(run)
         chosen.append(row)
     return pd.DataFrame(chosen).drop(columns="repeat").reset_index(drop=True)
 
 
 def time_for(rows: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
-    """CPU time (or another cost) of one solver for an error over the run of at most `target`; NaN where none is so good.
+    """CPU time (or another cost) of one solver for an error of at most `target`; NaN where no run is so good.
 
     Between the two runs on either side of the target, on the log-log line through them: solvers whose settings lie
     far apart are not made to look expensive by it. NaN too where the target is below what the reference resolves.
@@ -83,7 +84,7 @@ def why_not(rows: pd.DataFrame) -> str:
     return f"least error {number(best)}" + (", then time limit" if stopped else "")
 
 
-def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] | None = None) -> list[list[str]]:
+def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = ()) -> list[list[str]]:
     """Lines of a table: solver, called from, CPU time with quartiles in seconds for each target.
 
     Instead of a dash the cell of a target that is not reached says how far the solver came.

@@ -30,7 +30,7 @@ def case(**changed):
     def known():
         return ReferenceMotion(lambda t: pendulum_state(t)[:2], 1e-13, "elliptic functions")
 
-    return Case("pendulum", problem(), T_END, **{"known": known, "n_instants": 50, **changed})
+    return Case("pendulum", problem(), T_END, **{"known": known, "n_instants": 50, "timed": 0.0, **changed})
 
 
 def solver(run, name="a solver", **changed):
@@ -44,11 +44,6 @@ def ours(case, value, repeat):
 @pytest.fixture
 def kept(tmp_path):
     return KeptRows(tmp_path / "x.partial.jsonl", {})
-
-
-@pytest.fixture(autouse=True)
-def timed_once(monkeypatch):
-    monkeypatch.setattr(bench, "TIMED", 0.0)
 
 
 def row(kept, run, case_=None, **changed):
@@ -76,10 +71,10 @@ def test_every_repetition_is_a_row_and_repetitions_are_interleaved(kept):
     assert (rows["tol"] == 1e-6).all() and (rows["group"] == "group").all()
 
 
-def test_a_short_run_is_called_until_its_time_can_be_read(kept, monkeypatch):
-    monkeypatch.setattr(bench, "TIMED", 1e9)
+@pytest.mark.parametrize(("timed", "calls"), [(0.0, 1), (1e9, 3)])
+def test_a_short_run_is_called_until_its_time_can_be_read(kept, monkeypatch, timed, calls):
     monkeypatch.setattr(bench, "MOST_CALLS", 3)
-    assert row(kept, ours)["calls"] == 3
+    assert row(kept, ours, case(timed=timed))["calls"] == calls
 
 
 @pytest.mark.parametrize(
@@ -209,7 +204,9 @@ def test_the_quintic_is_exact_on_polynomials_of_degree_5():
 def test_foreign_solvers_run_any_mechanism_or_say_why_not(kept):
     names = ("Exudyn, GeneralizedAlpha", "IDA from C, stabilised", "DOP853 (two-loop)")
     with kept:
-        rows = collect([Run(case(), CATALOGUE[name], CATALOGUE[name].grid(case())[1], repeats=1) for name in names], kept)
+        rows = collect(
+            [Run(case(), CATALOGUE[name], CATALOGUE[name].grid(case())[1], repeats=1) for name in names], kept
+        )
     status = dict(zip(rows["solver"], rows["status"], strict=True))
     assert status[names[0]] == status[names[1]] == "NOT_APPLICABLE" and status[names[2]] == "REACHED_END"
     assert "model of its own" in rows["message"][0] and "compiled" in rows["message"][1]

@@ -38,7 +38,12 @@ def test_numbers_have_two_digits_and_one_exponent_style(value, text):
 def test_other_styles():
     assert number(3.4449, 3) == "3.44" and power(1e-9) == "1e-9" and power(0.01) == "1e-2"
     assert percent(0.123) == "12 %"
-    assert [listed(words) for words in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["none", "a", "a and b", "a, b and c"]
+    assert [listed(words) for words in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
+        "none",
+        "a",
+        "a and b",
+        "a, b and c",
+    ]
 
 
 def test_a_table_wants_rows_of_its_width():

@@ -9,7 +9,14 @@ from studies.solvers import CATALOGUE, IRK, LINE_UP, TOLERANCES, baumgarte, gear
 from twoloop.mechanisms import four_bar
 
 T_END = 0.2
-COMPILING = ("IDA", "LSODA", "DOP853", "RK45", "Radau,", "BDF,")  # seconds each, and tested by the studies that show them
+COMPILING = (
+    "IDA",
+    "LSODA",
+    "DOP853",
+    "RK45",
+    "Radau,",
+    "BDF,",
+)  # seconds each, and tested by the studies that show them
 
 
 def setting(name):

@@ -39,7 +39,7 @@ def test_two_runs_in_one_folder_are_refused(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_refused_before_any_run(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StudyError, match="cannot write to .*--out"), Output(call(tmp_path / "file" / "below")):
+    with pytest.raises(StudyError, match=r"cannot write to .*--out"), Output(call(tmp_path / "file" / "below")):
         pass
 
 
