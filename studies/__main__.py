@@ -4,7 +4,8 @@ import importlib
 import sys
 import traceback
 
-from studies.index import STUDIES
+from studies.cli import REPORTS, ROOT
+from studies.index import STUDIES, put_in_readme
 
 USAGE = "usage: python -m studies [NAME | all | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 
@@ -40,6 +41,9 @@ def run_all(words: list[str]) -> None:
         except Exception:  # a bug in one study
             traceback.print_exc()
             failed.append(name)
+    options = {word.split("=")[0] for word in words}
+    if not options & {"--quick", "--out"} and "work_precision" not in failed:
+        put_in_readme(REPORTS, ROOT / "README.md")
     if failed:
         sys.exit(f"{len(failed)} of {len(STUDIES)} studies failed, see above: {', '.join(failed)}")
 

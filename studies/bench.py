@@ -320,6 +320,10 @@ def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str]:
         return None, "TIME_LIMIT", f"Stopped after {run.case.time_limit:g} s of CPU time, the limit of a run."
     except ImportError as error:
         return None, "NOT_AVAILABLE", str(error)
+    except RuntimeError as error:
+        # references/ say so what is to be installed for a package that is not there
+        status = "NOT_AVAILABLE" if isinstance(error.__context__, ImportError) else "RAISED"
+        return None, status, str(error)
     except Exception as error:  # a solver that raises must not end a night of runs: the row says what it raised
         return None, "RAISED", f"{type(error).__name__}: {error}"
     if result.status.name == "INTERRUPTED":  # Ctrl-C, which solve_dae turns into a partial result

@@ -69,14 +69,6 @@ def load_series(path: Path) -> dict[str, Array]:
         return {name: stored[name] for name in stored.files}
 
 
-def put_in_readme(text: str) -> None:
-    """Put a generated piece between its two marks in the README."""
-    path = ROOT / "README.md"
-    before, rest = path.read_text().split("<!-- generated: begin -->\n", 1)
-    after = rest.split("<!-- generated: end -->", 1)[1]
-    path.write_text(f"{before}<!-- generated: begin -->\n{text}\n<!-- generated: end -->{after}")
-
-
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:
     """A markdown table of ready strings; the first column to the left, the others to the right."""
     lines = ["| " + " | ".join(header) + " |", "|---" + "|--:" * (len(header) - 1) + "|"]

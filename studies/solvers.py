@@ -122,6 +122,13 @@ def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int
     return solve_ida_c(*_start(case), rtol, tolerance, t_eval=_with_start(case), **more)
 
 
+def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.fully_implicit import solve_fully_implicit  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+    limit = {"time_limit": case.time_limit}
+    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, **limit)  # type: ignore[no-any-return, unused-ignore]
+
+
 def _with_start(case: Case) -> Any:
     return np.append(0.0, case.instants)
 
@@ -192,6 +199,9 @@ def _all() -> Iterator[CatalogueSolver]:
     for name, options in ((IDA_C, dict[str, Any]()), (IDA_C_ORDER_2, loose)):
         run = partial(_ida_c, options)
         yield entry(name, "SUNDIALS", "compiled", True, "tol", run, TOLERANCES, own_accelerations=True)
+    for name in ("Radau", "Radau9", "BDF"):
+        run = partial(_fully_implicit, name)
+        yield entry(f"{name}, solve_dae", "solve_dae", "Python", True, "tol", run, TOLERANCES, own_accelerations=True)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
         yield entry(
             f"{name}, index 1", "SciPy", "Python", False, "tol", partial(_index1, name, "none", None), TOLERANCES

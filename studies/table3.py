@@ -16,7 +16,7 @@ from studies import cli, figures, tables
 from studies.bench import Case, Run, Solver, collect
 from studies.cases import four_bar
 from studies.cli import Call, StudyError
-from studies.index import put_in_index
+from studies.index import write_index
 from studies.metrics import ASTRAY, LOST
 from studies.render import number, power, render, table
 from studies.solvers import (
@@ -278,8 +278,7 @@ def _work(words: Sequence[str] | None) -> None:
             rows, line = make(output, call.quick), cli.stamp(call.command)
             output.save_rows(rows, line)
         report(output, rows, line)
-    text = "[Report](table3.md), [rows](table3.csv)\n\n![CPU time and evaluations over error](table3.png)"
-    put_in_index(call, "table3", __doc__, text, line)
+        write_index(output)
     show(rows)
     print(f"wrote table3.md, .csv, .json and figures to {output.path}")
 

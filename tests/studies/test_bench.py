@@ -77,11 +77,19 @@ def test_a_short_run_is_called_until_its_time_can_be_read(kept, monkeypatch, tim
     assert row(kept, ours, case(timed=timed))["calls"] == calls
 
 
+def not_installed():
+    error = RuntimeError("foreign is not installed: pip install foreign")
+    error.__context__ = ImportError("No module named 'foreign'")
+    return error
+
+
 @pytest.mark.parametrize(
     ("raised", "status", "says"),
     [
         (NotApplicable("needs a model of its own"), "NOT_APPLICABLE", "needs a model of its own"),
         (ImportError("No module named 'foreign'"), "NOT_AVAILABLE", "foreign"),
+        (not_installed(), "NOT_AVAILABLE", "pip install foreign"),
+        (RuntimeError("cannot start"), "RAISED", "cannot start"),
         (ZeroDivisionError("by zero"), "RAISED", "ZeroDivisionError: by zero"),
     ],
 )

@@ -15,6 +15,7 @@ COMPILING = (
     "DOP853",
     "RK45",
     "Radau,",
+    "Radau9,",
     "BDF,",
 )  # seconds each, and tested by the studies that show them
 
