@@ -1,22 +1,29 @@
-"""List the studies (`python -m studies`) or run them all (`python -m studies all [--quick] [--out DIR]`)."""
+"""List the studies (`python -m studies`), run one (`python -m studies table3`) or all (`python -m studies all`)."""
 
 import importlib
 import sys
 import traceback
 
-from studies.index import STUDIES
+from studies.cli import REPORTS, ROOT
+from studies.index import STUDIES, put_in_readme
+
+USAGE = "usage: python -m studies [NAME | all | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 
 
 def main() -> None:
-    words = sys.argv[1:]
-    if words[:1] == ["all"]:
-        run_all(words[1:])
-    elif words:
-        sys.exit(f"usage: python -m studies [all [--quick] [--out DIR]]; given {' '.join(words)}")
+    name, *words = sys.argv[1:] or [""]
+    if name == "all":
+        run_all(words)
+    elif name in (*STUDIES, "compare"):
+        importlib.import_module(f"studies.{name}").main(words)
+    elif name and name not in ("-h", "--help"):
+        sys.exit(f"{USAGE}; given {name}, which is none of {', '.join(STUDIES)}")
     else:
-        for name in STUDIES:
-            module = importlib.import_module(f"studies.{name}")
-            print(f"python -m studies.{name:10s} {(module.__doc__ or '').splitlines()[0]}")
+        if name:
+            print(USAGE)
+        for study in STUDIES:
+            module = importlib.import_module(f"studies.{study}")
+            print(f"python -m studies.{study:10s} {(module.__doc__ or '').splitlines()[0]}")
 
 
 def run_all(words: list[str]) -> None:
@@ -25,11 +32,18 @@ def run_all(words: list[str]) -> None:
     for name in STUDIES:
         print(f"--- {name}", flush=True)
         try:
-            module = importlib.import_module(f"studies.{name}")
-            module.main(words, command=f"python -m studies.{name} {' '.join(words)}".strip())
-        except Exception:  # a bug in one study; what is not an Exception (Ctrl-C, wrong options) ends the run
+            importlib.import_module(f"studies.{name}").main(words)
+        except SystemExit as end:
+            if not isinstance(end.code, str):  # Ctrl-C, --help, wrong options
+                raise
+            print(end.code, file=sys.stderr)
+            failed.append(name)
+        except Exception:  # a bug in one study
             traceback.print_exc()
             failed.append(name)
+    options = {word.split("=")[0] for word in words}
+    if not options & {"--quick", "--out"} and "work_precision" not in failed:
+        put_in_readme(REPORTS, ROOT / "README.md")
     if failed:
         sys.exit(f"{len(failed)} of {len(STUDIES)} studies failed, see above: {', '.join(failed)}")
 

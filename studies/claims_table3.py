@@ -22,7 +22,7 @@ from studies.claims_verdicts import (
 from studies.report import number
 from studies.runs import ASTRAY, LOST
 from studies.solvers import IRK, IRK_LINE, NEWMARK, QUARTER
-from studies.table3_report import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
+from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 
 IRK_GROUP, NEWMARK_GROUP = FAMILIES
 LAST = TOLERANCES[-1]

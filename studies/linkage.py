@@ -1,16 +1,19 @@
 """Pictures of the four-bar linkage in its motion: both geometries over half a period."""
 
+from collections.abc import Sequence
+
 import matplotlib.pyplot as plt
 import numpy as np
 
 from references.four_bar_minimal import MinimalFourBar
-from studies.index import put_in_index
-from studies.report import parse, stamp
+from studies import cli, figures
+from studies.cases.four_bar import SECOND
+from studies.index import write_index
+from studies.store import Output
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
 
 INSTANTS = 9
-PROBLEMS = (four_bar(), four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0))
 
 
 def _joints(problem: Problem, q):  # type: ignore[no-untyped-def]
@@ -28,7 +31,7 @@ def draw(axes: plt.Axes, problem: Problem) -> None:
     times = np.linspace(0.0, half, INSTANTS)
     result = solve_dae(problem.system, (0.0, half), problem.q0, problem.v0, t_eval=times)
     fine = solve_dae(problem.system, (0.0, half), problem.q0, problem.v0, t_eval=np.linspace(0.0, half, 200))
-    axes.plot(fine.q[6], fine.q[7], color="tab:red", lw=1.2, label="centre of bar 3")
+    axes.plot(fine.q[6], fine.q[7], color=figures.RED, lw=1.2, label="centre of bar 3")
     for k in range(INSTANTS):
         x, y = _joints(problem, result.q[:, k])
         shade = plt.cm.viridis(0.9 * k / (INSTANTS - 1))
@@ -44,17 +47,20 @@ def draw(axes: plt.Axes, problem: Problem) -> None:
     axes.legend(loc="lower left", fontsize=8)
 
 
-def main(words: list[str] | None = None, command: str | None = None) -> None:
-    """Draw `linkage.png`."""
-    call = parse("linkage", __doc__, words, command)
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for one, problem in zip(axes, PROBLEMS, strict=True):
-        draw(one, problem)
-    figure.suptitle("Released from rest (dark, thick); drawn at equal intervals of time, later is lighter", fontsize=9)
-    figure.savefig(call.out / "linkage.png")
-    plt.close(figure)
-    put_in_index(call, "linkage", __doc__, "![The linkage in its motion](linkage.png)", stamp(call.command))
-    print(f"wrote {call.out / 'linkage.png'}")
+def _work(words: Sequence[str] | None) -> None:
+    with Output(cli.parse("linkage", __doc__, words)) as output:
+        figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+        for one, problem in zip(axes, (four_bar(), four_bar(**SECOND)), strict=True):  # type: ignore[arg-type]
+            draw(one, problem)
+        figure.suptitle("Released from rest (dark, thick); equal intervals of time, later is lighter", fontsize=9)
+        figures.save(figure, output, "linkage")
+        write_index(output)
+    print(f"wrote linkage.png and .svg to {output.path}")
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Draw `linkage.png` and `linkage.svg`."""
+    cli.main(_work, words)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,6 @@
 """What every study writes: rows with a stamp (CSV), markdown, figures; and how it is called."""
 
 import argparse
-import os
-import platform
-import subprocess
-from dataclasses import dataclass
-from datetime import date
-from importlib.metadata import PackageNotFoundError, version
 from io import StringIO
 from pathlib import Path
 
@@ -15,13 +9,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from studies.cli import Call
+from studies.cli import stamp as stamp  # studies that are not on the bench yet take it from here
+
 mpl.use("Agg")
 
 Array = NDArray[np.floating]
 
 ROOT = Path(__file__).parent.parent
 REPORTS = ROOT / "reports"
-PACKAGES = ("twoloop", "numpy", "scipy", "numba", "scikit-sundae", "exudyn")
 
 mpl.rcParams.update(
     {
@@ -37,16 +33,6 @@ mpl.rcParams.update(
 )
 
 
-@dataclass(frozen=True)
-class Call:
-    """How a study was called."""
-
-    quick: bool
-    out: Path
-    redraw: bool
-    command: str
-
-
 def parse(name: str, description: str | None, words: list[str] | None, command: str | None) -> Call:
     """Read the command line of a study."""
     parser = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=description)
@@ -57,46 +43,7 @@ def parse(name: str, description: str | None, words: list[str] | None, command: 
     out = given.out or (REPORTS / "quick" if given.quick else REPORTS)
     out.mkdir(parents=True, exist_ok=True)
     line = command or " ".join([f"python -m studies.{name}", *(["--quick"] if given.quick else [])])
-    return Call(given.quick, out, given.redraw, line)
-
-
-def stamp(command: str) -> str:
-    """One line: command, date, commit, machine, versions."""
-    versions = []
-    for package in PACKAGES:
-        try:
-            versions.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            versions.append(f"{package} (not installed)")
-    return "; ".join(
-        [
-            f"`{command}`",
-            date.today().isoformat(),
-            f"commit {_commit()}",
-            f"{_cpu()}, {os.cpu_count()} cores",
-            f"{platform.system()}, Python {platform.python_version()}",
-            *versions,
-        ]
-    )
-
-
-def _commit() -> str:
-    def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        changed = git("status", "--porcelain", "--", "twoloop", "references", "studies")
-        return git("rev-parse", "--short=10", "HEAD") + (" with uncommitted changes" if changed else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown (not a git checkout)"
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+    return Call(name, given.quick, out, given.redraw, line)
 
 
 def save_rows(path: Path, rows: pd.DataFrame, line: str) -> None:
@@ -120,14 +67,6 @@ def load_series(path: Path) -> dict[str, Array]:
     """Read what `save_series` wrote."""
     with np.load(path) as stored:
         return {name: stored[name] for name in stored.files}
-
-
-def put_in_readme(text: str) -> None:
-    """Put a generated piece between its two marks in the README."""
-    path = ROOT / "README.md"
-    before, rest = path.read_text().split("<!-- generated: begin -->\n", 1)
-    after = rest.split("<!-- generated: end -->", 1)[1]
-    path.write_text(f"{before}<!-- generated: begin -->\n{text}\n<!-- generated: end -->{after}")
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

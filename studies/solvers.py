@@ -1,74 +1,68 @@
-"""All solvers that the studies compare, by name: how to run each at one setting, a tolerance or a step."""
+"""The catalogue: every solver that the studies compare, one entry each, usable on any case.
 
+An adapter that needs a model of its own (Exudyn) or compiled functions (IDA from C) raises `NotApplicable` for a case
+that it cannot run, which becomes a row. Foreign packages are imported when they are used, so that one that is not
+installed is a row too.
+"""
+
+import inspect
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from references import exudyn_four_bar, ida
-from references.exudyn_four_bar import solve_exudyn
-from references.gear import STARTS, solve_gear
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
+from studies.bench import Case, NotApplicable, Solver
 from studies.runs import Job
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.plan import Method
 from twoloop.tableaux import gauss, sun_radau_iib
 
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of all solvers that have one
+ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
 ERR_IN = 1e-9  # err_in and ...
 PAPER_TOL = 1e-5  # ... Atol = Rtol of the paper
-INSTANTS = 2001  # output times of solvers that interpolate
 STORED = 5000  # about as many steps of a fixed-step solver are stored
-NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is the row's
+NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is shown
 
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
-IDA_C = "IDA from C, stabilised"
+IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
 CANONICAL = "Gauss6, momenta, symmetric"
-OWN_EXPLICIT = "DOP853 (two-loop)"  # the preset "DOP853"; the other lines of this name are SciPy's
-IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", "BDF")
+OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
+IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", OWN_BDF)
 PRESETS = (*IMPLICIT, OWN_EXPLICIT)  # of twoloop, with their own options
+IDA_FORMS = ("index1", "stabilised")
+EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
+GEAR_STARTS = ("accurate", "ramp")
+
+# what `compare` runs, and the lines from which its figure takes the cheapest seven
+COMPARED = (
+    *("DOP853 (two-loop)", "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
+    *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
+)
 
 
-@dataclass(frozen=True)
-class Solver:
-    """A solver of the catalogue.
+class CatalogueSolver(Solver):
+    """What studies that are not on the bench yet ask of a solver."""
 
-    Attributes
-    ----------
-    name : str
-        Its line in tables and figures.
-    setting : str
-        What the one number is that `run` takes: "tol" (relative and absolute), "err_out" (Newmark's step-error
-        tolerance) or "h" (fixed step, s).
-    run : callable
-        run(problem, t_end, value, k) integrates from the problem's start to t_end and returns a Result; k is the
-        number of the repeat.
-    fixed : mapping
-        Settings that do not vary, for the row.
-    two_loop : bool
-        Whether it is a two-loop procedure of this project.
-    own_a : bool
-        Whether the accelerations in its results are not those of eq. (6) at its q and v, but unknowns of its own,
-        differences of v, or with Baumgarte's terms.
-    """
+    @property
+    def two_loop(self) -> bool:
+        return self.family == "two-loop"
 
-    name: str
-    setting: str
-    run: Callable[[Problem, float, float, int], Result]
-    fixed: Mapping[str, float] = field(default_factory=dict)
-    two_loop: bool = False
-    own_a: bool = False
+    @property
+    def own_a(self) -> bool:
+        return self.own_accelerations
 
     def job(self, group: str, problem: Problem, t_end: float, value: float, repeats: int = 3) -> Job:
-        """One run at the setting `value` as a job of a study."""
+        """One run at the setting `value` as a job of `runs.py`."""
+        case = Case(problem.name, problem, t_end, n_instants=2000)
         settings = {**self.fixed, self.setting: value}
-        return Job(group, self.name, problem, partial(self.run, problem, t_end, value), settings, repeats)
+        return Job(group, self.name, problem, partial(self.run, case, value), settings, repeats)
 
 
 def two_loop(method: str | Method, problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
@@ -77,61 +71,93 @@ def two_loop(method: str | Method, problem: Problem, t_end: float, tolerance: fl
     return solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=tolerance, atol=tolerance)
 
 
-def _paper_irk(problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
-    method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, 1e-4 * tolerance)
-    return two_loop(method, problem, t_end, tolerance, k)
+def _start(case: Case) -> tuple[Any, Any, Any, Any]:
+    return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
 
 
-def _paper_irk_out(problem: Problem, t_end: float, err_out: float, k: int) -> Result:
-    return two_loop(paper_irk(ERR_IN, err_out), problem, t_end, PAPER_TOL, k)
+def _time_limit(solve: Callable[..., Result], case: Case) -> dict[str, Any]:
+    known = "time_limit" in inspect.signature(solve).parameters
+    return {"time_limit": case.time_limit} if known else {}
 
 
-def _paper_newmark(beta: float, problem: Problem, t_end: float, err_out: float, k: int) -> Result:
-    return two_loop(paper_newmark(ERR_IN, err_out, beta), problem, t_end, PAPER_TOL, k)
+def _preset(method: str | Method, case: Case, tolerance: float, repeat: int) -> Result:
+    return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance)
 
 
-def _canonical(problem: Problem, t_end: float, step: float, k: int) -> Result:
+def _paper_irk(case: Case, tolerance: float, repeat: int) -> Result:
+    err_out = max(1e-4 * tolerance, 1e-14)  # smaller ones are below rounding
+    method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, err_out)
+    return _preset(method, case, tolerance, repeat)
+
+
+def _paper_irk_out(err_in: float, case: Case, err_out: float, repeat: int) -> Result:
+    return _preset(paper_irk(err_in, err_out), case, PAPER_TOL, repeat)
+
+
+def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repeat: int) -> Result:
+    return _preset(paper_newmark(err_in, err_out, beta), case, PAPER_TOL, repeat)
+
+
+def _canonical(case: Case, step: float, repeat: int) -> Result:
     method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    return solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, method=method, step_size=step)
+    return solve_dae(*_start(case), method=method, step_size=step)
 
 
-def _ida(form: str, problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
+def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.ida import solve_ida
+
     # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
-    instants = np.linspace(0.0, t_end, INSTANTS)
-    rtol = tolerance * (1.0 + NUDGE * k)
-    return solve_ida(problem.system, (0.0, t_end), problem.q0, problem.v0, form, rtol, tolerance, t_eval=instants)
+    rtol = tolerance * (1.0 + NUDGE * repeat)
+    limit = _time_limit(solve_ida, case)
+    return solve_ida(*_start(case), form, rtol, tolerance, t_eval=_with_start(case), **limit)
 
 
-def _ida_c(problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
-    instants = np.linspace(0.0, t_end, INSTANTS)
-    rtol = tolerance * (1.0 + NUDGE * k)
-    return solve_ida_c(problem.system, (0.0, t_end), problem.q0, problem.v0, rtol, tolerance, t_eval=instants)
+def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
+    from references.ida_c import solve_ida_c
+
+    if case.problem.system.called_in_python:
+        raise NotApplicable("IDA from C needs compiled functions; this mechanism is plain Python (see IDA, stabilised)")
+    rtol = tolerance * (1.0 + NUDGE * repeat)
+    more = {**options, **_time_limit(solve_ida_c, case)}
+    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=_with_start(case), **more)
 
 
-def _index1(
-    method: str,
-    stabilisation: str,
-    alpha: float | None,
-    problem: Problem,
-    t_end: float,
-    tolerance: float,
-    k: int,
-) -> Result:
-    options = {"stabilisation": stabilisation, "alpha": alpha}
-    span = (0.0, t_end)
-    return solve_index1(problem.system, span, problem.q0, problem.v0, method, tolerance, tolerance, **options)  # type: ignore[arg-type]
+def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.fully_implicit import solve_fully_implicit  # type: ignore[import-untyped, import-not-found, unused-ignore]
+
+    limit = {"time_limit": case.time_limit}
+    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, **limit)  # type: ignore[no-any-return, unused-ignore]
 
 
-def _exudyn(solver: str, options: Mapping[str, float], problem: Problem, t_end: float, step: float, k: int) -> Result:
-    n_steps = round(t_end / step)
-    return solve_exudyn(problem, t_end, n_steps, solver, **options, store_every=max(1, n_steps // STORED))  # type: ignore[arg-type]
+def _with_start(case: Case) -> Any:
+    return np.append(0.0, case.instants)
 
 
-def _gear(order: int, start: str, problem: Problem, t_end: float, step: float, k: int) -> Result:
-    n_steps = round(t_end / step)
+def _index1(method: str, stabilisation: str, alpha: float | None, case: Case, tolerance: float, repeat: int) -> Result:
+    options: dict[str, Any] = {"stabilisation": stabilisation, "alpha": alpha, **_time_limit(solve_index1, case)}
+    return solve_index1(*_start(case), method, tolerance, tolerance, **options)
+
+
+def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
+    if "L3" not in case.problem.parameters:  # of the four-bar linkage
+        raise NotApplicable(
+            f"Exudyn needs a model of its own for every mechanism; it has none of {case.problem.name!r}"
+        )
+    from references.exudyn_four_bar import solve_exudyn
+
+    n_steps = round(case.t_end / step)
     every = max(1, n_steps // STORED)
-    kept = np.append(np.arange(0, n_steps, every) * step, t_end)
-    return solve_gear(problem.system, (0.0, t_end), problem.q0, problem.v0, step, order, start=start, t_eval=kept)
+    limit = _time_limit(solve_exudyn, case)
+    return solve_exudyn(case.problem, case.t_end, n_steps, solver, **options, **limit, store_every=every)  # type: ignore[arg-type]
+
+
+def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Result:
+    from references.gear import solve_gear
+
+    n_steps = round(case.t_end / step)
+    kept = np.append(np.arange(0, n_steps, max(1, n_steps // STORED)) * step, case.t_end)
+    limit = _time_limit(solve_gear, case)
+    return solve_gear(*_start(case), step, order, start=start, t_eval=kept, **limit)
 
 
 def baumgarte(method: str, alpha: float) -> str:
@@ -144,37 +170,64 @@ def gear(order: int, start: str = "accurate") -> str:
     return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
 
 
-def _all() -> Iterator[Solver]:
-    yield Solver(IRK, "err_out", _paper_irk_out, {"err_in": ERR_IN, "tol": PAPER_TOL}, two_loop=True)
-    yield Solver(IRK_LINE, "tol", _paper_irk, two_loop=True)
-    for name, beta in ((NEWMARK, 0.5), (QUARTER, 0.25)):
-        yield Solver(name, "err_out", partial(_paper_newmark, beta), {"err_in": ERR_IN}, two_loop=True)
+def paper_irk_at(err_in: float) -> Solver:
+    """The paper's Runge-Kutta procedure along err_out, Atol = Rtol = 1e-5."""
+    run, fixed = partial(_paper_irk_out, err_in), {"err_in": err_in, "tol": PAPER_TOL}
+    return CatalogueSolver(IRK, "two-loop", "compiled", True, "err_out", run, ERR_OUT, fixed)
+
+
+def paper_newmark_at(err_in: float, beta: float = 0.5) -> Solver:
+    """The paper's Newmark procedure along err_out."""
+    name, run = NEWMARK if beta == 0.5 else QUARTER, partial(_paper_newmark, beta, err_in)
+    return CatalogueSolver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
+
+
+def _all() -> Iterator[CatalogueSolver]:
+    entry = CatalogueSolver
+    yield paper_irk_at(ERR_IN)  # type: ignore[misc]
+    yield entry(IRK_LINE, "two-loop", "compiled", True, "tol", _paper_irk, TOLERANCES)
+    yield paper_newmark_at(ERR_IN)  # type: ignore[misc]
+    yield paper_newmark_at(ERR_IN, 0.25)  # type: ignore[misc]
     for preset in PRESETS:
         method = "DOP853" if preset == OWN_EXPLICIT else preset
-        yield Solver(preset, "tol", partial(two_loop, method), two_loop=True)
-    yield Solver(CANONICAL, "h", _canonical, two_loop=True)
-    for form in ida.FORMS:
-        yield Solver(f"IDA, {form}", "tol", partial(_ida, form), own_a=True)
-    yield Solver(IDA_C, "tol", _ida_c, own_a=True)
-    for name in ("LSODA", "DOP853", "RK45"):
-        yield Solver(f"{name}, index 1", "tol", partial(_index1, name, "none", None))
+        yield entry(preset, "two-loop", "compiled", True, "tol", partial(_preset, method), TOLERANCES)
+    yield entry(CANONICAL, "two-loop", "compiled", True, "h", _canonical)
+    for form in IDA_FORMS:
+        keeps, run = form == "stabilised", partial(_ida, form)
+        yield entry(f"IDA, {form}", "SUNDIALS", "Python", keeps, "tol", run, TOLERANCES, own_accelerations=True)
+    loose = {"max_order": 2, "error_test": "positions"}
+    for name, options in ((IDA_C, dict[str, Any]()), (IDA_C_ORDER_2, loose)):
+        run = partial(_ida_c, options)
+        yield entry(name, "SUNDIALS", "compiled", True, "tol", run, TOLERANCES, own_accelerations=True)
+    for name in ("Radau", "Radau9", "BDF"):
+        run = partial(_fully_implicit, name)
+        yield entry(f"{name}, solve_dae", "solve_dae", "Python", True, "tol", run, TOLERANCES, own_accelerations=True)
+    for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
+        yield entry(
+            f"{name}, index 1", "SciPy", "Python", False, "tol", partial(_index1, name, "none", None), TOLERANCES
+        )
     for name in ("DOP853", "RK45"):
-        yield Solver(f"{name}, projected", "tol", partial(_index1, name, "projection", None))
+        run = partial(_index1, name, "projection", None)
+        yield entry(f"{name}, projected", "SciPy", "Python", True, "tol", run, TOLERANCES)
     for name in ("LSODA", "DOP853"):
         for alpha in ALPHAS:
-            run = partial(_index1, name, "baumgarte", alpha)
-            yield Solver(baumgarte(name, alpha), "tol", run, {"alpha": alpha}, own_a=True)
-    for solver in exudyn_four_bar.SOLVERS:
-        yield Solver(f"Exudyn, {solver}", "h", partial(_exudyn, solver, {}), own_a=True)
+            run, fixed = partial(_index1, name, "baumgarte", alpha), {"alpha": alpha}
+            line = baumgarte(name, alpha)
+            yield entry(line, "SciPy", "Python", False, "tol", run, TOLERANCES, fixed, own_accelerations=True)
+    for solver in EXUDYN:
+        run = partial(_exudyn, solver, {})
+        yield entry(f"Exudyn, {solver}", "Exudyn", "compiled", True, "h", run, own_accelerations=True)
     for radius in (1.0, 0.6):
-        run = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius})
-        yield Solver(f"Exudyn, GeneralizedAlpha {radius:g}", "h", run, {"spectral_radius": radius}, own_a=True)
+        run, fixed = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius}), {"spectral_radius": radius}
+        line = f"Exudyn, GeneralizedAlpha {radius:g}"
+        yield entry(line, "Exudyn", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
     for order in GEAR_ORDERS:
-        for start in STARTS:
-            yield Solver(gear(order, start), "h", partial(_gear, order, start), {"order": order}, own_a=True)
+        for start in GEAR_STARTS:
+            run, fixed = partial(_gear, order, start), {"order": order}
+            yield entry(gear(order, start), "stand-in", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
 
 
-CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
+CATALOGUE: dict[str, CatalogueSolver] = {solver.name: solver for solver in _all()}
 
 # one sensible setting of each, for studies that show a run of every solver: two-loop procedures first
 LINE_UP: dict[str, float] = {
@@ -183,13 +236,13 @@ LINE_UP: dict[str, float] = {
     QUARTER: 1e-9,
     **dict.fromkeys(PRESETS, 1e-8),
     CANONICAL: 0.01,
-    **{f"IDA, {form}": 1e-8 for form in ida.FORMS},
+    **{f"IDA, {form}": 1e-8 for form in IDA_FORMS},
     IDA_C: 1e-8,
     "LSODA, index 1": 1e-8,
     "DOP853, index 1": 1e-8,
     "DOP853, projected": 1e-8,
     baumgarte("DOP853", 10.0): 1e-8,
-    **{f"Exudyn, {solver}": 1e-3 for solver in exudyn_four_bar.SOLVERS},
+    **{f"Exudyn, {solver}": 1e-3 for solver in EXUDYN},
     "Exudyn, GeneralizedAlpha 0.6": 1e-3,
     "Exudyn, GeneralizedAlpha 1": 1e-3,
     **{gear(order): 1e-3 for order in (2, 5)},

@@ -1,14 +1,13 @@
 """The list of studies, running them all, and the index of the reports."""
 
+import json
 import sys
 
 import pytest
 
 from studies import __main__ as command
 from studies import index
-from studies.report import parse
-
-LINE = "`python -m studies.x`; 2026-01-01; commit abc; somewhere"
+from studies.cli import StudyError
 
 
 def test_the_list_names_every_study_with_its_first_line(monkeypatch, capsys):
@@ -22,7 +21,7 @@ def test_the_list_names_every_study_with_its_first_line(monkeypatch, capsys):
 
 def test_unknown_words_are_refused(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["studies", "motoin"])
-    with pytest.raises(SystemExit, match="given motoin"):
+    with pytest.raises(SystemExit, match="given motoin, which is none of"):
         command.main()
 
 
@@ -33,8 +32,8 @@ def test_a_failing_study_is_named_and_the_others_run(monkeypatch, capsys):
         def __init__(self, name):
             self.name = name
 
-        def main(self, words, command):
-            ran.append((self.name, words, command))
+        def main(self, words):
+            ran.append((self.name, words))
             if self.name == "bad":
                 raise RuntimeError("broken on purpose")
 
@@ -49,31 +48,71 @@ def test_a_failing_study_is_named_and_the_others_run(monkeypatch, capsys):
     with pytest.raises(SystemExit, match=r"2 of 4 studies failed.*bad, missing") as exit_:
         command.main()
     assert exit_.value.code not in (0, None)
-    assert [name for name, _, _ in ran] == ["good", "bad", "last"]
-    assert ran[0][1:] == (["--quick"], "python -m studies.good --quick")
+    assert ran == [("good", ["--quick"]), ("bad", ["--quick"]), ("last", ["--quick"])]
     assert "broken on purpose" in capsys.readouterr().err
 
 
-def call(tmp_path):
-    return parse("x", "", ["--out", str(tmp_path)], None)
+def test_one_study_runs_by_its_name(monkeypatch):
+    ran = []
+    monkeypatch.setattr(command.importlib, "import_module", lambda name: type("S", (), {"main": ran.append}))
+    monkeypatch.setattr(sys, "argv", ["studies", "table3", "--quick"])
+    command.main()
+    assert ran == [["--quick"]]
 
 
-def test_a_study_writes_its_own_section_only(tmp_path):
-    index.put_in_index(call(tmp_path), "motion", "The motion.", "![y3](motion_long.png)", LINE)
-    index.put_in_index(call(tmp_path), "table3", "The table.", "| a |\n|---|\n| 1 |", LINE)
-    first = (tmp_path / "README.md").read_text()
-    index.put_in_index(call(tmp_path), "motion", "The motion.", "changed", LINE)
-    second = (tmp_path / "README.md").read_text()
-    assert "motion_long.png" in first and "motion_long.png" not in second and "changed" in second
-    assert first.replace("![y3](motion_long.png)", "changed") == second
-    assert second.index("## table3") < second.index("## motion")  # the order of STUDIES
-    assert "Not run here yet: `python -m studies.violation`" in second
-    assert "Made by `python -m studies.x`, 2026-01-01, commit abc." in second
+def case(**changed):
+    """A case as `work_precision` finds it."""
+    best = {"solver": "ours", "cpu_s": 0.1, "cpu_q1": 0.1, "cpu_q3": 0.1, "n_evaluations": 100.0, "keeps": True}
+    best |= {"called_from": "compiled", "violation_q": 1e-15, "energy": 1e-3}
+    at = [{"error": 1e-4, "ours": best, "others": best | {"solver": "theirs", "keeps": False}, "default_over": 2.0}]
+    found = {"name": "crane", "tags": ["stiff"], "t_end": 1.0, "floor": 1e-9, "at": at, "figure": "crane.png"}
+    found |= {"default_dominated": True, "default_over": [2.0, 3.0], "astray": [], "drift": None, "note": ""}
+    return found | changed
 
 
-def test_the_index_is_the_same_when_a_study_is_drawn_again(tmp_path):
-    for _ in range(2):
-        for name in index.STUDIES:
-            index.put_in_index(call(tmp_path), name, "Title.", f"headline of {name}", LINE)
-    text = (tmp_path / "README.md").read_text()
-    assert text.count("headline of") == len(index.STUDIES) and "Not run" not in text
+def screen(tmp_path, cases, dominated=(), **others):
+    found = {"cases": cases, "dominated": list(dominated), "limit": 2.0, "default": "SunRadau5"}
+    for name, each in {"work_precision": found, **others}.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(each))
+    return index.first_screen(tmp_path, False)
+
+
+def test_the_first_screen_turns_with_the_findings(tmp_path):
+    worse = {"solver": "slow", "by": "ours", "factor": 3.0, "n": 6, "called_from": "Python"}
+    text = screen(tmp_path, [case()], [worse])
+    assert "| crane (stiff) | 1e-4 | `ours` | 0.10 |" in text and "`theirs` (drifts)" in text
+    assert "is never the cheapest of ours: it takes 2.0 to 3.0 times as long" in text
+    assert "`slow` (called from Python): `ours` takes at most 1/3.0 of its time" in text
+    text = screen(tmp_path, [case(default_dominated=False, default_over=[1.0, 2.0])])
+    assert "is the cheapest of ours at one of these errors" in text and "is dominated everywhere" in text
+    nothing = [{"error": 1e-4, "ours": None, "others": None, "default_over": None}]
+    text = screen(tmp_path, [case(at=nothing, default_dominated=False, default_over=[])])
+    assert "reaches none of these errors" in text and "none reaches it" in text
+
+
+def test_what_the_paper_promised_turns_with_the_findings(tmp_path):
+    found = {"newmark_dearer_everywhere": True, "newmark_over_irk": [2.0, 6.0], "one_constant": False}
+    found |= {"irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0]}
+    text = screen(tmp_path, [case()], table3=found)
+    assert "holds on the linkage at every error compared, by 2.0 to 6.0 times" in text
+    assert "do not follow the paper's up to one factor (8.0 to 15 for Runge" in text
+    text = screen(tmp_path, [case()], table3=found | {"newmark_dearer_everywhere": False, "one_constant": True})
+    assert "does not hold at every error" in text and "times follow the paper's up to one factor" in text
+
+
+def test_an_empty_folder_says_what_to_run(tmp_path):
+    text = index.first_screen(tmp_path, False)
+    assert "Not compared here yet: `python -m studies.work_precision`" in text
+    assert text.count("not run here") == len(index.STUDIES)
+
+
+def test_the_readme_changes_between_its_marks_only(tmp_path):
+    screen(tmp_path, [case()])
+    readme = tmp_path / "README.md"
+    readme.write_text("above\n<!-- generated: begin -->\nold\n<!-- generated: end -->\nbelow\n")
+    index.put_in_readme(tmp_path, readme)
+    text = readme.read_text()
+    assert text.startswith("above\n") and text.endswith("\nbelow\n") and "old" not in text
+    assert "| crane | 1e-4 | `ours` 0.10 s | `theirs` 0.10 s |" in text
+    with pytest.raises(StudyError, match="there is no work_precision"):
+        index.put_in_readme(tmp_path / "nowhere", readme)

@@ -4,11 +4,20 @@ import numpy as np
 import pytest
 
 from references.four_bar_minimal import trajectory
-from studies.solvers import CATALOGUE, IRK, LINE_UP, baumgarte, gear
+from studies.bench import Case
+from studies.solvers import CATALOGUE, IRK, LINE_UP, TOLERANCES, baumgarte, gear
 from twoloop.mechanisms import four_bar
 
 T_END = 0.2
-COMPILING = ("IDA", "LSODA", "DOP853", "RK45")  # seconds each, and tested by the studies that show them
+COMPILING = (
+    "IDA",
+    "LSODA",
+    "DOP853",
+    "RK45",
+    "Radau,",
+    "Radau9,",
+    "BDF,",
+)  # seconds each, and tested by the studies that show them
 
 
 def setting(name):
@@ -20,7 +29,7 @@ def setting(name):
 )
 def test_every_solver_runs_at_one_setting(name):
     problem = four_bar()
-    result = CATALOGUE[name].run(problem, T_END, setting(name), 0)
+    result = CATALOGUE[name].run(Case("four-bar", problem, T_END), setting(name), 0)
     assert result.success and result.t[-1] == pytest.approx(T_END)
     bound = 0.02 if ", order 1" in name else 1e-3  # implicit Euler
     assert np.abs(result.q - trajectory(problem.parameters, result.t)[0]).max() < bound
@@ -34,6 +43,11 @@ def test_a_job_carries_what_its_row_needs():
     assert CATALOGUE[baumgarte("DOP853", 10.0)].job("", four_bar(), T_END, 1e-6).settings["alpha"] == 10.0
 
 
+def test_all_tolerances_are_the_same_down_to_1e_13():
+    grids = {solver.values for solver in CATALOGUE.values() if solver.setting == "tol"}
+    assert grids == {TOLERANCES} and min(TOLERANCES) == 1e-13
+
+
 def test_names_and_flags_agree():
     assert set(LINE_UP) <= set(CATALOGUE)
     assert all(solver.name == name for name, solver in CATALOGUE.items())
@@ -41,6 +55,6 @@ def test_names_and_flags_agree():
 
 
 def test_long_runs_of_fixed_steps_are_thinned_and_end_at_the_end():
-    result = CATALOGUE[gear(2)].run(four_bar(), 0.7, 5e-5, 0)
+    result = CATALOGUE[gear(2)].run(Case("four-bar", four_bar(), 0.7), 5e-5, 0)
     assert result.stats.n_accepted == 14000 and result.t.size == 7001
     assert result.t[-1] == 0.7

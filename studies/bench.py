@@ -1,0 +1,356 @@
+"""The bench: a case (a mechanism and its reference) x a solver x a setting x a repetition is a row; one collector.
+
+A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechanisms stand in `cases/`, solvers in
+`solvers.py`, what a row says of the quality of a run in `metrics.py`.
+"""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from studies import metrics
+from studies.reference_motion import ReferenceMotion, make_reference
+from studies.store import KeptRows, Row
+from twoloop import Result, Statistics
+from twoloop.mechanisms import Problem
+
+Array = NDArray[np.float64]
+
+INSTANTS = 1000  # common instants of a case that names none
+WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed
+MOST_CALLS = 500
+NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
+
+
+class NotApplicable(Exception):
+    """Raised by a solver of the catalogue for a case that it cannot run; the text says why."""
+
+
+class TimeLimit(Exception):
+    """Raised in a run that has used up its CPU time."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A mechanism, a time span, and what runs are measured by.
+
+    Attributes
+    ----------
+    name : str
+        In tables and rows.
+    problem : Problem
+    t_end : float
+        s; runs start at 0.
+    known : callable or None
+        known() -> ReferenceMotion where the motion is known; None: two unlike methods make one.
+    n_instants : int
+        Common instants, evenly spaced in (0, t_end].
+    conserved : bool
+        Whether the problem's energy is an invariant of the true motion.
+    invariants : mapping
+        Further ones: column to invariant(t, q, v), for columns of states.
+    watched : tuple of int or None
+        Coordinates by which "out of phase" is judged. None: all.
+    step_sizes : tuple of float or None
+        s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
+    time_limit : float
+        CPU seconds that a run may use.
+    timed : float
+        s of CPU time: a shorter run is timed by calling it again until it has used so much, because some systems count
+        CPU time in ticks of 4 ms.
+    tags : tuple of str
+        Class of the problem, "smooth", "stiff", "long", for tables over several cases.
+    note : str
+        What is assumed.
+    """
+
+    name: str
+    problem: Problem
+    t_end: float
+    known: Callable[[], ReferenceMotion] | None = None
+    n_instants: int = INSTANTS
+    conserved: bool = True
+    invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
+    watched: tuple[int, ...] | None = None
+    step_sizes: tuple[float, ...] | None = None
+    time_limit: float = 60.0
+    timed: float = 0.1
+    tags: tuple[str, ...] = ()
+    note: str = ""
+
+    @cached_property
+    def instants(self) -> Array:
+        """The common instants (n_instants,), the last of which is t_end."""
+        return np.linspace(0.0, self.t_end, self.n_instants + 1)[1:]
+
+    @cached_property
+    def reference(self) -> ReferenceMotion:
+        """The motion against which errors are measured; made when first asked for."""
+        return make_reference(self.problem, self.t_end) if self.known is None else self.known()
+
+    @cached_property
+    def scale(self) -> metrics.Scale:
+        """Largest kinetic energy and ranges of the reference."""
+        return metrics.Scale(self.problem, self.reference, self.instants, self.conserved)
+
+    def steps(self) -> tuple[float, ...]:
+        """Fixed steps, s."""
+        return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A solver of the catalogue.
+
+    Attributes
+    ----------
+    name : str
+        Its line in tables and figures.
+    family : str
+        Whose it is: "two-loop" (this project), "SUNDIALS", "SciPy", "Exudyn", "stand-in".
+    called_from : str
+        What calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call.
+    keeps_constraints : bool
+        Whether positions and velocities stay on the constraints to the solver's tolerance; False: they drift.
+    setting : str
+        What the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s).
+    run : callable
+        run(case, value, repeat) -> Result, from 0 to case.t_end, within case.time_limit where the solver has such a
+        limit. `repeat` counts from 0; a solver whose error scatters with rounding alone varies its input by it.
+    values : tuple of float
+        Values of the setting, loose to tight. Empty: those of the case, for "h".
+    fixed : mapping
+        Settings that do not vary, for the row.
+    own_accelerations : bool
+        Whether the accelerations in its results are not those of eq. (6) at its q and v.
+    """
+
+    name: str
+    family: str
+    called_from: str
+    keeps_constraints: bool
+    setting: str
+    run: Callable[[Case, float, int], Result]
+    values: tuple[float, ...] = ()
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    own_accelerations: bool = False
+
+    def grid(self, case: Case) -> tuple[float, ...]:
+        """The values of the setting to run on a case."""
+        return self.values or case.steps()
+
+
+@dataclass(frozen=True)
+class Run:
+    """One cell: a solver on a case at one value of its setting, repeated.
+
+    Attributes
+    ----------
+    group : str
+        Part of the study to which the rows belong.
+    """
+
+    case: Case
+    solver: Solver
+    value: float
+    group: str = ""
+    repeats: int = 3
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Names and values of the settings, for the row."""
+        return {**self.solver.fixed, self.solver.setting: self.value}
+
+    def key(self, repeat: int) -> str:
+        """What tells one row from all others of the study."""
+        settings = " ".join(f"{name}={value!r}" for name, value in sorted(self.settings.items()))
+        return f"{self.group} | {self.case.name} to {self.case.t_end!r} | {self.solver.name} | {settings} | {repeat}"
+
+
+Measure = Callable[[Run, Result], dict[str, Any]]
+
+
+def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None, processes: int = 1) -> pd.DataFrame:
+    """Make the rows of all runs that are not kept yet: one row a repetition.
+
+    The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
+    alike. A run that fails, exceeds its time limit, or cannot be made is a row whose status and message say so.
+
+    Parameters
+    ----------
+    runs : iterable of Run
+        No two with the same key.
+    kept : KeptRows
+        Of the study's `Output`; rows are on disk as soon as they are made.
+    measure : callable, optional
+        measure(run, result) -> further columns, of values that JSON holds. Not called where there is no result.
+    processes : int
+        More than 1: runs side by side, for long studies whose times are not compared.
+
+    Returns
+    -------
+    DataFrame
+        In the order of the runs, the repetitions of a run one below the other.
+
+    Raises
+    ------
+    ValueError
+        If two runs have the same key.
+    """
+    runs = list(runs)
+    order = {run.key(k): (run, k) for run in runs for k in range(run.repeats)}
+    if len(order) < sum(run.repeats for run in runs):
+        raise ValueError("two runs of the study have the same group, case, solver and settings")
+    rounds = range(max((run.repeats for run in runs), default=0))
+    left = [(run, k) for k in rounds for run in runs if k < run.repeats and run.key(k) not in kept]
+    for case in {id(run.case): run.case for run, _ in left}.values():
+        _ = case.scale  # makes the reference, which is not to be timed with anything
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with _rows_of(left, measure, processes) as made, Progress(*columns, disable=not sys.stdout.isatty()) as progress:
+        task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
+        for run, k, row in made:
+            kept.add(run.key(k), row)
+            progress.update(task, advance=1, description=f"{run.case.name}: {run.solver.name}"[:50].ljust(50))
+    return pd.DataFrame([kept[key] for key in order])
+
+
+@contextmanager
+def _rows_of(
+    left: list[tuple[Run, int]], measure: Measure | None, processes: int
+) -> Iterator[Iterator[tuple[Run, int, Row]]]:
+    if processes == 1:
+        warm: set[tuple[int, str]] = set()
+        yield ((run, k, _row(run, k, measure, warm)) for run, k in left)
+        return
+    context = multiprocessing.get_context("fork")  # cases and solvers hold functions that cannot be sent
+    _shared[:] = [(run, k, measure) for run, k in left]
+    with ProcessPoolExecutor(processes, context, _end_with_parent) as pool:
+        futures = {pool.submit(_shared_row, i): left[i] for i in range(len(left))}
+        try:
+            yield ((*futures[future], future.result()) for future in as_completed(futures))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+_shared: list[tuple[Run, int, Measure | None]] = []  # as the workers inherit it
+
+
+def _shared_row(i: int) -> Row:
+    run, k, measure = _shared[i]
+    return _row(run, k, measure, set())
+
+
+def _end_with_parent() -> None:
+    """End this worker when the study is killed, which a worker of a pool does not notice by itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) -> Row:
+    case, solver = run.case, run.solver
+    row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
+    row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
+    row |= {**run.settings, "t_end": case.t_end, "repeat": k}
+    what = (id(case), solver.name)
+    if what not in warm:  # compiles what is not compiled yet; a failure comes back in the run itself
+        warm.add(what)
+        span = 10.0 * run.value if solver.setting == "h" else WARM_UP * case.t_end
+        attempt(replace(run, case=replace(case, t_end=min(span, case.t_end))), k)
+    row |= {"cpu_s": None, "calls": 0}
+    result, status, message = attempt(run, k)
+    stats = Statistics() if result is None else result.stats
+    rejected = [n for n in (stats.n_rejected_error, stats.n_rejected_convergence) if n is not None]
+    row |= {"status": status, "message": message, **({} if result is None else _timed(run, k, stats.cpu_time))}
+    row |= {"n_steps": stats.n_accepted, "n_rejected": sum(rejected) if rejected else None}
+    for name in ("n_evaluations", "n_outer", "n_inner", "n_partitions", "n_factorizations", "n_jacobians"):
+        row[name] = getattr(stats, name)
+    row["floor"] = case.reference.floor
+    if result is None:
+        return row | metrics.COLUMNS
+    invariants = dict(case.invariants)
+    row |= metrics.measure(case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants)
+    return row if measure is None else row | measure(run, result)
+
+
+def _timed(run: Run, k: int, first: float) -> Row:
+    """CPU time of a call in s, the mean of `calls` of them where one is too short for the clock."""
+    spent = [first]
+    while sum(spent) < run.case.timed and len(spent) < MOST_CALLS:
+        again = attempt(run, k)[0]
+        if again is None:
+            break
+        spent.append(again.stats.cpu_time)
+    mean = sum(spent) / len(spent)
+    return {"cpu_s": mean or None, "calls": len(spent)}
+
+
+def called_from(run: Run) -> str:
+    """What calls the mechanism: Python wherever the mechanism's functions themselves are Python."""
+    return "Python" if run.case.problem.system.called_in_python else run.solver.called_from
+
+
+def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str]:
+    """Make a run: its result, where there is one, a status and a message."""
+    try:
+        with _limited(run.case.time_limit):
+            result = run.solver.run(run.case, run.value, repeat)
+    except NotApplicable as why:
+        return None, "NOT_APPLICABLE", str(why)
+    except TimeLimit:
+        return None, "TIME_LIMIT", f"Stopped after {run.case.time_limit:g} s of CPU time, the limit of a run."
+    except ImportError as error:
+        return None, "NOT_AVAILABLE", str(error)
+    except RuntimeError as error:
+        # references/ say so what is to be installed for a package that is not there
+        status = "NOT_AVAILABLE" if isinstance(error.__context__, ImportError) else "RAISED"
+        return None, status, str(error)
+    except Exception as error:  # a solver that raises must not end a night of runs: the row says what it raised
+        return None, "RAISED", f"{type(error).__name__}: {error}"
+    if result.status.name == "INTERRUPTED":  # Ctrl-C, which solve_dae turns into a partial result
+        raise KeyboardInterrupt
+    if not result.success and "time_limit =" in result.message:  # as the adapters in references/ say it
+        return result, "TIME_LIMIT", result.message
+    return result, result.status.name, result.message
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise TimeLimit in this process after so many seconds of its CPU time, where the system can.
+
+    Compiled code is not interrupted but at its return to Python.
+    """
+    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise TimeLimit
+
+    before = signal.signal(signal.SIGPROF, stop)
+    # again every second: an exception raised in a callback of a foreign solver may be swallowed by it
+    signal.setitimer(signal.ITIMER_PROF, 1.1 * seconds, 1.0)  # a solver's own limit comes first
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)

@@ -1,0 +1,178 @@
+"""Work-precision report of a mechanism of your own: our methods beside IDA and SciPy's solvers."""
+
+import importlib.util
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from studies import cli, figures, tables
+from studies.bench import Case, Run, collect
+from studies.cli import Call, StudyError
+from studies.reference_motion import check_published
+from studies.render import number, power, render, table
+from studies.solvers import CATALOGUE, COMPARED
+from studies.store import Output
+from twoloop.mechanisms import Problem
+
+ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
+QUICK = (1e-3, 1e-5, 1e-7, 1e-9)  # values of tolerances in a quick comparison
+
+
+def load_problem(where: str) -> Problem:
+    """The problem that FILE.py:FUNCTION makes.
+
+    Raises
+    ------
+    StudyError
+        If there is no such file or function, or it does not return a `Problem`.
+    """
+    file, _, function = where.rpartition(":")
+    path = Path(file)
+    if not (file and function.isidentifier()):
+        raise StudyError(f"give FILE.py:FUNCTION, such as crane.py:crane; given {where}")
+    if not path.is_file():
+        raise StudyError(f"there is no file {path.resolve()}")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise StudyError(f"{path} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    sys.path.insert(0, str(path.parent.resolve()))  # for files beside it
+    spec.loader.exec_module(module)
+    maker = getattr(module, function, None)
+    if not callable(maker):
+        raise StudyError(f"{path} has no function {function}")
+    problem = maker()
+    if not isinstance(problem, Problem):
+        raise StudyError(f"{where} must return a twoloop.mechanisms.Problem; it returned {type(problem).__name__}")
+    return problem
+
+
+def runs_of(case: Case, solvers: Sequence[str], quick: bool) -> list[Run]:
+    """All runs of the comparison of a case."""
+    runs = []
+    for name in solvers:
+        solver = CATALOGUE[name]
+        values = solver.grid(case)
+        if quick:
+            values = tuple(value for value in QUICK if solver.setting == "tol") or values[:2]
+        runs += [Run(case, solver, value, "compare", 1 if quick else 3) for value in values]
+    return runs
+
+
+def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, object]:
+    """What the report says, from the medians."""
+    cheapest = []
+    for error in errors:
+        ranked = tables.ranking(rows, error)
+        ours = ranked[ranked["family"] == "two-loop"] if len(ranked) else ranked
+        others = ranked[ranked["family"] != "two-loop"] if len(ranked) else ranked
+        best, foreign = (None if part.empty else part.iloc[0] for part in (ours, others))
+        cheapest.append(
+            {
+                "error": error,
+                "ours": None if best is None else best["solver"],
+                "ours_s": None if best is None else best["cpu_s"],
+                "others": None if foreign is None else foreign["solver"],
+                "others_s": None if foreign is None else foreign["cpu_s"],
+                "others_keep": None if foreign is None else bool(foreign["keeps_constraints"]),
+                "others_called_from": None if foreign is None else foreign["called_from"],
+                "ours_first": None if best is None or foreign is None else bool(best["cpu_s"] < foreign["cpu_s"]),
+            }
+        )
+    floor = float(rows["floor"].iloc[0])
+    return {
+        "name": case.name,
+        "t_end": case.t_end,
+        "floor": floor,
+        "digits": int(np.floor(-np.log10(floor))),
+        "n_instants": case.n_instants,
+        "cheapest": cheapest,
+        "python": case.problem.system.called_in_python,
+        "n_failed": int((rows["status"] != "REACHED_END").sum()),
+        "unresolved": [error for error in errors if error < floor],
+    }
+
+
+def report(call: Call, output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Sequence[float]) -> None:
+    """Write findings, figure and report."""
+    rows = tables.medians(rows)
+    findings = findings_of(rows, case, errors)
+    if call.redraw:  # without making the reference again
+        findings |= {key: output.load_findings().get(key) for key in ("source", "published")}
+    else:
+        published = check_published(case.problem, case.reference, case.t_end)
+        findings |= {"source": case.reference.source, "published": published}
+    output.save_findings(findings)
+    lines = figures.cheapest_lines(rows, errors)
+    findings["drawn"] = lines
+    seconds = f"{number(case.t_end)} s"
+    if lines:
+        figures.save(figures.work_precision(rows, lines, f"{case.name}, {seconds}"), output, call.study)
+    header = ["solver", "called from", *(power(error) for error in errors)]
+    best = tables.ranking(rows, errors[len(errors) // 2])
+    failed = tables.failures(rows)
+    ready = {
+        "work": table(header, tables.work_precision(rows, errors)),
+        "kept": table(
+            ["solver", "CPU (s)", "evaluations", "max abs C", "max abs C_q v + C_t", "energy error (J)"],
+            [
+                [row[key] for key in ("solver", "cpu_s", "n_evaluations", "violation_q", "violation_v", "energy")]
+                for _, row in best.iterrows()
+            ],
+        ),
+        "failed": table(["solver", "setting", "status", "message"], failed) if failed else "",
+    }
+    middle = errors[len(errors) // 2]
+    output.write(
+        f"{call.study}.md",
+        render("compare", findings, ready, stamp=line, quick=call.quick, middle=middle, note=case.note),
+    )
+
+
+def _work(words: Sequence[str] | None) -> None:
+    parser = cli.parser("compare", __doc__)
+    parser.add_argument(
+        "where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem"
+    )
+    parser.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
+    parser.add_argument("--solvers", nargs="+", metavar="NAME", help=f"of {', '.join(CATALOGUE)}")
+    parser.add_argument("--errors", nargs="+", type=float, default=list(ERRORS), help="errors to compare the cost at")
+    given = parser.parse_args(words)
+    unknown = [name for name in given.solvers or () if name not in CATALOGUE]
+    if unknown:
+        raise StudyError(f"no solver is called {unknown[0]!r}; there are: {'; '.join(CATALOGUE)}")
+    if any(not error > 0.0 for error in given.errors):
+        raise StudyError("--errors must be positive")
+    given.out = given.out or Path("compare")
+    problem = load_problem(given.where)
+    t_end = problem.t_span[1] if given.t_end is None else given.t_end
+    if not t_end > 0.0:
+        raise StudyError(f"--t-end must be positive; given {t_end:g}")
+    case = Case(problem.name, problem, t_end, note=problem.note, timed=0.02 if given.quick else 0.1)
+    call, errors = cli.call_of("compare", given, words), sorted(given.errors, reverse=True)
+    with Output(call) as output:
+        if call.redraw:
+            rows, line = output.load_rows()
+        else:
+            runs = runs_of(case, given.solvers or COMPARED, call.quick)
+            with output.kept({"where": given.where, "t_end": t_end}) as kept:
+                rows = collect(runs, kept)
+            if not (rows["status"] == "REACHED_END").any():
+                raise StudyError(f"no solver reached the end; the first said: {rows['message'].iloc[0]}")
+            line = cli.stamp(call.command)
+            output.save_rows(rows, line)
+        report(call, output, case, rows, line, errors)
+    print(f"wrote compare.md, .csv, .json, .png and .svg to {output.path}")
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Compare solvers on a mechanism of the user's own."""
+    cli.main(_work, words)
+
+
+if __name__ == "__main__":
+    main()

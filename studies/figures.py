@@ -1,0 +1,138 @@
+"""One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
+
+from collections.abc import Sequence
+from io import BytesIO
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from studies.store import Output
+from studies.tables import time_for
+
+MOST_LINES = 7
+
+mpl.rcParams.update(
+    {
+        "figure.dpi": 130,
+        "savefig.bbox": "tight",
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "font.size": 9,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+        "lines.linewidth": 1.2,
+        "lines.markersize": 5,
+        "svg.hashsalt": "twoloop",  # the same figure is the same file
+        "svg.fonttype": "none",
+    }
+)
+
+# Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
+
+STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
+    "DOP853 (two-loop)": (RED, "o"),
+    "Gauss12": (BLUE, "s"),
+    "Gauss6": (SKY, "D"),
+    "SunRadau5": (PINK, "v"),
+    "RadauIIA5": (ORANGE, "^"),
+    "BDF": (GREEN, "P"),
+    "Newmark": (GREY, "h"),
+    "PaperIRK": (YELLOW, "H"),
+    "PaperIRK, Atol = Rtol varied": (YELLOW, "H"),
+    "PaperNewmark (beta = 1/2)": (GREY, "X"),
+    "PaperNewmark, beta = 1/4": (BLACK, "X"),
+    "Gauss6, momenta, symmetric": (BLACK, "D"),
+    "IDA from C, stabilised": (BLACK, ">"),
+    "IDA from C, order 2, positions tested": (BLUE, ">"),
+    "IDA, stabilised": (GREY, "<"),
+    "IDA, index1": (SKY, "<"),
+    "LSODA, index 1": (BROWN, "p"),
+    "DOP853, index 1": (SKY, "*"),
+    "DOP853, projected": (ORANGE, "*"),
+    "Radau, index 1": (PINK, "d"),
+    "BDF, index 1": (YELLOW, "d"),
+    "Exudyn, GeneralizedAlpha": (RED, "8"),
+    "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
+}
+_REST = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY)
+
+
+def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, object]:
+    """Colour, marker and line of a solver, the same in all figures; an open marker where the constraints drift."""
+    color, marker = STYLES.get(solver, (_REST[sum(solver.encode()) % len(_REST)], "o"))
+    made: dict[str, object] = {"color": color, "marker": marker, "linestyle": "-" if family == "two-loop" else "--"}
+    return made if keeps_constraints else made | {"markerfacecolor": "white"}
+
+
+def save(figure: Figure, output: Output, name: str) -> None:
+    """Write NAME.png and NAME.svg, a quick one marked as such, and close the figure."""
+    if output.call.quick:
+        figure.text(0.005, 0.005, "quick run: shorter and coarser than the report", fontsize=7, color=RED, va="top")
+    for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+        stream = BytesIO()
+        figure.savefig(stream, format=suffix, metadata=metadata)
+        output.write(f"{name}.{suffix}", stream.getvalue())
+    plt.close(figure)
+
+
+def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
+    """At most so many solvers of a case, those with the best places at the targets; in the order of the rows."""
+    places: dict[str, list[int]] = {}
+    for target in targets:
+        times = {solver: time_for(runs, target) for solver, runs in rows.groupby("solver", sort=False)}
+        ranked = sorted((time, str(solver)) for solver, time in times.items() if time == time)
+        for place, (_, solver) in enumerate(ranked):
+            places.setdefault(solver, []).append(place)
+    missing = len(rows["solver"].unique())
+    score = {solver: sum(got) + missing * (len(targets) - len(got)) for solver, got in places.items()}
+    best = sorted(score, key=score.__getitem__)[:most]
+    return [solver for solver in dict.fromkeys(rows["solver"]) if solver in best]
+
+
+def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str) -> Figure:
+    """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
+
+    Errors that the reference does not resolve are not drawn.
+
+    Raises
+    ------
+    ValueError
+        If there are more than seven lines.
+    """
+    if len(solvers) > MOST_LINES:
+        raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.8), sharex=True, layout="constrained")
+    for solver in solvers:
+        runs = rows[(rows["solver"] == solver) & rows["error_q"].notna()].sort_values("error_q")
+        runs = runs[runs["error_q"] > runs["floor"]]
+        if runs.empty:
+            continue
+        look = style(solver, runs["family"].iloc[0], bool(runs["keeps_constraints"].iloc[0]))
+        label = f"{solver} [{'P' if runs['called_from'].iloc[0] == 'Python' else 'c'}]"
+        times = runs["cpu_s"].astype(float)
+        spread = [times - runs["cpu_q1"].astype(float), runs["cpu_q3"].astype(float) - times]
+        left.errorbar(runs["error_q"].astype(float), times, yerr=spread, label=label, elinewidth=0.8, **look)
+        counted = runs[runs["n_evaluations"].notna()]
+        right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **look)
+    for axes, what in ((left, "CPU time (s)"), (right, "evaluations")):
+        _log_axes(axes, "largest position error over the run (m, rad)", what)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside right upper", title="filled: keeps constraints\n[c] compiled, [P] Python"
+    )
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _log_axes(axes: Axes, x: str, y: str) -> None:
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)

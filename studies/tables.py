@@ -1,0 +1,120 @@
+"""From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pandas as pd
+
+from studies.bench import NOTHING_RUN
+from studies.render import number
+
+
+def medians(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row a run: the repetition of median error, with median and quartiles of the CPU time of all repetitions.
+
+    The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
+    repetition failed is represented by a failed one if half of them or more failed.
+    """
+    runs = (rows["repeat"].diff().fillna(-1) <= 0).cumsum()
+    chosen = []
+    for _, run in rows.groupby(runs.to_numpy(), sort=False):
+        order = run["error_q"].astype(float).fillna(np.inf).argsort(kind="stable")
+        row = run.iloc[order.iloc[len(run) // 2]].copy()
+        times = run["cpu_s"].astype(float).dropna()
+        for name, share in (("cpu_q1", 25), ("cpu_s", 50), ("cpu_q3", 75)):
+            row[name] = np.percentile(times, share) if len(times) else np.nan
+        row["repeats"] = len(run)
+        chosen.append(row)
+    return pd.DataFrame(chosen).drop(columns="repeat").reset_index(drop=True)
+
+
+def time_for(rows: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
+    """CPU time (or another cost) of one solver for an error of at most `target`; NaN where no run is so good.
+
+    Between the two runs on either side of the target, on the log-log line through them: solvers whose settings lie
+    far apart are not made to look expensive by it. NaN too where the target is below what the reference resolves.
+    """
+    runs = rows[rows["error_q"].notna() & rows[what].notna()].sort_values("error_q")
+    if runs.empty or target < runs["floor"].max():
+        return float("nan")
+    errors = np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
+    costs = runs[what].to_numpy(float)
+    n_good = int((errors <= target).sum())
+    if n_good == 0:
+        return float("nan")
+    best = float(costs[:n_good].min())
+    if n_good < len(errors) and errors[n_good - 1] > 0.0:
+        x = np.log(errors[n_good - 1 : n_good + 1])
+        share = (np.log(target) - x[0]) / (x[1] - x[0])
+        between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
+        best = min(best, float(between))
+    return best
+
+
+def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
+    """The solvers of one case that reach an error, cheapest first.
+
+    Returns
+    -------
+    DataFrame
+        solver, family, called_from, keeps_constraints, cpu_s, cpu_q1, cpu_q3, n_evaluations for this error (on the
+        log-log line between two runs), and violation_q, violation_v, energy of the cheapest run that is as good.
+    """
+    lines = []
+    for solver, runs in rows.groupby("solver", sort=False):
+        cpu = time_for(runs, target)
+        if np.isnan(cpu):
+            continue
+        good = runs[runs["error_q"] <= target]
+        run = good.loc[good["cpu_s"].astype(float).idxmin()]
+        line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
+        line |= {"cpu_s": cpu, **{what: time_for(runs, target, what) for what in ("cpu_q1", "cpu_q3", "n_evaluations")}}
+        lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
+    return pd.DataFrame(lines).sort_values("cpu_s", ignore_index=True) if lines else pd.DataFrame()
+
+
+def why_not(rows: pd.DataFrame) -> str:
+    """What a table shows for a solver that did not reach an error: its smallest error, or why there is none."""
+    reached = rows[rows["error_q"].notna()]
+    if reached.empty:
+        first = rows["status"].iloc[0]
+        return first.lower().replace("_", " ")
+    best = float(reached["error_q"].min())
+    stopped = bool((rows["status"] == "TIME_LIMIT").any())
+    return f"least error {number(best)}" + (", then time limit" if stopped else "")
+
+
+def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = ()) -> list[list[str]]:
+    """Lines of a table: solver, called from, CPU time with quartiles in seconds for each target.
+
+    Instead of a dash the cell of a target that is not reached says how far the solver came.
+    """
+    lines = []
+    for solver in solvers or list(dict.fromkeys(rows["solver"])):
+        runs = rows[rows["solver"] == solver]
+        if runs.empty:
+            continue
+        line = [solver, str(runs["called_from"].iloc[0])]
+        for target in targets:
+            middle, low, high = (time_for(runs, target, what) for what in ("cpu_s", "cpu_q1", "cpu_q3"))
+            line.append(why_not(runs) if np.isnan(middle) else with_quartiles(middle, low, high))
+        lines.append(line)
+    return lines
+
+
+def with_quartiles(middle: float, low: float, high: float) -> str:
+    """Seconds, the quartiles in brackets where they differ from the median at the digits shown."""
+    texts = [number(value) for value in (low, middle, high)]
+    return texts[1] if len(set(texts)) == 1 else f"{texts[1]} ({texts[0]}–{texts[2]})"
+
+
+def failures(rows: pd.DataFrame) -> list[list[str]]:
+    """Lines of a table of runs that did not reach the end: solver, setting, status, message."""
+    lines = []
+    for _, row in rows[rows["status"] != "REACHED_END"].iterrows():
+        what = [f"{key} {number(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
+        setting = "all" if row["status"] in NOTHING_RUN else ", ".join(what)
+        line = [row["solver"], setting, str(row["status"]).lower().replace("_", " "), str(row["message"])]
+        if line not in lines:
+            lines.append(line)
+    return lines

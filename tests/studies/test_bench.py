@@ -1,0 +1,220 @@
+"""The bench on a mechanism that is not the four-bar: rows, repetitions, failures, limits, resuming, references."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from studies import bench
+from studies.bench import Case, NotApplicable, Run, Solver, collect
+from studies.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
+from studies.solvers import CATALOGUE
+from studies.store import KeptRows
+from tests.problems import pendulum, pendulum_energy, pendulum_state, worst
+from twoloop import Status, solve_dae
+from twoloop.mechanisms import Problem
+from twoloop.mechanisms.problem import Reference
+
+T_END = 1.0
+
+
+def problem(**options):
+    q, v, _ = pendulum_state(0.0)
+    return Problem("pendulum", pendulum(**options), q, v, (0.0, T_END), lambda t, q, v: pendulum_energy(q, v))
+
+
+def case(**changed):
+    def known():
+        return ReferenceMotion(lambda t: pendulum_state(t)[:2], 1e-13, "elliptic functions")
+
+    return Case("pendulum", problem(), T_END, **{"known": known, "n_instants": 50, "timed": 0.0, **changed})
+
+
+def solver(run, name="a solver", **changed):
+    return Solver(name, "two-loop", "compiled", True, "tol", run, (1e-6,), **changed)
+
+
+def ours(case, value, repeat):
+    return solve_dae(case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0, rtol=value, atol=value)
+
+
+@pytest.fixture
+def kept(tmp_path):
+    return KeptRows(tmp_path / "x.partial.jsonl", {})
+
+
+def row(kept, run, case_=None, **changed):
+    with kept:
+        return collect([Run(case_ or case(), solver(run), 1e-6, repeats=1)], kept, **changed).iloc[0]
+
+
+def test_every_repetition_is_a_row_and_repetitions_are_interleaved(kept):
+    order = []
+
+    def named(name):
+        def run(case, value, repeat):
+            if case.t_end == T_END:  # not the warm-up
+                order.append((name, repeat))
+            return ours(case, value, repeat)
+
+        return solver(run, name)
+
+    with kept:
+        rows = collect([Run(case(), named(name), 1e-6, "group", repeats=2) for name in "ab"], kept)
+    assert order == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
+    assert rows["solver"].tolist() == ["a", "a", "b", "b"] and rows["repeat"].tolist() == [0, 1, 0, 1]
+    assert (rows["error_q"] < 1e-5).all() and (rows["violation_q"] < 1e-13).all() and not rows["lost"].any()
+    assert (rows["called_from"] == "Python").all()  # whatever the solver: the mechanism is plain Python
+    assert (rows["tol"] == 1e-6).all() and (rows["group"] == "group").all()
+
+
+@pytest.mark.parametrize(("timed", "calls"), [(0.0, 1), (1e9, 3)])
+def test_a_short_run_is_called_until_its_time_can_be_read(kept, monkeypatch, timed, calls):
+    monkeypatch.setattr(bench, "MOST_CALLS", 3)
+    assert row(kept, ours, case(timed=timed))["calls"] == calls
+
+
+def not_installed():
+    error = RuntimeError("foreign is not installed: pip install foreign")
+    error.__context__ = ImportError("No module named 'foreign'")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "says"),
+    [
+        (NotApplicable("needs a model of its own"), "NOT_APPLICABLE", "needs a model of its own"),
+        (ImportError("No module named 'foreign'"), "NOT_AVAILABLE", "foreign"),
+        (not_installed(), "NOT_AVAILABLE", "pip install foreign"),
+        (RuntimeError("cannot start"), "RAISED", "cannot start"),
+        (ZeroDivisionError("by zero"), "RAISED", "ZeroDivisionError: by zero"),
+    ],
+)
+def test_what_cannot_be_run_is_a_row(kept, raised, status, says):
+    def run(case, value, repeat):
+        raise raised
+
+    got = row(kept, run)
+    assert got["status"] == status and says in got["message"]
+    assert got["error_q"] is None and got["lost"] and got["astray"]
+
+
+def test_a_run_past_its_limit_is_a_row(kept):
+    def run(case, value, repeat):
+        while case.t_end == T_END:
+            pass
+        return ours(case, value, repeat)
+
+    got = row(kept, run, case(time_limit=0.05))
+    assert got["status"] == "TIME_LIMIT" and "0.05 s" in got["message"]
+
+
+def test_a_failed_run_keeps_what_it_had(kept):
+    def run(case, value, repeat):
+        result = ours(case, value, repeat)
+        t = result.t[:5]
+        cut = {name: getattr(result, name)[:, :5] for name in ("q", "v", "a", "lam")}
+        return replace(result, t=t, **cut, status=Status.STEP_TOO_SMALL, message="stuck")
+
+    got = row(kept, run)
+    assert got["status"] == "STEP_TOO_SMALL" and got["message"] == "stuck"
+    assert got["violation_q"] < 1e-13 and got["error_q"] is None and got["lost"] is not None
+
+
+def test_further_columns_come_from_the_study_and_its_case(kept):
+    def measure(run, result):
+        return {"largest_x": result.q[0].max(), "curve": result.t[:3]}
+
+    more = case(invariants={"length": lambda t, q, v: np.hypot(*q)})
+    got = row(kept, ours, more, measure=measure)
+    assert got["largest_x"] == pytest.approx(1.0, abs=0.6) and len(got["curve"]) == 3
+    assert abs(got["length"]) < 1e-13
+
+
+def test_ctrl_c_keeps_finished_rows_and_the_next_start_goes_on(kept):
+    calls = []
+
+    def run(case, value, repeat):
+        if case.t_end == T_END:
+            calls.append(value)
+            if len(calls) == 2:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(1.0)
+        return ours(case, value, repeat)
+
+    runs = [Run(case(), solver(run), tolerance, repeats=1) for tolerance in (1e-5, 1e-6, 1e-7)]
+    with pytest.raises(KeyboardInterrupt), kept:
+        collect(runs, kept)
+    again = KeptRows(kept.path, {})
+    with again:
+        rows = collect(runs, again)
+    assert again.n_resumed == 1 and calls == [1e-5, 1e-6, 1e-6, 1e-7]
+    assert rows["tol"].tolist() == [1e-5, 1e-6, 1e-7] and rows["error_q"].notna().all()
+
+
+def test_an_interrupted_result_stops_the_collector(kept):
+    def run(case, value, repeat):
+        class Interrupted:
+            name = "INTERRUPTED"
+
+        return replace(ours(case, value, repeat), status=Interrupted())
+
+    with pytest.raises(KeyboardInterrupt):
+        row(kept, run)
+
+
+def test_processes_make_the_same_rows(kept, tmp_path):
+    runs = [Run(case(), solver(ours), tolerance, repeats=1) for tolerance in (1e-5, 1e-7)]
+    with kept:
+        one = collect(runs, kept)
+    with KeptRows(tmp_path / "y.jsonl", {}) as other:
+        two = collect(runs, other, processes=2)
+    assert one["error_q"].tolist() == two["error_q"].tolist()
+
+
+def test_two_equal_runs_are_refused(kept):
+    with kept, pytest.raises(ValueError, match="same group"):
+        collect([Run(case(), solver(ours), 1e-6)] * 2, kept)
+
+
+def test_a_made_reference_says_how_far_it_holds():
+    made = make_reference(problem(compile=True), T_END)
+    t = np.linspace(0.0, T_END, 77)
+    q, v, _ = pendulum_state(t)
+    states = made.states(t)
+    assert worst(states[0], q) < 10.0 * made.floor < 1e-10
+    assert worst(states[1], v) < 1e-9
+    assert made.digits >= 10 and "Gauss16" in made.source and "DOP853" in made.source
+
+
+def test_a_published_state_checks_the_reference():
+    q, v, _ = pendulum_state(0.5)
+    right = replace(problem(), reference=Reference(0.5, q, v, "closed form"))
+    wrong = replace(problem(), reference=Reference(0.5, q + 1e-3, v, "closed form"))
+    motion = case().reference
+    assert check_published(right, motion, T_END) < 1e-14
+    assert check_published(wrong, motion, T_END) == pytest.approx(1e-3)
+    assert check_published(right, motion, 0.4) is None and check_published(problem(), motion, T_END) is None
+
+
+def test_the_quintic_is_exact_on_polynomials_of_degree_5():
+    t = np.array([0.0, 0.3, 1.0])
+    p = np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0, -1.0, 0.7])
+    motion = Quintic(t, p(t)[None], p.deriv()(t)[None], p.deriv(2)(t)[None])
+    times = np.linspace(0.0, 1.0, 11)
+    q, v = motion(times)
+    assert worst(q[0], p(times)) < 1e-14 and worst(v[0], p.deriv()(times)) < 1e-13
+
+
+def test_foreign_solvers_run_any_mechanism_or_say_why_not(kept):
+    names = ("Exudyn, GeneralizedAlpha", "IDA from C, stabilised", "DOP853 (two-loop)")
+    with kept:
+        rows = collect(
+            [Run(case(), CATALOGUE[name], CATALOGUE[name].grid(case())[1], repeats=1) for name in names], kept
+        )
+    status = dict(zip(rows["solver"], rows["status"], strict=True))
+    assert status[names[0]] == status[names[1]] == "NOT_APPLICABLE" and status[names[2]] == "REACHED_END"
+    assert "model of its own" in rows["message"][0] and "compiled" in rows["message"][1]

@@ -1,0 +1,97 @@
+"""`studies.compare` on the mechanism of docs/compare.md, as printed, outside the repository."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+
+from studies import compare
+from studies.bench import Case
+from studies.cli import ROOT, StudyError
+from studies.render import render
+from tests.problems import pendulum, pendulum_state
+from twoloop.mechanisms import Problem
+
+CODE = (ROOT / "docs" / "compare.md").read_text().split("```python\n")[1].split("```")[0]
+SOLVERS = ("DOP853 (two-loop)", "DOP853, projected", "Exudyn, GeneralizedAlpha")
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "swing.py").write_text(CODE)
+    return tmp_path / "swing.py"
+
+
+def test_the_page_of_the_docs_runs_as_printed_outside_the_repository(file):
+    words = ["swing.py:swing", "--quick", "--t-end", "0.5", "--out", "report", "--errors", "1e-3", "1e-5"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-m", "studies.compare", *words, "--solvers", *SOLVERS]
+    done = subprocess.run(command, cwd=file.parent, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    out = file.parent / "report"
+    text, rows = (out / "compare.md").read_text(), pd.read_csv(out / "compare.csv", comment="#")
+    assert set(rows["solver"]) == set(SOLVERS) and "NOT_APPLICABLE" in set(rows["status"])
+    assert "model of its own" in text and "Quick run" in text and "1e-5" in text
+    findings = json.loads((out / "compare.json").read_text())
+    assert findings["floor"] < 1e-9 and [at["error"] for at in findings["cheapest"]] == [1e-3, 1e-5]
+    assert {"compare.png", "compare.svg"} <= {path.name for path in out.iterdir()}
+    (out / "compare.md").unlink()
+    compare.main([f"{file}:swing", *words[1:-4], str(out), *words[-3:], "--redraw"])
+    assert (out / "compare.md").read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("where", "says"),
+    [
+        ("swing.py", "give FILE.py:FUNCTION"),
+        ("missing.py:swing", "there is no file"),
+        ("{file}:swong", "has no function swong"),
+        ("{file}:np", "has no function np"),
+        ("{file}:wrong", "it returned int"),
+    ],
+)
+def test_wrong_mechanisms_are_named(file, where, says):
+    file.write_text(CODE + "\n\ndef wrong():\n    return 3\n")
+    with pytest.raises(StudyError, match=says):
+        compare.load_problem(where.format(file=file))
+
+
+def test_errors_are_one_line(file, capsys):
+    for words, says in (
+        ([f"{file}:swing", "--solvers", "Guass12"], "no solver is called 'Guass12'"),
+        ([f"{file}:swing", "--t-end", "-1"], "--t-end must be positive"),
+        ([f"{file}:swing", "--errors", "0"], "--errors must be positive"),
+    ):
+        with pytest.raises(SystemExit, match=f"^error: {says}"):
+            compare.main(words)
+
+
+def findings(**rows):
+    q, v, _ = pendulum_state(0.0)
+    case = Case("swing", Problem("swing", pendulum(), q, v, (0.0, 1.0), lambda t, q, v: 0.0), 1.0)
+    common = {"keeps_constraints": True, "called_from": "compiled", "floor": 1e-10, "status": "REACHED_END"}
+    common |= {"violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "n_evaluations": 1.0}
+    lines = [
+        {"solver": name, "family": family, "error_q": error, "cpu_s": cpu, "cpu_q1": cpu, "cpu_q3": cpu, **common}
+        for name, (family, error, cpu) in rows.items()
+    ]
+    return compare.findings_of(pd.DataFrame(lines), case, (1e-4,)) | {"source": "", "published": None, "drawn": []}
+
+
+def text_of(found):
+    tables = {"work": "", "kept": "", "failed": ""}
+    return render("compare", found, tables, stamp="", quick=False, middle=1e-4, note="")
+
+
+def test_the_sentences_turn_with_the_rows():
+    ours, theirs = ("two-loop", 1e-5, 1.0), ("SciPy", 1e-5, 2.0)
+    assert "`ours` is cheapest" in text_of(findings(ours=ours, theirs=theirs))
+    assert "`theirs` (compiled) is cheapest" in text_of(findings(ours=("two-loop", 1e-5, 3.0), theirs=theirs))
+    assert "None of the other solvers reaches it" in text_of(findings(ours=ours, theirs=("SciPy", 1e-2, 2.0)))
+    assert "None of the two-loop methods" in text_of(findings(ours=("two-loop", 1e-2, 1.0), theirs=theirs))
+    assert "reached by no solver" in text_of(findings(ours=("two-loop", 1e-2, 1.0)))
+    assert "check the problem" in text_of(findings(ours=ours) | {"published": 1e-3})
+    assert "check the problem" not in text_of(findings(ours=ours) | {"published": 1e-10})

@@ -1,0 +1,173 @@
+"""The folder of a report under attack: two runs, damaged rows, links, full and quick, files cut off."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import store
+from studies.cli import ROOT, Call, StudyError
+from studies.store import KeptRows, Output, plain
+
+STAMP = "`python -m studies.x`; 2026-01-01"
+
+
+def call(path, study="x", quick=False):
+    return Call(study, quick, path, False, f"python -m studies.{study}")
+
+
+def interrupt(path, *names):
+    """Leave the rows of these names as an interrupted run would."""
+    with pytest.raises(KeyboardInterrupt), KeptRows(path, {}) as kept:
+        for name in names:
+            kept.add(name, {"name": name, "x": 0.1 + 0.2})
+        raise KeyboardInterrupt
+
+
+def test_two_runs_in_one_folder_are_refused(tmp_path):
+    with Output(call(tmp_path)), pytest.raises(StudyError, match="another run is writing"), Output(call(tmp_path)):
+        pass
+    with Output(call(tmp_path)):  # free again
+        pass
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_any_run(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StudyError, match=r"cannot write to .*--out"), Output(call(tmp_path / "file" / "below")):
+        pass
+
+
+def test_rows_findings_and_series_come_back(tmp_path):
+    rows = pd.DataFrame({"solver": ["a, b", "c"], "x": [0.1, None], "lost": [True, False]})
+    with Output(call(tmp_path)) as output:
+        output.save_rows(rows, STAMP)
+        again, line = output.load_rows()
+        output.save_findings({"n": np.int64(3), "x": np.float64(np.nan), "ok": np.bool_(True), "two": [1.0, "b"]})
+        output.save_series({"t": np.linspace(0.0, 1.0, 3)})
+        assert output.load_series()["t"].tolist() == [0.0, 0.5, 1.0]
+    pd.testing.assert_frame_equal(again, rows)
+    assert line == STAMP
+    assert json.loads((tmp_path / "x.json").read_text()) == {"n": 3, "x": None, "ok": True, "two": [1.0, "b"]}
+
+
+def test_rows_of_another_study_or_size_are_refused(tmp_path):
+    with Output(call(tmp_path)) as output:
+        output.save_rows(pd.DataFrame({"x": [1]}), STAMP)
+    os.rename(tmp_path / "x.csv", tmp_path / "y.csv")
+    with Output(call(tmp_path, "y")) as output, pytest.raises(StudyError, match="other rows than full y ones"):
+        output.load_rows()
+    os.rename(tmp_path / "y.csv", tmp_path / "x.csv")
+    with Output(call(tmp_path, quick=True)) as output, pytest.raises(StudyError, match="other rows than quick x ones"):
+        output.load_rows()
+    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00")
+    with Output(call(tmp_path)) as output, pytest.raises(StudyError, match="damaged"):
+        output.load_rows()
+    (tmp_path / "x.csv").unlink()
+    with Output(call(tmp_path)) as output, pytest.raises(StudyError, match="there is no"):
+        output.load_rows()
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    with Output(call(tmp_path)) as output:
+        output.write("x.md", "old")
+
+        def full(descriptor):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(store.os, "fsync", full)
+        with pytest.raises(StudyError, match="No space left"):
+            output.write("x.md", "new")
+    assert (tmp_path / "x.md").read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "x.md"]
+
+
+def test_links_out_of_the_folder_are_not_followed(tmp_path):
+    outside, folder = tmp_path / "outside.csv", tmp_path / "reports"
+    outside.write_text("precious")
+    folder.mkdir()
+    for name in ("x.csv", "x.partial.jsonl", "x.md"):
+        (folder / name).symlink_to(outside)
+    with Output(call(folder)) as output:
+        for attempt in (output.load_rows, output.kept, lambda: output.write("x.md", "new")):
+            with pytest.raises(StudyError, match="outside the folder"):
+                attempt()
+    assert outside.read_text() == "precious"
+
+
+def test_finished_rows_are_kept_and_the_file_goes_when_all_is_done(tmp_path):
+    path = tmp_path / "x.partial.jsonl"
+    interrupt(path, "a", "b")
+    with KeptRows(path, {}) as kept:
+        assert kept.n_resumed == 2 and "a" in kept and kept["b"] == {"name": "b", "x": 0.1 + 0.2}
+    assert not path.exists()
+
+
+def test_a_torn_last_line_is_dropped(tmp_path):
+    path = tmp_path / "x.partial.jsonl"
+    interrupt(path, "a", "b")
+    path.write_text(path.read_text()[:-5])
+    with KeptRows(path, {}) as kept:
+        assert "a" in kept and "b" not in kept
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text.replace('{"key": "a"', '{"kex": "a"'),
+        lambda text: text.replace('{"key": "a"', "not json"),
+        lambda text: text.replace('{"key": "a", "row"', '{"key": 3, "row"'),
+        lambda text: text + "[1]\n",
+        lambda text: "\x00\x00" + text,
+        lambda text: text.replace('"settings": {}', '"settings": {"quick": true}'),
+    ],
+)
+def test_damaged_or_foreign_rows_are_set_aside_whole(tmp_path, capsys, damage):
+    path = tmp_path / "x.partial.jsonl"
+    interrupt(path, "a", "b")
+    damaged = damage(path.read_text())
+    path.write_text(damaged)
+    with KeptRows(path, {}) as kept:
+        assert kept.n_resumed == 0 and "a" not in kept and "b" not in kept
+    assert "set aside as x.partial.aside-1" in capsys.readouterr().out
+    assert (tmp_path / "x.partial.aside-1").read_text() == damaged
+
+
+def test_rows_of_changed_sources_are_not_used(tmp_path, monkeypatch):
+    path = tmp_path / "x.partial.jsonl"
+    interrupt(path, "a")
+    monkeypatch.setattr(store, "sources", lambda: "others")
+    with KeptRows(path, {}) as kept:
+        assert "a" not in kept
+
+
+def test_rows_survive_a_kill(tmp_path):
+    path = tmp_path / "x.partial.jsonl"
+    code = f"""
+        import time
+        from pathlib import Path
+        from studies.store import KeptRows
+        with KeptRows(Path({str(path)!r}), {{}}) as kept:
+            kept.add("a", {{"x": 1}})
+            time.sleep(60)
+    """
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT)
+    try:
+        end = time.monotonic() + 60.0
+        while time.monotonic() < end and not (path.exists() and '"x": 1' in path.read_text()):
+            time.sleep(0.05)
+    finally:
+        process.kill()
+        process.wait()
+    with KeptRows(path, {}) as kept:
+        assert kept["a"] == {"x": 1}
+
+
+def test_what_json_does_not_hold_is_refused():
+    with pytest.raises(TypeError, match="given complex"):
+        plain({"x": 1j})

@@ -1,0 +1,90 @@
+"""Medians, cost at equal error, rankings and figures, from rows made by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import figures, tables
+from studies.cli import Call
+from studies.store import Output
+
+
+def rows(*lines, floor=1e-12):
+    """Rows of (solver, error, seconds), one repetition each."""
+    common = {"family": "two-loop", "called_from": "compiled", "keeps_constraints": True, "status": "REACHED_END"}
+    common |= {"floor": floor, "violation_q": 1e-16, "violation_v": 1e-16, "energy": 0.0, "repeat": 0, "message": ""}
+    made = [
+        {"solver": solver, "error_q": error, "cpu_s": cpu, "cpu_q1": cpu, "cpu_q3": cpu, "n_evaluations": 1e3 * cpu}
+        for solver, error, cpu in lines
+    ]
+    return pd.DataFrame([{**common, **line} for line in made])
+
+
+def test_medians_keep_the_repetition_of_median_error_and_the_quartiles_of_time():
+    made = rows(("a", 3.0, 1.0), ("a", 1.0, 5.0), ("a", 2.0, 2.0), ("b", 1.0, 9.0)).assign(repeat=[0, 1, 2, 0])
+    middle = tables.medians(made)
+    assert middle["error_q"].tolist() == [2.0, 1.0] and middle["cpu_s"].tolist() == [2.0, 9.0]
+    assert middle["cpu_q1"][0] == 1.5 and middle["cpu_q3"][0] == 3.5 and middle["repeats"].tolist() == [3, 1]
+
+
+@pytest.mark.parametrize(("n_failed", "status"), [(1, "REACHED_END"), (2, "STEP_TOO_SMALL")])
+def test_a_run_that_mostly_fails_is_shown_as_failed(n_failed, status):
+    made = rows(*[("a", 1.0, 1.0)] * 3).assign(repeat=[0, 1, 2])
+    made.loc[: n_failed - 1, ["error_q", "status"]] = [np.nan, "STEP_TOO_SMALL"]
+    assert tables.medians(made)["status"].tolist() == [status]
+
+
+def test_cost_at_an_error_lies_on_the_line_between_two_runs():
+    made = rows(("a", 1e-2, 1.0), ("a", 1e-4, 4.0))
+    assert tables.time_for(made, 1e-3) == pytest.approx(2.0)
+    assert tables.time_for(made, 1.0) == 1.0 and tables.time_for(made, 1e-4) == 4.0
+    assert np.isnan(tables.time_for(made, 1e-5))
+
+
+def test_nothing_is_claimed_below_what_the_reference_resolves():
+    made = rows(("a", 1e-2, 1.0), ("a", 1e-9, 4.0), floor=1e-6)
+    assert np.isnan(tables.time_for(made, 1e-7)) and tables.time_for(made, 1e-6) == pytest.approx(4.0)
+
+
+def test_a_ranking_turns_with_the_rows():
+    made = rows(("a", 1e-4, 1.0), ("b", 1e-4, 2.0), ("c", 1e-2, 0.1))
+    assert tables.ranking(made, 1e-3)["solver"].tolist() == ["a", "b"]
+    made.loc[0, ["cpu_s", "cpu_q1", "cpu_q3"]] = 3.0
+    assert tables.ranking(made, 1e-3)["solver"].tolist() == ["b", "a"]
+    assert tables.ranking(made, 1e-9).empty
+
+
+def test_a_cell_that_is_not_reached_says_why():
+    made = rows(("a", 1e-4, 1.0))
+    assert tables.work_precision(made, [1e-3, 1e-5]) == [["a", "compiled", "1.0", "least error 1e-4"]]
+    limited = pd.concat([made, rows(("a", np.nan, 60.0)).assign(status="TIME_LIMIT")])
+    assert tables.work_precision(limited, [1e-5])[0][2] == "least error 1e-4, then time limit"
+    nothing = rows(("x", np.nan, np.nan)).assign(status="NOT_APPLICABLE", message="needs a model of its own")
+    assert tables.work_precision(nothing, [1e-5])[0][2] == "not applicable"
+    assert tables.failures(nothing) == [["x", "all", "not applicable", "needs a model of its own"]]
+
+
+def test_styles_tell_the_solvers_of_a_figure_apart():
+    looks = {(look[0], look[1]) for look in figures.STYLES.values()}
+    assert len(looks) >= len(figures.STYLES) - 1  # PaperIRK along its two settings is one
+    assert figures.style("LSODA, index 1", "SciPy", False)["markerfacecolor"] == "white"
+    assert "markerfacecolor" not in figures.style("Gauss12")
+
+
+def test_a_figure_has_at_most_seven_lines_and_both_formats(tmp_path):
+    made = rows(*[(name, error, 1.0 / error) for name in "abcdefghi" for error in (1e-2, 1e-4)])
+    with pytest.raises(ValueError, match="at most 7 lines"):
+        figures.work_precision(made, list("abcdefgh"), "title")
+    lines = figures.cheapest_lines(made, (1e-2, 1e-4))
+    assert len(lines) == 7
+    with Output(Call("x", True, tmp_path, False, "")) as output:
+        figures.save(figures.work_precision(made, lines, "title"), output, "x")
+        first = (tmp_path / "x.svg").read_bytes()
+        figures.save(figures.work_precision(made, lines, "title"), output, "x")
+    assert (tmp_path / "x.svg").read_bytes() == first and b"quick run" in first
+    assert (tmp_path / "x.png").stat().st_size > 1000
+
+
+def test_the_cheapest_lines_are_the_cheapest():
+    made = rows(*[(f"s{k}", 1e-4, 1.0 + k) for k in range(9)])
+    assert figures.cheapest_lines(made, (1e-3,), 2) == ["s0", "s1"]

@@ -1,0 +1,47 @@
+"""The comparison of all mechanisms: what is dominated, what the default costs, a quick run."""
+
+import pandas as pd
+import pytest
+
+from studies import cases, work_precision
+from tests.studies.test_tables import rows
+
+
+def made(*lines):
+    return rows(*lines).assign(case="crane", astray=False)
+
+
+def test_dominated_is_who_costs_more_at_every_error_on_every_case():
+    table = made(("a", 1e-3, 1.0), ("b", 1e-3, 3.0), ("c", 1e-5, 9.0))
+    found = {line["solver"]: (line["by"], line["factor"]) for line in work_precision.dominated(table, (1e-2,))}
+    assert found == {"b": ("a", pytest.approx(3.0)), "c": ("a", pytest.approx(9.0))}
+    both = work_precision.dominated(table, (1e-2, 1e-4))
+    assert [line["solver"] for line in both] == ["b"]  # c alone reaches 1e-4
+    other = pd.concat([table, made(("a", 1e-3, 5.0), ("b", 1e-3, 4.0)).assign(case="robot")])
+    assert "b" not in [line["solver"] for line in work_precision.dominated(other, (1e-2,))]
+
+
+def test_the_default_is_judged_by_the_rows():
+    table = made(("SunRadau5", 1e-5, 4.0), ("Gauss12", 1e-5, 1.0))
+    assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(4.0)
+    table.loc[1, "cpu_s"] = 8.0
+    assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(1.0)
+    assert work_precision.class_of(table, 1e-9) == {"error": 1e-9, "ours": None, "others": None, "default_over": None}
+
+
+def test_cases_are_found_by_listing_the_folder():
+    quick, full = cases.load(True), cases.load(False)
+    assert {"four-bar", "four-bar, second"} <= {case.name for case in full}
+    assert len({case.name for case in full}) == len(full)
+    assert all(a.t_end <= b.t_end for a, b in zip(quick, full, strict=True))
+
+
+@pytest.mark.slow
+def test_the_quick_study_runs_and_is_drawn_again(tmp_path):
+    words = ["--quick", "--out", str(tmp_path)]
+    work_precision.main(words)
+    text = (tmp_path / "work_precision.md").read_text()
+    assert "Quick run" in text and (tmp_path / "work_precision_four_bar.png").exists()
+    assert "four-bar" in (tmp_path / "README.md").read_text()
+    work_precision.main([*words, "--redraw"])
+    assert (tmp_path / "work_precision.md").read_text() == text
