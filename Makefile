@@ -76,7 +76,7 @@ lint: install ## ruff and mypy
 
 lock: ## renew requirements.lock from pyproject.toml; PYTHON=python3.11, the oldest supported
 	@$(FIND_PYTHON); "$$python" -m venv --clear .venv
-	@$(RUN) $(PIP) install ".[references,studies,dev]" hatchling
+	@$(RUN) $(PIP) install ".[references,peers,studies,dev]" hatchling
 	@{ grep '^#' requirements.lock; $(RUN) -m pip freeze --exclude twoloop; } > requirements.new
 	@mv requirements.new requirements.lock
 
