@@ -91,14 +91,14 @@ def test_t_span(t_span, error, words):
 @pytest.mark.parametrize(
     ("t_eval", "error", "words"),
     [
-        ([0.5, 1.5], ValueError, r"within t_span = \(0, 1\).*1.5"),
+        ([0.5, 1.5], ValueError, r"within t_span = \(0.0, 1.0\).*1.5"),
         ([-0.1, 0.5], ValueError, r"within t_span.*-0.1"),
         ([0.5, 0.2], ValueError, r"strictly increasing; entry 1 \(0.2\) follows 0.5"),
         ([0.2, 0.2], ValueError, "strictly increasing"),
         ([], ValueError, "non-empty"),
         ([[0.1, 0.2]], ValueError, "one-dimensional"),
         (0.5, ValueError, "one-dimensional"),
-        ([0.1, np.nan], ValueError, "within t_span"),
+        ([0.1, np.nan], ValueError, "must be finite"),
         (["soon"], (TypeError, ValueError), ""),
         ([0.5 + 1.0j], (TypeError, ValueError), ""),
     ],

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from twoloop.callbacks import KINDS
 from twoloop.differences import EPS, Estimate, Function, confirms, differentiate
 from twoloop.kernels.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, GAMMA_GIVEN, REACTION_BY_Q_GIVEN
+from twoloop.scales import column_scales, sizes
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -159,7 +160,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
         return None
     generic = np.random.default_rng(1)
-    v = _sizes(q) * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    v = sizes(q) * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
     try:
         system.force(t, q + NEAR_START * v, v)
         q = q + NEAR_START * v
@@ -207,7 +208,7 @@ def _wrong_column(
     noise = EPS * (np.abs(given) @ np.abs(x))
     largest = np.abs(given).max(axis=1)
     rounding = _rounding(lambda x: derivative(t, x), given, x)
-    sizes = _sizes(x)
+    scales = sizes(x)
     for j in range(len(x)):
         unit = np.zeros(len(x))
         unit[j] = 1.0
@@ -216,7 +217,7 @@ def _wrong_column(
             return function(x + shift * unit)
 
         column = _Comparison(system, kind, t, displaced, float(x[j]), given[:, j], j)
-        wrong = column.wrong(float(sizes[j]), noise, largest, rounding[:, j], ANYWHERE)
+        wrong = column.wrong(float(scales[j]), noise, largest, rounding[:, j], ANYWHERE)
         if wrong is not None:
             return wrong
     return None
@@ -234,18 +235,11 @@ def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> A
     return largest
 
 
-def _sizes(q: Array) -> Array:
-    """A first guess at how far each coordinate must move to matter."""
-    size = np.abs(q)
-    typical = float(np.median(size[size > 0.0])) if size.any() else 1.0
-    return np.maximum(size, 1e-3 * typical)
-
-
 def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
     """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
     generic = np.random.default_rng(1)
-    v = column_scales(jacobian, _sizes(q)) * generic.uniform(0.5, 1.5, len(q)) * generic.choice((-1.0, 1.0), len(q))
-    v = v / float(np.median(np.abs(v) / _sizes(q)))
+    v = column_scales(jacobian, sizes(q)) * generic.uniform(0.5, 1.5, len(q)) * generic.choice((-1.0, 1.0), len(q))
+    v = v / float(np.median(np.abs(v) / sizes(q)))
     driven, moved = rate != 0.0, np.abs(jacobian) @ np.abs(v)
     if not (driven & (moved > 0.0)).any():
         return [v]
@@ -253,27 +247,9 @@ def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
     return [v, faster * v]
 
 
-def column_scales(jacobian: Array, sizes: Array) -> Array:
-    """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the sizes."""
-    size = np.abs(jacobian)
-    counts = size > 1e-12 * size.max(axis=1, keepdims=True)  # others are what rounding has left
-    used = counts.any(axis=0)
-    if not used.any():
-        return sizes
-    logs = np.where(counts, np.log(np.where(counts, size, 1.0)), 0.0)
-    in_row, in_column = np.maximum(counts.sum(axis=1), 1), np.maximum(counts.sum(axis=0), 1)
-    rows, columns = np.zeros(len(size)), np.zeros(len(sizes))
-    for _ in range(20):  # least squares of log|C_q| + columns - rows, by turns
-        rows = (logs.sum(axis=1) + counts @ columns) / in_row
-        columns = (rows @ counts - logs.sum(axis=0)) / in_column
-    # the unit of the whole is free: that of the coordinates
-    columns = np.exp(columns + float(np.median(np.log(sizes[used]) - columns[used])))
-    return np.where(used, columns, sizes)
-
-
 def _time_scale(q: Array, v: Array) -> float:
     """Time in which no coordinate moves by more than its size, s."""
-    return float((_sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
+    return float((sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
 
 
 def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
@@ -289,7 +265,7 @@ def _bent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
 def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
     if not system.constant_mass:
         return
-    shift = 0.1 * _sizes(q) * np.random.default_rng(1).choice((-1.0, 1.0), system.n_q)
+    shift = 0.1 * sizes(q) * np.random.default_rng(1).choice((-1.0, 1.0), system.n_q)
     there = system.mass(t + 1.0, q + shift)
     if np.isfinite(there).all() and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
         raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")

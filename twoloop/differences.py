@@ -20,7 +20,9 @@ EPS = float(np.finfo(np.float64).eps)
 DEGREE = 8
 TAIL = 5  # coefficients from this one on have to have decayed
 NODES = np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
-SLOPES = {side: chebyshev.chebval(-float(side), chebyshev.chebder(np.eye(DEGREE + 1))) for side in (0, 1, -1)}
+SLOPES: dict[int, Array] = {  # of the polynomials at the place, by the side that the interval lies on
+    side: np.asarray(chebyshev.chebval(-float(side), chebyshev.chebder(np.eye(DEGREE + 1)))) for side in (0, 1, -1)
+}
 FIRST = 2.0**-5  # the first half-width, of the scale
 RATIO = 16.0  # of one half-width to the next
 SMALLER, LARGER = 11, 8  # half-widths that are tried on either side
