@@ -114,13 +114,14 @@ def linkage(unit):
 
 def lever(small, large):
     """A lever with a tip of one unit and an arm of another: coordinates that differ by their ratio, in one row too."""
+    total = math.sin(0.3) + math.cos(0.3) + 0.5 * 0.7**2
 
     def constraint(t, q):
         return np.array(
             [
                 q[0] - small * math.sin(q[2]),
                 q[1] - large * math.cos(q[2]),
-                q[0] / small + q[1] / large + 0.5 * q[3] ** 2 - 1.0,
+                q[0] / small + q[1] / large + 0.5 * q[3] ** 2 - total,
             ]
         )
 

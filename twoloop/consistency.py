@@ -106,7 +106,7 @@ class Violation:
     def of_velocity(
         cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
     ) -> "Violation":
-        """C_q v + C_t at a state, beside what is fast there: velocities, drives, and what the forces can bring about."""
+        """C_q v + C_t at a state, beside what is fast there: velocities, drives, and what forces can bring about."""
         rate = system.constraint_rate(t, q)
         fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
         try:

@@ -75,7 +75,7 @@ def consistent_state(
     ------
     TypeError, ValueError
         If a shape is wrong, a value is not finite, `keep` leaves too little freedom, no consistent position is found
-        near the guess, or a guess twice as far off would lead to another one: near a dead centre, as a rule.
+        near the guess, or other guesses as far off would lead to another one: near a dead centre, as a rule.
     """
     check_system(system)
     t = check_finite("t", t)
@@ -120,17 +120,26 @@ def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[n
         )
     if start.excess <= 1.0:
         return found
-    moved = float(np.abs((found - guess) / scales.columns).max())
-    mirrored, excess, _ = _gauss_newton(system, t, 2.0 * guess - found, free)
-    apart = np.inf if mirrored is None else float(np.abs((mirrored - found) / scales.columns).max())
-    if mirrored is None or not excess <= CONVERGED or apart > moved:
-        j = int(np.abs((found - guess) / scales.columns).argmax())
-        raise ValueError(
-            f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves coordinate "
-            f"{j} from {guess[j]:.6g} to {found[j]:.6g}, and from a guess twice as far off it "
-            f"{'fails' if mirrored is None or not excess <= CONVERGED else 'leads to another position'}. Give a guess "
-            f"that is nearer to the assembly that is meant{_smallest(scaled, free, kept)}"
-        )
+    moved = (found - guess) / scales.columns
+    far = float(np.abs(moved).max())
+    there = scales.scaled(system.jacobian(t, found))
+    dependent, sign, _ = _assembly(there, free)
+    weakest = far * _weakest_direction(there, free)
+    for other in (-2.0 * moved, weakest, -weakest):
+        again, excess, _ = _gauss_newton(system, t, found + other * scales.columns, free)
+        same = again is not None and excess <= CONVERGED
+        if again is not None and same:
+            block = scales.scaled(system.jacobian(t, again))[:, list(dependent)]
+            same = float(np.abs((again - found) / scales.columns).max()) <= far
+            same = same and (sign == 0 or int(np.linalg.slogdet(block)[0]) == sign)
+        if not same:
+            j = int(np.abs(moved).argmax())
+            raise ValueError(
+                f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
+                f"coordinate {j} from {guess[j]:.6g} to {found[j]:.6g}, and from other positions as far away it does "
+                f"not lead there. Give a guess that is nearer to the assembly that is meant, or farther from a dead "
+                f"centre{_smallest(there, free, kept)}"
+            )
     return found
 
 
@@ -181,6 +190,15 @@ def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], i
     block = scaled[:, list(dependent)]
     values = np.linalg.svd(block, compute_uv=False)
     return dependent, int(np.linalg.slogdet(block)[0]), float(values.min() / values.max())
+
+
+def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
+    """The direction in which the constraints hold the free coordinates least; its largest entry is 1."""
+    values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
+    held = values > SINGULAR * values.max()
+    direction = np.zeros(scaled.shape[1])
+    direction[free] = rows[held][-1] / np.abs(rows[held][-1]).max()
+    return direction
 
 
 def _smallest(scaled: Array, free: NDArray[np.intp], kept: list[int]) -> str:
