@@ -109,6 +109,12 @@ def test_redundant_rows_name_what_they_depend_on():
     assert any(equation in str(caught.value) for equation in equations)
 
 
+def test_a_start_without_rank_names_its_row():
+    flat = np.array([0.5, 0.0, 0.0, 2.0, 0.0, 0.0, 2.5, 0.0, np.pi])
+    with pytest.raises(ValueError, match=r"rank 7 < n_c = 8.*row\(s\) \[7\] depend on the others \(row 7 = "):
+        solve_dae(four_bar((1.0, 2.0, 1.0), 2.0, theta3=2.0).system, (0.0, 1.0), flat, np.zeros(9))
+
+
 # --- consistent_state
 
 
@@ -175,7 +181,7 @@ def test_a_guess_near_a_dead_centre_is_refused(beside):
 def test_a_guess_near_a_position_without_rank_is_refused():
     flat = np.array([0.5, 0.0, 0.0, 2.0, 0.0, 0.0, 2.5, 0.0, np.pi])  # a parallelogram folded into one line
     system = four_bar((1.0, 2.0, 1.0), 2.0, theta3=2.0).system
-    with pytest.raises(ValueError, match="as at a dead centre"):
+    with pytest.raises(ValueError, match="does not say on which assembly.*or farther from a dead centre"):
         consistent_state(system, 0.0, flat + 0.01 * np.cos(np.arange(9.0)), np.zeros(9))
 
 

@@ -6,7 +6,7 @@ from scipy.linalg import qr
 
 from twoloop.derivatives import check_derivatives
 from twoloop.kernels.common import GAMMA_GIVEN
-from twoloop.scales import EPS, Scales, column_scales, scales_of
+from twoloop.scales import EPS, Scales, scales_of
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> N
     check_derivatives(system, t0, q0)
     violation = Violation.of_velocity(system, t0, q0, v0, jacobian, scales)
     violation.refuse("v0")
-    redundant = redundant_rows(jacobian)
+    redundant = redundant_rows(scales.scaled(jacobian))
     if redundant:
         raise ValueError(
             f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} "
@@ -142,11 +142,9 @@ class Violation:
         )
 
 
-def redundant_rows(jacobian: Array) -> list[int]:
-    """Rows of a Jacobian that depend on the others, by QR with pivoting, whatever their units."""
-    scaled = jacobian * column_scales(jacobian, np.ones(jacobian.shape[1]))
-    norms = np.linalg.norm(scaled, axis=1, keepdims=True)
-    R, order = qr((scaled / np.where(norms > 0.0, norms, 1.0)).T, mode="r", pivoting=True)
+def redundant_rows(scaled: Array) -> list[int]:
+    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    R, order = qr(scaled.T, mode="r", pivoting=True)
     diagonal = np.abs(np.diagonal(R))
     rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
     return sorted(order[rank:].tolist())
@@ -172,7 +170,7 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
     jacobian = system.jacobian(t, q)
-    rows = redundant_rows(jacobian)
+    rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
     return in_words(jacobian, rows) if rows else "or so nearly that Newton cannot tell"
 
 

@@ -82,15 +82,21 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     noise = EPS * (np.abs(jacobian) @ np.abs(q))
     given = jacobian @ generic + rate
     along = _along(system, t, q, generic)
-    found = differentiate(along, 0.0, scale, noise, given, np.abs(given), sides=ANYWHERE, most=ALONG_A_RUN)
+    spacing = _spacing(t, q, generic)
+    found = _along_a_run(along, scale, noise, given, spacing)
     suspicious = found.disagrees(given, EPS * (np.abs(jacobian) @ np.abs(generic))).max() > 1.0
     if not suspicious and system.functions.flags[GAMMA_GIVEN] == 1:
         given = -system.gamma(t, q, generic)
         noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))
         bent = _bent(system, t, q, generic)
-        found = differentiate(bent, 0.0, scale, noise, given, np.abs(given), sides=ANYWHERE, most=ALONG_A_RUN)
+        found = _along_a_run(bent, scale, noise, given, spacing)
         suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
     return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
+
+
+def _along_a_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
+    largest = np.abs(given)
+    return differentiate(function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ANYWHERE, most=ALONG_A_RUN)
 
 
 @dataclass(frozen=True)
@@ -104,10 +110,13 @@ class _Comparison:
     place: float
     given: Array
     column: int | None = None
+    spacing: float = 0.0
 
     def wrong(self, scale: float, noise: Array, largest: Array, rounding: Array, sides: tuple[int, ...]) -> str | None:
         """Say which entry is wrong, or None."""
-        best = differentiate(self.function, self.place, scale, noise, self.given, largest, sides=sides)
+        best = differentiate(
+            self.function, self.place, scale, noise, self.given, largest, spacing=self.spacing, sides=sides
+        )
         ratio = best.disagrees(self.given, rounding)
         for entry in np.argsort(-ratio):
             if ratio[entry] <= 1.0:
@@ -148,7 +157,8 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
             continue
         noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))
         rounding = _rounding(lambda x, v=v: system.gamma(t, x, v), given, q)  # type: ignore[misc]
-        bent = _Comparison(system, "gamma", t, lambda s, v=v: -_bent(system, t, q, v)(s), 0.0, given)  # type: ignore[misc]
+        turned = _minus(_bent(system, t, q, v))
+        bent = _Comparison(system, "gamma", t, turned, 0.0, given, spacing=_spacing(t, q, v))
         wrong = bent.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
         if wrong is not None:
             return wrong
@@ -252,6 +262,11 @@ def _time_scale(q: Array, v: Array) -> float:
     return float((sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
 
 
+def _spacing(t: float, q: Array, v: Array) -> float:
+    """Time from which on a straight motion moves every coordinate by more than rounding, s."""
+    return max(float(np.spacing(abs(t))), float((np.spacing(np.abs(q)) / np.maximum(np.abs(v), 1e-300)).max()))
+
+
 def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
     """C along a straight motion."""
     return lambda s: system.constraint(t + s, q + s * v)
@@ -260,6 +275,10 @@ def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
 def _bent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
     """C_q v + C_t along a straight motion."""
     return lambda s: system.velocity_constraint(t + s, q + s * v, v)
+
+
+def _minus(function: Function) -> Function:
+    return lambda s: -function(s)
 
 
 def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:

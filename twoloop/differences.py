@@ -89,9 +89,9 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
     return _Window(slope, np.where(resolved, error, np.inf), np.ptp(values, axis=0) == 0.0)
 
 
-def _widths(place: float, scale: float) -> Iterator[float]:
+def _widths(scale: float, spacing: float) -> Iterator[float]:
     """Half-widths to try, from a fraction of the scale, smaller and larger in turn."""
-    least = LEAST_SPACINGS * float(np.spacing(abs(place)))
+    least = LEAST_SPACINGS * spacing
     first = max(FIRST * scale, least)
     yield first
     for k in range(1, max(SMALLER, LARGER) + 1):
@@ -109,6 +109,7 @@ def differentiate(
     given: Array,
     largest: Array,
     *,
+    spacing: float = 0.0,
     sides: tuple[int, ...] = (0,),
     most: int = SMALLER + LARGER + 1,
 ) -> Estimate:
@@ -124,6 +125,8 @@ def differentiate(
         What rounding of the arguments does to the function.
     given, largest : ndarray (m,)
         The entries to judge, and the largest entry beside each.
+    spacing : float
+        Least displacement that rounding lets through, where that is not the spacing of numbers at the place.
     sides : tuple of int
         0: around the place; 1: after it; -1: before it. The next is tried where the function is not defined.
     most : int
@@ -139,13 +142,16 @@ def differentiate(
         slope, error, width = np.zeros(m), np.full(m, np.inf), np.full(m, np.inf)
         flat_error, flat_width, moved = np.full(m, np.inf), np.full(m, np.inf), np.zeros(m, dtype=bool)
         tried = 0
-        for number, h in enumerate(_widths(place, scale)):
+        for number, h in enumerate(_widths(scale, max(spacing, float(np.spacing(abs(place)))))):
             if number >= most:
                 break
             found = _window(function, place, h, side, noise)
             if found is None:
                 continue
-            better = ~found.flat & (found.error < error)
+            # on a narrow interval parts of a function may stand still by rounding and the rest look smooth
+            with np.errstate(invalid="ignore"):
+                agrees = ~(np.abs(found.slope - slope) > SAFETY * (found.error + error))
+            better = ~found.flat & (found.error < error) & agrees
             slope[better], error[better], width[better] = found.slope[better], found.error[better], h
             better = found.flat & (found.error < flat_error)
             flat_error[better], flat_width[better] = found.error[better], h

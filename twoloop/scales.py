@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
+TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
 NEGLIGIBLE = 1e-6  # of the largest coordinate: smaller ones are zero by chance and are no size
 
 
@@ -24,11 +25,11 @@ class Scales:
     """Units in which the entries of C_q are of like size, and the mechanism's size in these units."""
 
     columns: Array  # (n_q,), units of the coordinates
-    rows: Array  # (n_c,), norms of the rows of C_q in these units; 1 for a row of zeros
+    rows: Array  # (n_c,), norms of the rows of C_q in these units, or what they become a little away; 1 for zeros
     reach: Array  # (n_c,), in these units: how far each constraint stays what it is
 
     def scaled(self, jacobian: Array) -> Array:
-        """C_q with coordinates in these units and rows of norm 1."""
+        """C_q with coordinates in these units and rows of norm 1, less where a row vanishes by its position."""
         return jacobian * self.columns / self.rows[:, None]
 
     def by_coordinate(self, per_row: Array, jacobian: Array) -> Array:
@@ -67,9 +68,10 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     size = np.abs(q)
     typical = float(np.median(size[size > 0.0])) if size.any() else 1.0
     columns = column_scales(jacobian, np.maximum(size, typical))
-    norms = np.linalg.norm(jacobian * columns, axis=1)
-    rows = np.where(norms > 0.0, norms, 1.0)
-    radius = rows / np.maximum(_curvature(system, t, q, columns), 1e-300)
+    norms, curvature = np.linalg.norm(jacobian * columns, axis=1), _curvature(system, t, q, columns)
+    rows = np.maximum(norms, TURNS * curvature)
+    rows = np.where(rows > 0.0, rows, 1.0)
+    radius = np.where(norms > 0.0, norms, 1.0) / np.maximum(curvature, 1e-300)
     in_units = np.where(jacobian != 0.0, size / columns, 0.0)
     reach = np.ones(len(rows))
     for i, row in enumerate(in_units):
