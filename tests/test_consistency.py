@@ -181,7 +181,7 @@ def test_a_guess_near_a_dead_centre_is_refused(beside):
 def test_a_guess_near_a_position_without_rank_is_refused():
     flat = np.array([0.5, 0.0, 0.0, 2.0, 0.0, 0.0, 2.5, 0.0, np.pi])  # a parallelogram folded into one line
     system = four_bar((1.0, 2.0, 1.0), 2.0, theta3=2.0).system
-    with pytest.raises(ValueError, match="does not say on which assembly.*or farther from a dead centre"):
+    with pytest.raises(ValueError, match=r"does not say on which assembly.*or farther from a dead centre"):
         consistent_state(system, 0.0, flat + 0.01 * np.cos(np.arange(9.0)), np.zeros(9))
 
 
