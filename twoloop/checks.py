@@ -51,10 +51,8 @@ def check_text(name: str, value: Any) -> str:
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
     """Return `value`, or say what it must be one of."""
     if not isinstance(value, str) or value not in choices:
-        known = ", ".join(repr(each) for each in choices)
-        raise (ValueError if isinstance(value, str) else TypeError)(
-            f"{name} must be one of {known}; given {shown(value)}"
-        )
+        known = f"{', '.join(repr(each) for each in choices[:-1])} or {choices[-1]!r}"
+        raise (ValueError if isinstance(value, str) else TypeError)(f"{name} must be {known}; given {shown(value)}")
     return value
 
 
