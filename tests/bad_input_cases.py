@@ -100,7 +100,7 @@ VECTORS = [
     ([[1.0], [0.0, 1.0]], TypeError, "must be an array of real numbers; given", NUMBERS),
     ([True, False], TypeError, "must be an array of real numbers.*True and False", "write 1.0 and 0.0"),
     ([1.0, True], TypeError, "must be an array of real numbers.*True and False", "write 1.0 and 0.0"),
-    (DAYS, TypeError, "must be an array of real numbers.*datetime64", "convert dates to seconds"),
+    (DAYS, TypeError, "must be an array of real numbers.*which holds dates", "convert dates to seconds"),
     (MASKED, TypeError, "must be an array of real numbers; given a masked array", "fill the gaps with filled()"),
     ([HUGE, 0], ValueError, "must hold numbers that fit into a float", "use units in which numbers are moderate"),
     ([object, 0.0], TypeError, "must be an array of real numbers", NUMBERS),

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
+HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}  # by NumPy's kind
 SHOWN = 120  # characters of what was given, in a message
 
 
@@ -68,7 +69,7 @@ def check_real(name: str, value: ArrayLike) -> Array:
     if array.dtype.kind == "b" or _holds_bool(value):
         raise TypeError(f"{expected}; given {shown(value)}, in which True and False are no numbers")
     if array.dtype.kind not in "iufO":
-        raise TypeError(f"{expected}; given {shown(value)} of type {array.dtype}")
+        raise TypeError(f"{expected}; given {shown(value)}, which holds {HOLDS.get(array.dtype.kind, array.dtype)}")
     if array.dtype.kind == "O" and not all(isinstance(each, (int, float)) for each in array.flat):
         raise TypeError(f"{expected}; given {shown(value)}")
     try:
