@@ -124,7 +124,8 @@ class _Comparison:
         for entry in np.argsort(-ratio):
             if ratio[entry] <= 1.0:
                 return None
-            if confirms(self.function, self.place, int(entry), best, float(self.given[entry]), noise):
+            given = float(self.given[entry])
+            if confirms(self.function, self.place, int(entry), best, given, noise, self.spacing):
                 return self._message(int(entry), best)
         return None
 

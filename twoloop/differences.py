@@ -26,12 +26,16 @@ SLOPES: dict[int, Array] = {  # of the polynomials at the place, by the side tha
 FIRST = 2.0**-5  # the first half-width, of the scale
 RATIO = 16.0  # of one half-width to the next
 SMALLER, LARGER = 11, 8  # half-widths that are tried on either side
+FINER, WIDER, CLOSER = 4.0, 8, 24  # ratio and numbers of the intervals that have to confirm that an entry is wrong
+RIPPLES = 3  # narrower intervals after which a smooth function shows rounding only
 LEAST_SPACINGS = 256.0  # half-width, in spacings of floating-point numbers at the place
 SETTLED = 2e-7  # of an entry: agreement, with the error of the difference, at which no other half-width is tried
 AGREEMENT = 3e-7  # of an entry: less is not an error
 DECAYED = 0.01  # of the first coefficients: the last of a function that the points resolve are no more
+DECAYING = 0.2  # the last two of them to those before, where these are not rounding: else they are a ripple
 NOTHING = 100.0  # times rounding: a function that varies by no more does not vary
 SAFETY = 5.0  # times the estimated error of the difference
+FROZEN = 1e4  # times rounding of what is seen: inside, a function that stands still may add larger numbers
 FLAT = 3  # intervals, of different widths, on which a function that does not vary has the derivative 0
 TINY = 1e-12  # of the largest entry: such an entry counts as zero
 
@@ -58,6 +62,8 @@ class _Window:
     slope: Array
     error: Array
     flat: NDArray[np.bool_]
+    nothing: NDArray[np.bool_]  # varies by no more than rounding
+    ripple: Array  # the last coefficients, where they are more than rounding
 
 
 def _window(function: Function, place: float, width: float, side: int, noise: Array) -> _Window | None:
@@ -85,8 +91,12 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
         error = growth * tail + (2.0 if side else 1.0) * growth * level
     if not np.isfinite(error).all():
         return None
-    resolved = (tail <= DECAYED * head) | (np.maximum(head, tail) <= NOTHING * level)
-    return _Window(slope, np.where(resolved, error, np.inf), np.ptp(values, axis=0) == 0.0)
+    last = np.abs(coefficients[TAIL + 2 :]).max(axis=0)
+    still = tail <= NOTHING * level
+    resolved = ((tail <= DECAYED * head) & (still | (last <= DECAYING * tail))) | (still & (head <= NOTHING * level))
+    ripple = np.where(tail > NOTHING * level, tail, 0.0)
+    nothing = np.maximum(head, tail) <= NOTHING * level
+    return _Window(slope, np.where(resolved, error, np.inf), np.ptp(values, axis=0) == 0.0, nothing, ripple)
 
 
 def _widths(scale: float, spacing: float) -> Iterator[float]:
@@ -151,10 +161,10 @@ def differentiate(
             # on a narrow interval parts of a function may stand still by rounding and the rest look smooth
             with np.errstate(invalid="ignore"):
                 agrees = ~(np.abs(found.slope - slope) > SAFETY * (found.error + error))
-            better = ~found.flat & (found.error < error) & agrees
+            better = ~found.flat & (found.error < error) & agrees & ~(found.nothing & (h > RATIO * FIRST * scale))
             slope[better], error[better], width[better] = found.slope[better], found.error[better], h
-            better = found.flat & (found.error < flat_error)
-            flat_error[better], flat_width[better] = found.error[better], h
+            better = found.flat & (FROZEN * found.error < flat_error)
+            flat_error[better], flat_width[better] = FROZEN * found.error[better], h
             # where a wider interval moves an entry, one on which it does not has only seen rounding, or a dead zone
             moved |= ~found.flat
             best = Estimate(
@@ -179,10 +189,30 @@ def _settled(best: Estimate, given: Array, largest: Array) -> NDArray[np.bool_]:
     return confirmed | zero
 
 
-def confirms(function: Function, place: float, entry: int, best: Estimate, given: float, noise: Array) -> bool:
-    """Whether another interval also finds that this entry is not the one given: one disagreement may be an accident."""
-    found = _window(function, place, 0.55 * float(best.width[entry]), best.side, noise)
+def confirms(
+    function: Function, place: float, entry: int, best: Estimate, given: float, noise: Array, spacing: float = 0.0
+) -> bool:
+    """Whether other intervals, wider and narrower, also find that this entry is not the one given.
+
+    One disagreement may be an accident, and what moves little and fast (a fine ripple on a long way) shows on narrow
+    intervals only. Where one of them finds another derivative, nothing is certain.
+    """
+    width = 0.55 * float(best.width[entry])
+    found = _window(function, place, width, best.side, noise)
     if found is None:
         return False
     apart = abs(given - float(found.slope[entry]))
-    return bool(apart > 0.6 * SAFETY * found.error[entry] and abs(found.slope[entry] - best.slope[entry]) < 0.5 * apart)
+    if apart <= 0.6 * SAFETY * found.error[entry] or abs(found.slope[entry] - best.slope[entry]) >= 0.5 * apart:
+        return False
+    least = LEAST_SPACINGS * max(spacing, float(np.spacing(abs(place))))
+    for k in (*range(-WIDER, 0), *range(1, CLOSER)):
+        if width / FINER**k < least:
+            break
+        found = _window(function, place, width / FINER**k, best.side, noise)
+        if found is None or found.flat[entry]:
+            continue
+        if abs(found.slope[entry] - best.slope[entry]) > SAFETY * (found.error[entry] + best.error[entry]):
+            return False
+        if k > RIPPLES and found.ripple[entry] > 0.0:  # not from the ends of the interval: it may hide a steep slope
+            return False
+    return True
