@@ -1,10 +1,11 @@
-"""Writes docs/errors.md from the cases of `bad_input_cases`, each really run: python -m tests.errors_page."""
+"""Writes docs/errors.md from the cases of `tests/bad_input`, each really run: python -m tests.errors_page."""
 
 import re
 from itertools import groupby
 from pathlib import Path
 
-from tests.bad_input_cases import CASES, Case
+from tests.bad_input.case import Case
+from tests.bad_input.cases import CASES
 from twoloop import Status, result
 
 PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
@@ -15,7 +16,7 @@ BEGINNING = """# What happens at what mistake
 Wrong input raises before any work, and the message names the argument, what was given and what to do. What goes wrong
 later ends the run with a status: `result.status`, `result.message`, and what was computed so far.
 
-Every line below is a test. Written by `python -m tests.errors_page` from `tests/bad_input_cases.py`, with the messages
+Every line below is a test. Written by `python -m tests.errors_page` from `tests/bad_input`, with the messages
 as they were raised; do not edit it by hand.
 """
 

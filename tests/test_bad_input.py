@@ -1,6 +1,6 @@
 """Wrong input: each mistake has its own error, which names the argument, says what was given and what to do.
 
-The table of `bad_input_cases` is run entry by entry, and docs/errors.md is made from it; what goes wrong later follows.
+The table of `tests/bad_input` is run entry by entry, and docs/errors.md is made from it; what goes wrong later follows.
 """
 
 import re
@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tests import errors_page
-from tests.bad_input_cases import CASES, Q0, solve
+from tests.bad_input.case import Q0, solve
+from tests.bad_input.cases import CASES
 from tests.problems import moving_pivot, moving_pivot_state, pendulum, violations
 from twoloop import Status, solve_dae
 from twoloop.checks import check_real, check_tolerance
