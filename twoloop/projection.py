@@ -182,7 +182,9 @@ def _rank(scaled: Array) -> int:
 
 def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
     """The dependent columns, the sign of their determinant, and how far they are from losing rank."""
-    rank = min(_rank(scaled[:, free]), len(free))
+    rank = _rank(scaled[:, free])
+    if rank == 0:
+        return (), 0, 0.0
     order = qr(scaled[:, free], mode="r", pivoting=True)[1]
     dependent = tuple(sorted(int(j) for j in free[order[:rank]]))
     if rank < len(scaled):

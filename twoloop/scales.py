@@ -34,8 +34,8 @@ class Scales:
 
     def by_coordinate(self, per_row: Array, jacobian: Array) -> Array:
         """The least of what the constraints on each coordinate say, in its own unit; of all, where there is none."""
-        values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0)
-        return self.columns * np.where(np.isfinite(values), values, per_row.min())
+        values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
+        return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
 
 def sizes(q: Array) -> Array:
@@ -48,7 +48,7 @@ def sizes(q: Array) -> Array:
 def column_scales(jacobian: Array, typical: Array) -> Array:
     """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the typical ones."""
     size = np.abs(jacobian)
-    counts = size > 1e-12 * size.max(axis=1, keepdims=True)  # others are what rounding has left
+    counts = size > 1e-12 * size.max(axis=1, keepdims=True, initial=0.0)  # others are what rounding has left
     used = counts.any(axis=0)
     if not used.any():
         return typical
