@@ -2,9 +2,9 @@
 
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
-from twoloop.consistency import consistent_state
 from twoloop.dop853 import DOP853
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
+from twoloop.projection import ConsistentState, consistent_state
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
 from twoloop.system import ConstrainedSystem
@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 __all__ = [
     "BDF",
     "DOP853",
+    "ConsistentState",
     "ConstrainedSystem",
     "Newmark",
     "Result",

@@ -1,5 +1,6 @@
 """Checks of what a user gives: each says which argument is wrong, what was given, what was expected, what to do."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,25 +9,81 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
+HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}  # by NumPy's kind
+SHOWN = 120  # characters of what was given, in a message
+
+
+def shown(value: Any) -> str:
+    """`value` as a message shows it: what Python calls it, cut where it is long."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**30:
+        return f"an integer of {value.bit_length()} bits"  # of too many digits for Python to write them
+    try:
+        text = repr(value)
+    except Exception:  # of an object that cannot even be shown
+        text = f"an object of type {type(value).__name__}"
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def check_size(name: str, value: Any, least: int) -> int:
     """Return `value` as an int of at least `least`, or say what is wrong with it."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name} must be an int; given {value!r} of type {type(value).__name__}")
+        raise TypeError(f"{name} must be an int; given {shown(value)} of type {type(value).__name__}")
     if value < least:
-        raise ValueError(f"{name} must be at least {least}; given {value}")
+        raise ValueError(f"{name} must be at least {least}; given {shown(value)}")
+    if value > np.iinfo(np.int64).max:
+        raise ValueError(f"{name} must fit into 64 bits; given {shown(value)}")
     return int(value)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return `value` as a bool, or say that it is none."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be True or False; given {shown(value)} of type {type(value).__name__}")
+    return bool(value)
+
+
+def check_text(name: str, value: Any) -> str:
+    """Return `value`, or say that it is no text."""
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a string; given {shown(value)} of type {type(value).__name__}")
+    return value
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
+    """Return `value`, or say what it must be one of."""
+    if not isinstance(value, str) or value not in choices:
+        known = f"{', '.join(repr(each) for each in choices[:-1])} or {choices[-1]!r}"
+        raise (ValueError if isinstance(value, str) else TypeError)(f"{name} must be {known}; given {shown(value)}")
+    return value
 
 
 def check_real(name: str, value: ArrayLike) -> Array:
     """Return `value` as a new float array, or say that it is not one."""
+    expected = f"{name} must be an array of real numbers"
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{expected}; given a masked array: fill its gaps first, with filled()")
     try:
-        if np.iscomplexobj(value):
-            raise TypeError("complex numbers")
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be an array of real numbers; given {value!r}") from error
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:  # lists of unequal lengths
+        raise TypeError(f"{expected}; given {shown(value)}") from error
+    if array.dtype.kind == "b" or _holds_bool(value):
+        raise TypeError(f"{expected}; given {shown(value)}, in which True and False are no numbers")
+    if array.dtype.kind not in "iufO":
+        raise TypeError(f"{expected}; given {shown(value)}, which holds {HOLDS.get(array.dtype.kind, array.dtype)}")
+    if array.dtype.kind == "O" and not all(isinstance(each, (int, float)) for each in array.flat):
+        raise TypeError(f"{expected}; given {shown(value)}")
+    try:
+        with np.errstate(over="ignore"):  # what becomes infinite is said below, by those who want finite numbers
+            return np.array(array, dtype=np.float64)
+    except OverflowError as error:
+        raise ValueError(f"{name} must hold numbers that fit into a float; given one beyond 1.8e308") from error
+
+
+def _holds_bool(value: Any) -> bool:
+    """Whether a bool stands in nested lists, where NumPy would make it a number."""
+    if isinstance(value, (list, tuple)):
+        return any(_holds_bool(each) for each in value)
+    return isinstance(value, (bool, np.bool_)) or (isinstance(value, np.ndarray) and value.dtype.kind == "b")
 
 
 def check_vector(name: str, value: ArrayLike, n: int) -> Array:
@@ -37,6 +94,22 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite; entries {np.flatnonzero(~np.isfinite(array)).tolist()} are not")
     return array
+
+
+def check_indices(name: str, value: Any, n: int) -> list[int]:
+    """Return `value` as a list of different indices below n, or say what is wrong with it."""
+    if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, set, frozenset, range, np.ndarray)):
+        raise TypeError(f"{name} must be a list of indices of coordinates, e.g. [0]; given {shown(value)}")
+    indices = []
+    for each in value:
+        if isinstance(each, (bool, np.bool_)) or not isinstance(each, (int, np.integer)):
+            raise TypeError(f"{name} must be a list of indices of coordinates, e.g. [0]; given {shown(value)}")
+        if not 0 <= each < n:
+            raise ValueError(f"{name} must hold indices from 0 to {n - 1}; given {shown(each)}")
+        indices.append(int(each))
+    if len(set(indices)) < len(indices):
+        raise ValueError(f"{name} must name each coordinate once; given {shown(value)}")
+    return sorted(indices)
 
 
 def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
@@ -51,15 +124,42 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
 def check_number(name: str, value: Any) -> float:
     """Return `value` as a float, or say that it is not a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} must be a number; given {value!r} of type {type(value).__name__}")
-    return float(value)
+        raise TypeError(f"{name} must be a number; given {shown(value)} of type {type(value).__name__}")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise ValueError(f"{name} must fit into a float, below 1.8e308; given {shown(value)}") from error
+
+
+def check_finite(name: str, value: Any) -> float:
+    """Return `value` as a float, or say that it is not a finite number."""
+    number = check_number(name, value)
+    if not np.isfinite(number):
+        raise ValueError(f"{name} must be finite; given {value!r}")
+    return number
 
 
 def check_positive(name: str, value: Any, infinite: bool = False) -> None:
     """Raise unless `value` is a positive number, finite unless `infinite`."""
-    check_number(name, value)
-    if not value > 0.0 or (not infinite and value == np.inf):
+    number = check_number(name, value)
+    if not number > 0.0 or (not infinite and number == np.inf):
         raise ValueError(f"{name} must be positive{'' if infinite else ' and finite'}; given {value!r}")
+
+
+def check_tolerance(name: str, value: ArrayLike, n_q: int) -> Array:
+    """Return a tolerance as an array (n_q,): a positive number for all coordinates, or one for each."""
+    if isinstance(value, (int, float, np.integer, np.floating)):
+        check_positive(name, value)
+        return np.full(n_q, float(value))
+    array = check_real(name, value)
+    if array.shape != (n_q,):
+        raise ValueError(
+            f"{name} must be a number or have one for each coordinate, shape ({n_q},); given shape {array.shape}"
+        )
+    wrong = np.flatnonzero(~((array > 0.0) & np.isfinite(array)))
+    if wrong.size:
+        raise ValueError(f"{name} must be positive and finite; entries {wrong.tolist()} are not")
+    return array
 
 
 def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None) -> Array:
@@ -67,9 +167,12 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     times = check_real("t_eval", t_eval)
     if times.ndim != 1 or times.size == 0:
         raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
-    if not np.isfinite(times).all() or times.min() < t0 or times.max() > t1:
+    if not np.isfinite(times).all():
+        raise ValueError(f"t_eval must be finite; entries {np.flatnonzero(~np.isfinite(times)).tolist()} are not")
+    if times.min() < t0 or times.max() > t1:
         raise ValueError(
-            f"t_eval must lie within t_span = ({t0:g}, {t1:g}); given times from {times.min():g} to {times.max():g}"
+            f"t_eval must lie within t_span = ({t0!r}, {t1!r}); given times from {float(times.min())!r} to "
+            f"{float(times.max())!r}"
         )
     spacing = NEAR * np.spacing(max(abs(t0), abs(t1)))
     close = np.diff(times) <= spacing
@@ -89,14 +192,7 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
         off &= times != t1
         if off.any():
             raise ValueError(
-                f"t_eval must hold multiples of step_size = {step_size!r} from t = {t0:g} when the step is fixed; "
-                f"{times[off][0]!r} is not one"
+                f"t_eval must hold multiples of step_size = {step_size!r} from t = {t0!r} when the step is fixed; "
+                f"{float(times[off][0])!r} is not one"
             )
     return times
-
-
-def check_tolerance(name, value, n):
-    check = np.array(value, dtype=float)
-    if check.ndim == 0:
-        check_positive(name, value)
-    return np.broadcast_to(check, (n,)).copy()

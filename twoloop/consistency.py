@@ -1,79 +1,37 @@
-"""Consistent states: the check of a start, the projection of a guess, and what is wrong with a system at a point."""
+"""The check of a start: consistent, of full rank, finite; and what is wrong with a system at a point."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from twoloop.bounds import check_bounds
-from twoloop.checks import check_number, check_vector
+from twoloop.callbacks import KINDS
 from twoloop.derivatives import check_derivatives
-from twoloop.kernels.common import GAMMA_GIVEN
+from twoloop.scales import EPS, Scales, scales_of
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-MAX_ITERATIONS = 50
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
-CONSISTENT = 1e-8  # largest violation that an initial state may have, relative to max(1, |q|) or max(1, |v|)
+CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 
 
-def consistent_state(system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
-
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    t : float
-        Time, s.
-    q, v : array_like (n_q,)
-        Guess. Its distance to the constraints should be small against the mechanism.
-
-    Returns
-    -------
-    q, v : ndarray (n_q,)
-        With C(t, q) = 0 and C_q v + C_t = 0 to rounding.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a value is not finite, or no consistent position is found near the guess.
-    """
-    t = check_number("t", t)
-    q = check_vector("q", q, system.n_q)
-    v = check_vector("v", v, system.n_q)
-    check_bounds(system, t, q, v)
-    system.check_returned(t, q, v)
-    blame = not_finite(system, t, q, v)
-    if blame != _NOTHING_FOUND:
-        raise ValueError(f"q and v cannot be projected: {blame} at t = {t:g}")
-    correction = np.inf
-    iterations = 0
-    while iterations < MAX_ITERATIONS:
-        iterations += 1
-        matrix, violations = system.jacobian(t, q), system.constraint(t, q)
-        if not (np.isfinite(matrix).all() and np.isfinite(violations).all()):
-            break
-        step = np.linalg.lstsq(matrix, -violations, rcond=1e-10)[0]
-        q = q + step
-        before, correction = correction, float(np.abs(step).max())
-        if not np.isfinite(correction) or correction < 1e-15 * max(1.0, np.abs(q).max()):
-            break
-        if correction >= before and correction < 1e-12:
-            break  # rounding level
-    violation = float(np.abs(system.constraint(t, q)).max())
-    if not violation < 1e-10 * max(1.0, float(np.abs(q).max())):
-        raise ValueError(
-            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
-            f"iterations max|C| is {violation:.3g}. Give a guess that is nearer to an assembled position"
-        )
-    v = v - np.linalg.lstsq(system.jacobian(t, q), system.velocity_constraint(t, q, v), rcond=1e-10)[0]
-    return q, v
+def check_system(system: object) -> None:
+    """Raise unless a ConstrainedSystem is given."""
+    if isinstance(system, ConstrainedSystem):
+        return
+    inner = getattr(system, "system", None)
+    hint = "for a ready mechanism: problem.system"
+    if isinstance(inner, ConstrainedSystem):
+        hint = f"this is a {type(system).__name__}: give its system, problem.system"
+    raise TypeError(f"system must be a ConstrainedSystem ({hint}); given {system!r:.200}")
 
 
-def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool = True) -> None:
-    """Call every callback once at the start and check shapes, finiteness, rank and consistency.
+def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, derivatives: bool = True) -> None:
+    """Call every callback once at the start and check shapes, finiteness, rank, consistency and, if asked, derivatives.
 
     Raises
     ------
@@ -84,71 +42,149 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, deri
     system.check_returned(t0, q0, v0)
     matrix = system.mass(t0, q0)
     jacobian = system.jacobian(t0, q0)
-    blame = not_finite(system, t0, q0, v0)
-    if blame != _NOTHING_FOUND:
-        raise ValueError(f"at the start, t = {t0:g}, {blame}")
+    reason = not_finite(system, t0, q0, v0)
+    if reason is not None:
+        raise ValueError(f"at the start, t = {t0:g}, {reason}")
     if np.abs(matrix - matrix.T).max() > 1e-10 * np.abs(matrix).max():
         raise ValueError(
             f"mass of {system.name!r} must be symmetric; at t = {t0:g} max|M - M^T| is "
             f"{np.abs(matrix - matrix.T).max():.3g}"
         )
-    _refuse_inconsistent(system, "q0", t0, system.constraint(t0, q0), np.abs(q0).max())
+    scales = scales_of(system, t0, q0, jacobian)
+    violation = Violation.of_position(system, t0, q0, jacobian, scales)
+    violation.refuse("q0")
     if derivatives:
         check_derivatives(system, t0, q0)
-    _refuse_inconsistent(system, "v0", t0, system.velocity_constraint(t0, q0, v0), np.abs(v0).max())
-    redundant = redundant_rows(jacobian)
+    violation = Violation.of_velocity(system, t0, q0, v0, jacobian, scales)
+    violation.refuse("v0")
+    redundant = redundant_rows(scales.scaled(jacobian))
     if redundant:
         raise ValueError(
             f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} "
-            f"at t = {t0:g}: row(s) {redundant} depend on the others. Leave these constraints out (redundant "
+            f"at t = {t0:g}: {in_words(jacobian, redundant)}. Leave these constraints out (redundant "
             "constraints are not handled yet), or start from another position"
         )
 
 
-def _refuse_inconsistent(system: ConstrainedSystem, name: str, t0: float, violation: Array, scale: float) -> None:
-    row = int(np.abs(violation).argmax())
-    if abs(violation[row]) > CONSISTENT * max(1.0, scale):
-        equation = "C(t, q)" if name == "q0" else "C_q v + C_t"
+class Violation:
+    """What a state violates, as the change of coordinates (or velocities) that would put it right.
+
+    Attributes
+    ----------
+    correction : ndarray (n_q,)
+        The Newton correction, by least squares with C_q, coordinates weighted by their scales.
+    allowed : ndarray (n_q,)
+        How much of it is accepted: 1e-8 of the mechanism's size, and rounding.
+    left : ndarray (n_c,)
+        What the correction leaves, where rows of C_q depend on one another or are zero; `allowed_left` with it.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t: float,
+        equation: str,
+        values: Array,
+        terms: Array,
+        jacobian: Array,
+        scales: Scales,
+        per_row: Array,
+        spacing: Array,
+    ):
+        self.system, self.t, self.equation, self.values = system, t, equation, values
+        scaled = scales.scaled(jacobian)
+        inverse = np.linalg.pinv(scaled, rcond=1e-10)
+        self.correction = -scales.columns * (inverse @ (values / scales.rows))
+        by_rounding = scales.columns * (np.abs(inverse) @ (terms / scales.rows)) + spacing
+        self.allowed = CONSISTENT * scales.by_coordinate(per_row, jacobian) + ROUNDING * EPS * by_rounding
+        self.left = np.abs(values + jacobian @ self.correction) / scales.rows
+        self.allowed_left = CONSISTENT * per_row + ROUNDING * EPS * terms / scales.rows
+
+    @classmethod
+    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> "Violation":
+        """C(t, q) at a position."""
+        terms = np.abs(jacobian) @ np.abs(q)
+        values = system.constraint(t, q)
+        return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
+
+    @classmethod
+    def of_velocity(
+        cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
+    ) -> "Violation":
+        """C_q v + C_t at a state, beside what is fast there: velocities, drives, and what forces can bring about."""
+        rate = system.constraint_rate(t, q)
+        fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+        try:
+            pull = np.linalg.solve(system.mass(t, q), system.force(t, q, v))
+        except np.linalg.LinAlgError:
+            pull = np.zeros(system.n_q)
+        falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
+        speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
+        terms = np.abs(jacobian) @ np.abs(v) + np.abs(rate)
+        values = jacobian @ v + rate
+        return cls(system, t, "C_q v + C_t", values, terms, jacobian, scales, speeds, np.abs(v))
+
+    @property
+    def excess(self) -> float:
+        """The largest correction over what is accepted; at most 1 where the state is consistent."""
+        parts = [(np.abs(self.correction), self.allowed), (self.left, self.allowed_left)]
+        return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
+
+    def refuse(self, name: str) -> None:
+        """Raise unless the state is consistent."""
+        with np.errstate(divide="ignore"):
+            excess = self.excess
+        if excess <= 1.0:
+            return
+        row = int(np.abs(self.values).argmax())
+        j = int((np.abs(self.correction) / np.maximum(self.allowed, 1e-300)).argmax())
+        of = "coordinate" if name == "q0" else "the velocity of coordinate"
         raise ValueError(
-            f"{name} is not consistent with the constraints of {system.name!r}: max|{equation}| is "
-            f"{abs(violation[row]):.3g} (row {row}) at t = {t0:g}, at most {CONSISTENT:g} is accepted. Project it "
-            "with twoloop.consistent_state(system, t, q, v)"
+            f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
+            f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; to put it right {of} {j} has to change by "
+            f"{abs(self.correction[j]):.3g}, and at most {self.allowed[j]:.1g} is accepted. Project it with "
+            "twoloop.consistent_state(system, t, q, v)"
         )
 
 
-def redundant_rows(jacobian: Array) -> list[int]:
-    """Rows of a Jacobian that depend on the others, by QR with pivoting."""
-    R, order = qr(jacobian.T, mode="r", pivoting=True)
+def redundant_rows(scaled: Array) -> list[int]:
+    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    if scaled.size == 0:
+        return []
+    R, order = qr(scaled.T, mode="r", pivoting=True)
     diagonal = np.abs(np.diagonal(R))
     rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
     return sorted(order[rank:].tolist())
 
 
+def in_words(jacobian: Array, redundant: list[int]) -> str:
+    """Which rows depend on which others, with the coefficients."""
+    others = [i for i in range(len(jacobian)) if i not in redundant]
+    equations = []
+    for i in redundant[:5]:
+        factors = np.linalg.lstsq(jacobian[others].T, jacobian[i], rcond=None)[0] if others else np.zeros(0)
+        share = np.abs(factors) * np.linalg.norm(jacobian[others], axis=1) if others else np.zeros(0)
+        terms = [
+            f"{factor:.4g} row {k}"
+            for k, factor, part in zip(others, factors, share, strict=True)
+            if part > 1e-9 * np.linalg.norm(jacobian[i])
+        ]
+        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
+    more = ", ..." if len(redundant) > 5 else ""
+    return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
+
+
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
-    rows = redundant_rows(system.jacobian(t, q))
-    return f"row(s) {rows} depend on the others" if rows else "or so nearly that Newton cannot tell"
+    jacobian = system.jacobian(t, q)
+    rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
+    return in_words(jacobian, rows) if rows else "or so nearly that Newton cannot tell"
 
 
-_NOTHING_FOUND = "no callback was found at fault"
+def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
+    """Which callbacks give values that are not finite at (t, q, v); None: all are."""
+    state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
+    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in system.given}
+    wrong = [kind for kind, value in values.items() if not np.isfinite(value).all()]
+    return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None
 
-
-def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str:
-    """Which callback gives values that are not finite at (t, q, v)."""
-    values = {
-        "mass": lambda: system.mass(t, q),
-        "force": lambda: system.force(t, q, v),
-        "constraint": lambda: system.constraint(t, q),
-        "jacobian": lambda: system.jacobian(t, q),
-        "constraint_rate": lambda: system.constraint_rate(t, q),
-        # of tangents that are not given these are zeros
-        "force_by_q": lambda: system.force_by_q(t, q, v),
-        "force_by_v": lambda: system.force_by_v(t, q, v),
-        "reaction_by_q": lambda: system.reaction_by_q(t, q, np.ones(system.n_c)),
-    }
-    if system.functions.flags[GAMMA_GIVEN] == 1:
-        values["gamma"] = lambda: system.gamma(t, q, v)
-    guilty = [kind for kind, value in values.items() if not np.isfinite(value()).all()]
-    if not guilty:
-        return _NOTHING_FOUND
-    return f"{' and '.join(guilty)} of {system.name!r} returned values that are not finite"

@@ -1,25 +1,51 @@
 """Is what a system says about itself true? C_q, C_t, Q_d and tangents against differences, constant M, bandwidth.
 
-A wrong sign in one of them often runs to the end and looks like a motion. Each system is looked at once.
+A wrong sign in one of them often runs to the end and looks like a motion. Every entry is compared at the start, and
+along a run one direction through all of them.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.differences import EPS, Estimate, Function, confirms, differentiate
 from twoloop.kernels.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, GAMMA_GIVEN, REACTION_BY_Q_GIVEN
+from twoloop.scales import column_scales, sizes
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-DISPLACEMENTS = (1e-4, 1e-6, 1e-8)  # of the largest coordinate, and s; one of them has to agree
-AGREEMENT = 1e-3  # relative to the largest entry of the row
-ROUNDING = 1e-12  # of a difference, relative to |C_q| times the largest coordinate over the displacement
+ANYWHERE = (0, 1, -1)  # around the place; where the callbacks are not defined there, after it or before it
+FORWARD = (1, -1)  # for times at the start: callbacks need not work before it
+TIME = 0.1  # s: first guess at how fast constraints move
+NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
+ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
+ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
+
+WHAT = {
+    "jacobian": "the derivative of constraint with respect to q",
+    "constraint_rate": "the derivative of constraint with respect to t",
+    "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = gamma",
+    "force_by_q": "the derivative of force with respect to q",
+    "force_by_v": "the derivative of force with respect to v",
+    "reaction_by_q": "the derivative of C_q^T lam with respect to q",
+}
+HINTS = {
+    "constraint_rate": ", or give constraint_rate: the constraints depend on time",
+    "gamma": ", or leave gamma out to have it differenced",
+    "force_by_q": ", or leave all tangents out to have the force differenced",
+    "reaction_by_q": ", or leave reaction_by_q out to have it differenced",
+}
 
 
 def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     """Compare the callbacks of a system with one another near (t, q), at velocities that stand for any.
+
+    Every entry is compared on its own, with a displacement that suits it; one that differences cannot decide is
+    accepted. C_q comes first, then C_t, then gamma, whose check relies on both. A few dozen calls of each callback for
+    each coordinate, once for each system.
 
     Raises
     ------
@@ -28,77 +54,258 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     """
     if system.checked:
         return
-    size = float(np.abs(q).max()) or 1.0
-    generic = np.random.default_rng(1)
-    v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
-    jacobian = system.jacobian(t, q)
-    level = ROUNDING * max(float(np.abs(jacobian).max()), 1e-300) * size
-
-    def in_q(e: float) -> Array:
-        return _by_columns(lambda shift: system.constraint(t, q + shift), system.n_q, e * size)
-
-    # times only forward: nobody promised that the callbacks work before the start
-    def in_t(e: float) -> Array:
-        return _forward([system.constraint(t + k * e, q) for k in range(3)], e)
-
-    def along(e: float) -> Array:
-        return -_forward([system.velocity_constraint(t + k * e, q + k * e * v, v) for k in range(3)], e)
-
-    _compare(system, "jacobian", t, jacobian, in_q, level / size)
-    _compare(system, "constraint_rate", t, system.constraint_rate(t, q), in_t, level)
-    if system.functions.flags[GAMMA_GIVEN] == 1:
-        _compare(system, "gamma", t, system.gamma(t, q, v), along, level)
-    _check_tangents(system, t, q, v, size)
-    if system.constant_mass:
-        there = system.mass(t + 1.0, q + 0.1 * v)
-        if np.isfinite(there).all() and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
-            raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+    wrong = _wrong_constraint(system, t, q, FORWARD) or _wrong_tangent(system, t, q)
+    if wrong is not None:
+        raise ValueError(wrong)
+    _check_constant_mass(system, t, q)
     if system.bandwidth is not None:
-        _check_bandwidth(system, system.bandwidth, t, q + 1e-3 * v, v, 1e-3 * size)
+        _check_bandwidth(system, system.bandwidth, t, q)
     system.checked = True
 
 
-def _check_tangents(system: ConstrainedSystem, t: float, q: Array, v: Array, size: float) -> None:
-    """Compare those that are given, a little off the start, where symmetry may hide a term."""
-    n = system.n_q
+def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
+    """Say which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold near the start only.
+
+    One direction through all coordinates and time stands for all entries, so that this costs as a rule nine calls of
+    `constraint`, ten of `jacobian` and of `constraint_rate` and one of `gamma`, whatever n_q. Only where the direction
+    shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they decide
+    whether Newton's method converges, not what it converges to.
+    """
+    jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
+    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+        return None
+    generic = _generic_velocities(jacobian, rate, q)[-1]
+    generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
+    scale = min(TIME, _time_scale(q, generic))
+    noise = EPS * (np.abs(jacobian) @ np.abs(q))
+    given = jacobian @ generic + rate
+    along = _along(system, t, q, generic)
+    spacing = _spacing(t, q, generic)
+    found = _along_a_run(along, scale, noise, given, spacing)
+    suspicious = found.disagrees(given, EPS * (np.abs(jacobian) @ np.abs(generic))).max() > 1.0
+    if not suspicious and system.functions.flags[GAMMA_GIVEN] == 1:
+        right = _defined(lambda: system.gamma(t, q, generic))
+        if right is None:
+            return None
+        given = -right
+        noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))
+        bent = _bent(system, t, q, generic)
+        found = _along_a_run(bent, scale, noise, given, spacing)
+        suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
+    return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
+
+
+def _along_a_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
+    largest = np.abs(given)
+    return differentiate(function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ANYWHERE, most=ALONG_A_RUN)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """One column of what a callback gives, and the function whose derivative it should be."""
+
+    system: ConstrainedSystem
+    kind: str
+    t: float
+    function: Function
+    place: float
+    given: Array
+    column: int | None = None
+    spacing: float = 0.0
+
+    def wrong(self, scale: float, noise: Array, largest: Array, rounding: Array, sides: tuple[int, ...]) -> str | None:
+        """Say which entry is wrong, or None."""
+        best = differentiate(
+            self.function, self.place, scale, noise, self.given, largest, spacing=self.spacing, sides=sides
+        )
+        ratio = best.disagrees(self.given, rounding)
+        for entry in np.argsort(-ratio):
+            if ratio[entry] <= 1.0:
+                return None
+            given = float(self.given[entry])
+            if confirms(self.function, self.place, int(entry), best, given, noise, self.spacing):
+                return self._message(int(entry), best)
+        return None
+
+    def _message(self, row: int, best: Estimate) -> str:
+        entry = row if self.column is None else (row, self.column)
+        hint = HINTS.get(self.kind, "")
+        if self.kind == "force_by_v" and self.system.functions.flags[FORCE_BY_V_GIVEN] == 0:
+            hint = ", that is, give force_by_v: beside force_by_q the force may depend on v only with it"
+        return (
+            f"{self.kind} of {self.system.name!r} is not {WHAT[self.kind]}: entry {entry} is {self.given[row]:.9g}, by "
+            f"differences it is {best.slope[row]:.9g} with an error of about {best.error[row]:.1g} (near t = "
+            f"{self.t:.10g}; velocities are chosen at random). Correct its formula{hint}"
+        )
+
+
+def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
+    """Which entry of C_q, C_t or gamma is wrong: the first of them that is, because each relies on those before."""
+    jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
+    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+        return None  # outside what they are made for; at a state of the run consistency.py names it
+    wrong = _wrong_column(system, "jacobian", t, q, lambda x: system.constraint(t, x), lambda x: system.jacobian(t, x))
+    if wrong is not None:
+        return wrong
+    noise = EPS * (np.abs(jacobian) @ np.abs(q))
+    rounding = _rounding(lambda x: system.constraint_rate(t, x), rate, q)
+    in_t = _Comparison(system, "constraint_rate", t, lambda s: system.constraint(t + s, q), t, rate)
+    wrong = in_t.wrong(TIME, noise, np.abs(rate), rounding, sides)
+    if wrong is not None or system.functions.flags[GAMMA_GIVEN] == 0:
+        return wrong
+    for v in _generic_velocities(jacobian, rate, q):
+        given = _defined(lambda v=v: system.gamma(t, q, v))  # type: ignore[misc]
+        if given is None:
+            continue
+        noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))
+        rounding = _rounding(lambda x, v=v: system.gamma(t, x, v), given, q)  # type: ignore[misc]
+        turned = _minus(_bent(system, t, q, v))
+        bent = _Comparison(system, "gamma", t, turned, 0.0, given, spacing=_spacing(t, q, v))
+        wrong = bent.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
+        if wrong is not None:
+            return wrong
+    return None
+
+
+def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """Which entry of the tangents that are given is wrong."""
     if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
-        return
-    try:
-        force = system.force(t, q + 1e-3 * v, v)
-        q = q + 1e-3 * v
-    except (ArithmeticError, ValueError):  # as in _compare
-        force = system.force(t, q, 0.0 * v)
+        return None
+    generic = np.random.default_rng(1)
+    v = sizes(q) * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    if _defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
+        q = q + NEAR_START * v
 
-    def force_in_q(e: float) -> Array:
-        return _by_columns(lambda shift: system.force(t, q + shift, v), n, e * size)
+    def force_in_q(x: Array) -> Array:
+        return system.force(t, x, v)
 
-    def force_in_v(e: float) -> Array:
-        return _by_columns(lambda shift: system.force(t, q, v + shift), n, e * size)
+    def force_in_v(x: Array) -> Array:
+        return system.force(t, q, x)
 
-    level = ROUNDING * max(float(np.abs(force).max()), 1e-300) / size
-    _compare(system, "force_by_q", t, system.force_by_q(t, q, v), force_in_q, level)
-    _compare(system, "force_by_v", t, system.force_by_v(t, q, v), force_in_v, level)
-    if system.functions.flags[REACTION_BY_Q_GIVEN] == 0:
-        return
+    wrong = _wrong_column(system, "force_by_q", t, q, force_in_q, lambda x: system.force_by_q(t, x, v))
+    if wrong is None and (system.functions.flags[FORCE_BY_V_GIVEN] == 1 or _varies(force_in_v, v)):
+        wrong = _wrong_column(system, "force_by_v", t, v, force_in_v, lambda x: system.force_by_v(t, q, x))
+    if wrong is not None or system.functions.flags[REACTION_BY_Q_GIVEN] == 0:
+        return wrong
     lam = np.linspace(1.0, 2.0, system.n_c)
 
-    def reaction_in_q(e: float) -> Array:
-        return _by_columns(lambda shift: lam @ system.jacobian(t, q + shift), n, e * size)
+    def reaction_in_q(x: Array) -> Array:
+        return lam @ system.jacobian(t, x)
 
-    level = ROUNDING * max(float(np.abs(lam @ system.jacobian(t, q)).max()), 1e-300) / size
-    _compare(system, "reaction_by_q", t, system.reaction_by_q(t, q, lam), reaction_in_q, level)
-
-
-def _by_columns(function: Callable[[Array], Array], n: int, shift: float) -> Array:
-    """Central differences of a vector, a column for each displaced coordinate."""
-    shifts = shift * np.eye(n)
-    return np.column_stack([(function(each) - function(-each)) / (2.0 * shift) for each in shifts])
+    return _wrong_column(system, "reaction_by_q", t, q, reaction_in_q, lambda x: system.reaction_by_q(t, x, lam))
 
 
-def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array, v: Array, shift: float) -> None:
+def _defined(function: Callable[[], Array]) -> Array | None:
+    """What a callback gives away from the state, or None: there it may be outside what it is made for."""
+    try:
+        value = function()
+    except Exception:
+        return None
+    return value if np.isfinite(value).all() else None
+
+
+def _varies(function: Callable[[Array], Array], x: Array) -> bool:
+    """Whether a function changes along one direction, which is cheaper to see than by all columns."""
+    values = [_defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
+    known = [value for value in values if value is not None]
+    return any(bool((value != known[0]).any()) for value in known)
+
+
+def _wrong_column(
+    system: ConstrainedSystem,
+    kind: str,
+    t: float,
+    x: Array,
+    function: Callable[[Array], Array],
+    derivative: Callable[[Array], Array],
+) -> str | None:
+    """Displace one coordinate (or velocity) after another and compare the columns of a matrix."""
+    given = _defined(lambda: derivative(x))
+    if given is None:
+        return None
+    noise = EPS * (np.abs(given) @ np.abs(x))
+    largest = np.abs(given).max(axis=1)
+    rounding = _rounding(derivative, given, x)
+    scales = sizes(x)
+    for j in range(len(x)):
+        unit = np.zeros(len(x))
+        unit[j] = 1.0
+
+        def displaced(shift: float, unit: Array = unit) -> Array:
+            return function(x + shift * unit)
+
+        column = _Comparison(system, kind, t, displaced, float(x[j]), given[:, j], j)
+        wrong = column.wrong(float(scales[j]), noise, largest, rounding[:, j], ANYWHERE)
+        if wrong is not None:
+            return wrong
+    return None
+
+
+def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> Array:
+    """What rounding of the arguments does to the values given."""
+    largest = EPS * np.abs(given)
+    for signs in np.random.default_rng(2).choice((-2.0, 2.0), (3, len(x))):
+        try:
+            moved = np.abs(derivative(x * (1.0 + EPS * signs)) - given)
+        except Exception:  # the place is the edge of what the callbacks are made for
+            continue
+        largest = np.fmax(largest, moved)
+    return largest
+
+
+def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
+    """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
+    generic = np.random.default_rng(1)
+    v = column_scales(jacobian, sizes(q)) * generic.uniform(0.5, 1.5, len(q)) * generic.choice((-1.0, 1.0), len(q))
+    v = v / float(np.median(np.abs(v) / sizes(q)))
+    driven, moved = rate != 0.0, np.abs(jacobian) @ np.abs(v)
+    if not (driven & (moved > 0.0)).any():
+        return [v]
+    faster = float(np.median(np.abs(rate[driven & (moved > 0.0)]) / moved[driven & (moved > 0.0)]))
+    return [v, faster * v]
+
+
+def _time_scale(q: Array, v: Array) -> float:
+    """Time in which no coordinate moves by more than its size, s."""
+    return float((sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
+
+
+def _spacing(t: float, q: Array, v: Array) -> float:
+    """Time from which on a straight motion moves every coordinate by more than rounding, s."""
+    return max(float(np.spacing(abs(t))), float((np.spacing(np.abs(q)) / np.maximum(np.abs(v), 1e-300)).max()))
+
+
+def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
+    """C along a straight motion."""
+    return lambda s: system.constraint(t + s, q + s * v)
+
+
+def _bent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
+    """C_q v + C_t along a straight motion."""
+    return lambda s: system.velocity_constraint(t + s, q + s * v, v)
+
+
+def _minus(function: Function) -> Function:
+    return lambda s: -function(s)
+
+
+def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
+    if not system.constant_mass:
+        return
+    shift = 0.1 * sizes(q) * np.random.default_rng(1).choice((-1.0, 1.0), system.n_q)
+    there = _defined(lambda: system.mass(t + 1.0, q + shift))
+    if there is not None and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
+        raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+
+
+def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
     """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
     places = np.arange(system.n_q)
     farthest, where = bandwidth, ""
+    size = float(np.abs(q).max()) or 1.0
+    generic = np.random.default_rng(1)
+    v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    q, shift = q + 1e-3 * v, 1e-3 * size
 
     def look(what: str, j: int, column: Array, level: float) -> None:
         nonlocal farthest, where
@@ -128,58 +335,3 @@ def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arr
             f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "
             "coordinates otherwise, or leave bandwidth out"
         )
-
-
-def _forward(values: list[Array], e: float) -> Array:
-    return (-3.0 * values[0] + 4.0 * values[1] - values[2]) / (2.0 * e)
-
-
-def _compare(
-    system: ConstrainedSystem, kind: str, t: float, given: Array, difference: Callable[[float], Array], level: float
-) -> None:
-    if not np.isfinite(given).all():  # outside what it is made for; at a state of the run consistency.py names it
-        return
-    least = np.inf
-    for e in DISPLACEMENTS:
-        try:
-            differenced = difference(e)
-        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
-            continue
-        if not np.isfinite(differenced).all():
-            continue
-        both = np.maximum(np.abs(given), np.abs(differenced))
-        row = both.max(axis=-1, keepdims=True) if given.ndim == 2 else both
-        excess = np.abs(given - differenced) / (AGREEMENT * row + level / e)
-        if excess.max() <= 1.0:
-            return
-        if excess.max() < least:
-            least = float(excess.max())
-            where = tuple(int(k) for k in np.unravel_index(int(excess.argmax()), excess.shape))
-            values = float(given[where]), float(differenced[where])
-    if np.isinf(least):
-        return
-    entry = where if len(where) > 1 else where[0]
-    what = {
-        "jacobian": "the derivative of constraint with respect to q",
-        "constraint_rate": "the derivative of constraint with respect to t",
-        "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right side of C_q a = gamma",
-        "force_by_q": "the derivative of force with respect to q",
-        "force_by_v": "the derivative of force with respect to v",
-        "reaction_by_q": "the derivative of C_q^T lam with respect to q",
-    }[kind]
-    hint = {
-        "constraint_rate": ", or give constraint_rate: the constraints depend on time",
-        "gamma": ", or leave gamma out to have it differenced",
-        "force_by_q": ", or leave all tangents out to have the force differenced",
-        "reaction_by_q": ", or leave reaction_by_q out to have it differenced",
-    }.get(kind, "")
-    if kind == "force_by_v" and system.functions.flags[FORCE_BY_V_GIVEN] == 0:
-        hint = ", that is, give force_by_v: beside force_by_q the force may depend on v only with it"
-    raise ValueError(
-        f"{kind} of {system.name!r} is not {what}: entry {entry} is {values[0]:.6g}, by differences it is "
-        f"{values[1]:.6g} (t = {t:g}, near the start, velocities chosen at random). Mend its formula{hint}"
-    )
-
-
-def wrong_derivative(system, t, q, v):
-    return None

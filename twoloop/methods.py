@@ -6,12 +6,13 @@ from typing import Literal
 import numpy as np
 
 from twoloop.bdf import BDF
-from twoloop.checks import check_number
+from twoloop.checks import check_choice, check_number, shown
 from twoloop.dop853 import DOP853
 from twoloop.plan import INNER_TOL, LEAST_ERROR, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
+ILL_CONDITIONED = 1e8  # eigenvectors of A, as in kernels/newton.py; one over it: an eigenvalue that counts as zero
 NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
 NEWMARK_OUTER_SHARE = 1e-3  # of err_out; Newmark sweeps converge so fast that this costs next to nothing
 
@@ -74,23 +75,26 @@ class RungeKutta:
 
     def __post_init__(self) -> None:
         if not isinstance(self.tableau, Tableau):
-            raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {self.tableau!r}")
+            raise TypeError(f"tableau must be a twoloop.tableaux.Tableau, e.g. gauss(3); given {shown(self.tableau)}")
         if np.diff(np.sort(self.tableau.c)).min(initial=1.0) < 1e-10:
             raise ValueError(f"tableau must have distinct nodes; those of {self.tableau.name} are {self.tableau.c}")
-        if self.outer not in ("auto", "fixed-point", "newton", "paper"):
-            raise ValueError(f"outer must be 'auto', 'fixed-point', 'newton' or 'paper'; given {self.outer!r}")
-        if self.variables not in ("velocities", "momenta"):
-            raise ValueError(f"variables must be 'velocities' or 'momenta'; given {self.variables!r}")
-        if self.partition not in ("lasting", "symmetric"):
-            raise ValueError(f"partition must be 'lasting' or 'symmetric'; given {self.partition!r}")
+        check_choice("outer", self.outer, ("auto", "fixed-point", "newton", "paper"))
+        check_choice("variables", self.variables, ("velocities", "momenta"))
+        check_choice("partition", self.partition, ("lasting", "symmetric"))
+        check_choice("error", self.error, ("richardson", "richardson-paper"))
         if self.outer != "fixed-point" and self.variables != "velocities":
             raise ValueError(f"outer={self.outer!r} goes with variables='velocities' only; given {self.variables!r}")
         if self.outer == "paper" and self.partition != "lasting":
             raise ValueError(
                 f"outer='paper' is the paper's procedure, which has partition='lasting'; given {self.partition!r}"
             )
-        if self.error not in ("richardson", "richardson-paper"):
-            raise ValueError(f"error must be 'richardson' or 'richardson-paper'; given {self.error!r}")
+        if self.outer in ("auto", "newton"):
+            values, vectors = np.linalg.eig(self.tableau.A)
+            if np.linalg.cond(vectors) > ILL_CONDITIONED or np.abs(values).min() < 1.0 / ILL_CONDITIONED:
+                raise ValueError(
+                    f"tableau must have an invertible A with a basis of eigenvectors for outer={self.outer!r}; that of "
+                    f"{self.tableau.name} has not. Take outer='fixed-point'"
+                )
         check_tolerances(self, "inner_tol", "outer_tol")
 
     @property

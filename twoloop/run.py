@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.consistency import _NOTHING_FOUND, dependent_rows, not_finite
+from twoloop.consistency import dependent_rows, not_finite
 from twoloop.derivatives import wrong_derivative
 from twoloop.kernels import common
 from twoloop.kernels.banded import banded_pays
@@ -338,7 +338,7 @@ class Run:
         end = t + float(self.clock[self.a.H_FAILED])
         for instant in (t, end):
             found = not_finite(self.system, instant, q, v)
-            if found != _NOTHING_FOUND:
+            if found is not None:
                 return f"{found} at t = {instant:.10g}"
         return (
             "the state became larger than floating-point numbers can be, or a callback returned a value that is not "

@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks import check_positive, check_size, check_span, check_times, check_tolerance, check_vector
-from twoloop.consistency import check_start
+from twoloop.checks import (
+    check_flag,
+    check_positive,
+    check_size,
+    check_span,
+    check_times,
+    check_tolerance,
+    check_vector,
+    shown,
+)
+from twoloop.consistency import check_start, check_system
 from twoloop.methods import PRESETS
 from twoloop.plan import Method
 from twoloop.result import Result
@@ -101,12 +110,14 @@ def solve_dae(
     NotImplementedError
         If `dense_output` or `events` is asked for.
     """
-    if dense_output:
+    check_system(system)
+    if check_flag("dense_output", dense_output):
         raise NotImplementedError("dense_output is not available yet; use t_eval to get the solution at given times")
     if events is not None:
         raise NotImplementedError("events are not available yet; search the stored solution (t_eval) instead")
-    if not isinstance(system, ConstrainedSystem):
-        raise TypeError(f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r}")
+    if progress is not None:
+        check_flag("progress", progress)
+    check_flag("check_derivatives", check_derivatives)
     method = _check_method(method)
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
@@ -132,7 +143,7 @@ def solve_dae(
     if time_limit is not None:
         check_positive("time_limit", time_limit)
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
-    check_start(system, t0, q0, v0, check_derivatives)
+    check_start(system, t0, q0, v0, derivatives=check_derivatives)
 
     plan = method.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
     run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size)
@@ -148,10 +159,12 @@ def _check_method(method: str | Method) -> Method:
     known = ", ".join(PRESETS)
     if isinstance(method, str):
         if method not in PRESETS:
-            raise ValueError(f"method must be one of {known}, or a method object; given {method!r}")
+            raise ValueError(f"method must be one of {known}, or a method object; given {shown(method)}")
         return PRESETS[method]
     if isinstance(method, type) or not callable(getattr(method, "plan", None)):
-        raise TypeError(f"method must be a name ({known}) or an object such as RungeKutta(gauss(3)); given {method!r}")
+        raise TypeError(
+            f"method must be a name ({known}) or an object such as RungeKutta(gauss(3)); given {shown(method)}"
+        )
     return method
 
 

@@ -11,12 +11,17 @@ import numpy as np
 from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
+from twoloop.checks import check_real, check_size, check_text, check_vector, shown
+
 Array = NDArray[np.float64]
+
+CONSISTENT = 1e-12  # of a sum of coefficients
+MOST_STAGES = 100  # a step of as many stages is longer than any motion is smooth
 
 
 @dataclass(frozen=True, eq=False)
 class Tableau:
-    """Coefficients of an implicit Runge-Kutta method.
+    """Coefficients of a Runge-Kutta method, checked when they are put together.
 
     Attributes
     ----------
@@ -26,7 +31,12 @@ class Tableau:
     b, c : ndarray (s,)
         Weights and nodes; c = A 1, so that time-dependent problems are integrated consistently.
     order : int
-        Classical order.
+        Classical order; step-size control relies on it, and it is not checked beyond b summing to 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If shapes do not fit, a coefficient is not finite, b does not sum to 1, or c is not A 1.
     """
 
     name: str
@@ -34,6 +44,32 @@ class Tableau:
     b: Array
     c: Array
     order: int
+
+    def __post_init__(self) -> None:
+        check_text("name", self.name)
+        b = check_real("b", self.b)
+        if b.ndim != 1 or b.size == 0:
+            raise ValueError(f"b must be a vector with one weight for each stage; given shape {b.shape}")
+        s = b.size
+        A = check_real("A", self.A)
+        if A.shape != (s, s):
+            raise ValueError(f"A must have shape ({s}, {s}), as b has {s} entries; given shape {A.shape}")
+        if not np.isfinite(A).all():
+            raise ValueError("A must be finite")
+        check_vector("b", b, s)
+        c = check_vector("c", self.c, s)
+        check_size("order", self.order, 1)
+        if abs(b.sum() - 1.0) > CONSISTENT * np.abs(b).sum():
+            raise ValueError(f"b must sum to 1; the sum of {b.tolist()} is {float(b.sum())!r}")
+        off = np.abs(A.sum(axis=1) - c)
+        if (off > CONSISTENT * np.maximum(np.abs(A).sum(axis=1), 1.0)).any():
+            i = int(off.argmax())
+            raise ValueError(
+                f"c must be the row sums of A, so that time is integrated as the state is; row {i} of A sums to "
+                f"{float(A[i].sum())!r}, and c[{i}] is {float(c[i])!r}"
+            )
+        for name, array in (("A", A), ("b", b), ("c", c)):
+            object.__setattr__(self, name, array)
 
     @property
     def stages(self) -> int:
@@ -77,6 +113,8 @@ def _check_stages(s: int, least: int, family: str) -> None:
         raise TypeError(f"s must be an int, the number of stages of {family}; given {s!r} of type {type(s).__name__}")
     if s < least:
         raise ValueError(f"s must be at least {least} for {family}; given {s}")
+    if s > MOST_STAGES:
+        raise ValueError(f"s must be at most {MOST_STAGES} for {family}; given {shown(s)}")
 
 
 def gauss(s: int) -> Tableau:

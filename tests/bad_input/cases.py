@@ -1,0 +1,10 @@
+"""What users get wrong, all of it: the tests run it, and docs/errors.md is written from it."""
+
+from tests.bad_input.mechanisms import MECHANISMS
+from tests.bad_input.methods import METHODS
+from tests.bad_input.projection import PROJECTION
+from tests.bad_input.solving import SOLVE
+from tests.bad_input.start import START
+from tests.bad_input.systems import SYSTEMS
+
+CASES = [*SOLVE, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS]

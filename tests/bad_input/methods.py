@@ -1,0 +1,166 @@
+"""Wrong options of methods and tableaux."""
+
+import numpy as np
+
+from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, Case, argument
+from twoloop import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark
+from twoloop.tableaux import Tableau, gauss, lobatto_iiie, radau_iia, sun_radau_iib
+
+
+def runge_kutta(tableau=None, **options):
+    return RungeKutta(gauss(2) if tableau is None else tableau, **options)
+
+
+EXPLICIT = Tableau("Heun", [[0.0, 0.0], [1.0, 0.0]], [0.5, 0.5], [0.0, 1.0], 2)
+DOUBLE = Tableau("double", [[0.25, 0.25], [0.25, 0.25]], [0.5, 0.5], [0.5, 0.5], 2)
+
+
+def tableau(**changed):
+    right = {"name": "midpoint", "A": [[0.5]], "b": [1.0], "c": [0.5], "order": 2}
+    return Tableau(**{**right, **changed})
+
+
+STAGES = "give the number of stages, an int"
+UNIT = "give a number from 0 to 1"
+METHODS = [
+    *argument(
+        "RungeKutta",
+        lambda tableau: RungeKutta(tableau),
+        "tableau",
+        [
+            (None, TypeError, r"must be a twoloop.tableaux.Tableau.*given None", "give gauss(3), say"),
+            ("Gauss6", TypeError, "must be a twoloop.tableaux.Tableau.*given 'Gauss6'", "give gauss(3), say"),
+            (DOUBLE, ValueError, "must have distinct nodes", "take another tableau"),
+        ],
+    ),
+    Case(
+        "RungeKutta",
+        "an explicit tableau with `outer='newton'`",
+        lambda: RungeKutta(EXPLICIT, outer="newton"),
+        ValueError,
+        "tableau must have an invertible A.*Heun.*fixed-point",
+        "take outer='fixed-point'",
+    ),
+    *argument(
+        "RungeKutta",
+        runge_kutta,
+        "outer",
+        [
+            ("n", ValueError, "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'", "take one of these"),
+            (None, TypeError, "must be .*given None", "leave it out"),
+        ],
+    ),
+    *argument("RungeKutta", runge_kutta, "error", [("none", ValueError, "must be 'richardson'", "take one of these")]),
+    *argument("RungeKutta", runge_kutta, "variables", [("q", ValueError, "must be 'velocities'", "take one of these")]),
+    *argument("RungeKutta", runge_kutta, "partition", [(1, TypeError, "must be 'lasting'", "take one of these")]),
+    *argument("RungeKutta", runge_kutta, "inner_tol", FEW_POSITIVES),
+    *argument("RungeKutta", runge_kutta, "outer_tol", [*FEW_POSITIVES, INFINITE]),
+    Case(
+        "RungeKutta",
+        "`outer='newton', variables='momenta'`",
+        lambda: runge_kutta(outer="newton", variables="momenta"),
+        ValueError,
+        "outer='newton' goes with variables='velocities' only",
+        "take outer='fixed-point' for momenta",
+    ),
+    Case(
+        "RungeKutta",
+        "`outer='paper', partition='symmetric'`",
+        lambda: runge_kutta(outer="paper", partition="symmetric"),
+        ValueError,
+        "outer='paper' is the paper's procedure",
+        "take outer='fixed-point' for symmetric partitions",
+    ),
+    *argument(
+        "Newmark",
+        Newmark,
+        "beta",
+        [
+            (2.0, ValueError, "must be between 0 and 1; given 2.0", UNIT),
+            (np.nan, ValueError, "must be between 0 and 1; given nan", UNIT),
+            ("1/4", TypeError, "must be a number; given '1/4'", UNIT),
+            (True, TypeError, "must be a number; given True", UNIT),
+            (HUGE, ValueError, "must fit into a float", UNIT),
+        ],
+    ),
+    *argument("Newmark", Newmark, "gamma", [(-0.5, ValueError, "must be between 0 and 1; given -0.5", UNIT)]),
+    *argument("Newmark", Newmark, "error_tol", FEW_POSITIVES),
+    *argument(
+        "BDF",
+        BDF,
+        "max_order",
+        [
+            (0, ValueError, "must be at least 1; given 0", "give 1 to 5"),
+            (6, ValueError, "must be at most 5; given 6", "give 1 to 5"),
+            (2.0, TypeError, "must be an int; given 2.0", "give 1 to 5"),
+            (True, TypeError, "must be an int; given True", "give 1 to 5"),
+            ("5", TypeError, "must be an int; given '5'", "give 1 to 5"),
+        ],
+    ),
+    *argument("BDF", BDF, "outer_tol", FEW_POSITIVES[:2]),
+    *argument("DOP853", DOP853, "inner_tol", FEW_POSITIVES),
+    *argument("paper_irk", paper_irk, "inner_tol", FEW_POSITIVES[:2]),
+    *argument("paper_newmark", paper_newmark, "beta", [(2.0, ValueError, "must be between 0 and 1", UNIT)]),
+    *(
+        case
+        for family in (gauss, radau_iia, sun_radau_iib)
+        for case in argument(
+            family.__name__,
+            family,
+            "s",
+            [
+                (0, ValueError, "must be at least 1", STAGES),
+                (2.0, TypeError, "must be an int", STAGES),
+            ],
+        )
+    ),
+    *argument("gauss", gauss, "s", [(True, TypeError, "must be an int", STAGES), ("3", TypeError, "must be", STAGES)]),
+    *argument("gauss", gauss, "s", [(HUGE, ValueError, "must be at most 100", "give a moderate number")]),
+    *argument("lobatto_iiie", lobatto_iiie, "s", [(1, ValueError, "must be at least 2", STAGES)]),
+    *argument(
+        "Tableau",
+        tableau,
+        "name",
+        [(3, TypeError, "must be a string; given 3", "give a string")],
+    ),
+    *argument(
+        "Tableau",
+        tableau,
+        "A",
+        [
+            ([[0.5, 0.0]], ValueError, r"must have shape \(1, 1\).*given shape \(1, 2\)", "give s rows and columns"),
+            (0.5, ValueError, r"must have shape \(1, 1\)", "give s rows and columns"),
+            ([[np.nan]], ValueError, "must be finite", "give finite coefficients"),
+            ([["1/2"]], TypeError, "must be an array of real numbers", "give numbers"),
+            ([[True]], TypeError, "must be an array of real numbers", "give numbers"),
+        ],
+    ),
+    *argument(
+        "Tableau",
+        tableau,
+        "b",
+        [
+            ([], ValueError, "must be a vector with one weight for each stage", "give s weights"),
+            ([0.9], ValueError, "must sum to 1; the sum of .* is 0.9", "give weights that sum to 1"),
+            ([np.inf], ValueError, "must be finite", "give finite coefficients"),
+        ],
+    ),
+    *argument(
+        "Tableau",
+        tableau,
+        "c",
+        [
+            ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"),
+            ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A 1"),
+        ],
+    ),
+    *argument(
+        "Tableau",
+        tableau,
+        "order",
+        [
+            (0, ValueError, "must be at least 1; given 0", "give the classical order"),
+            (2.5, TypeError, "must be an int; given 2.5", "give the classical order"),
+        ],
+    ),
+]

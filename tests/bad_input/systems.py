@@ -1,0 +1,187 @@
+"""Systems and callbacks that make no sense."""
+
+import numpy as np
+
+from tests.bad_input.case import HUGE, Case, argument, linkage
+from twoloop import ConstrainedSystem, callback
+
+
+def make(**changed):
+    arguments = {
+        "n_q": 2,
+        "n_c": 1,
+        "mass": np.eye(2),
+        "force": lambda t, q, v: np.zeros(2),
+        "constraint": lambda t, q: q[:1],
+        "jacobian": lambda t, q: np.eye(2)[:1],
+    }
+    return ConstrainedSystem.from_python(**{**arguments, **changed})
+
+
+def compiled(**changed):
+    functions = linkage().system.functions
+    arguments = {kind: getattr(functions, kind) for kind in ("mass", "force", "constraint", "jacobian", "gamma")}
+    return ConstrainedSystem(**{"n_q": 9, "n_c": 8, "parameters": [1.0, 2.0, 1.5, 3.0], **arguments, **changed})
+
+
+COUNT = "give the number of coordinates, an int"
+SYSTEMS = [
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "n_q",
+        [
+            (0, ValueError, "must be at least 1; given 0", COUNT),
+            (-2, ValueError, "must be at least 1; given -2", COUNT),
+            (2.0, TypeError, "must be an int; given 2.0", COUNT),
+            ("2", TypeError, "must be an int; given '2'", COUNT),
+            (True, TypeError, "must be an int; given True", COUNT),
+            (None, TypeError, "must be an int; given None", COUNT),
+            (HUGE, ValueError, "must fit into 64 bits", COUNT),
+        ],
+    ),
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "n_c",
+        [
+            (-1, ValueError, "must be at least", "give the number of constraints"),
+            (True, TypeError, "must be an int; given True", "give the number of constraints"),
+            (3, ValueError, "must not exceed n_q = 2; given 3", "leave redundant constraints out"),
+        ],
+    ),
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "mass",
+        [
+            (np.eye(3), ValueError, r"must have shape \(2, 2\); given .*shape \(3, 3\)", "give an (n_q, n_q) array"),
+            ("heavy", TypeError, "must be an array of real numbers", "give an (n_q, n_q) array or a function"),
+            ([[1.0, 0.0], [1.0]], TypeError, "must be an array of real numbers", "give an (n_q, n_q) array"),
+            (np.eye(2, dtype=bool), TypeError, "must be an array of real numbers", "write 1.0 and 0.0"),
+            (np.eye(2, dtype=complex), TypeError, "must be an array of real numbers", "give real numbers"),
+            (1.0, ValueError, r"must have shape \(2, 2\)", "write 1.0 * np.eye(2)"),
+        ],
+    ),
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "force",
+        [
+            (None, TypeError, "must be a function; given None", "give force(t, q, v)"),
+            ([0.0, -9.81], TypeError, "must be a function; given", "give force(t, q, v)"),
+        ],
+    ),
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "gamma",
+        [(0.0, TypeError, "must be a function; given 0.0", "give gamma(t, q, v), or leave it out")],
+    ),
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "constraint_rate",
+        [("linear", TypeError, "must be a function; given 'linear'", "give constraint_rate(t, q), or leave it out")],
+    ),
+    *argument(
+        "ConstrainedSystem.from_python",
+        make,
+        "bandwidth",
+        [
+            (-1, ValueError, "must be at least 0; given -1", "give an int of at least 0, or leave it out"),
+            (1.5, TypeError, "must be an int; given 1.5", "give an int of at least 0, or leave it out"),
+        ],
+    ),
+    Case(
+        "ConstrainedSystem.from_python",
+        "`force(t, v, q)`: arguments in another order",
+        lambda: make(force=lambda t, v, q: np.zeros(2)),
+        TypeError,
+        r"force is called as force\(t, q, v\); the function given takes \(t, v, q\)",
+        "put them in the order named",
+    ),
+    Case(
+        "ConstrainedSystem.from_python",
+        "`force_by_v` without `force_by_q`",
+        lambda: make(force_by_v=lambda t, q, v: np.zeros((2, 2))),
+        ValueError,
+        "force_by_v.* go with force_by_q",
+        "give force_by_q too",
+    ),
+    Case(
+        "ConstrainedSystem.from_python",
+        "`bandwidth` with a mass that is a function",
+        lambda: make(bandwidth=1, mass=lambda t, q: np.eye(2)),
+        ValueError,
+        "bandwidth needs a constant mass",
+        "give the mass as an array",
+    ),
+    *argument(
+        "ConstrainedSystem",
+        compiled,
+        "parameters",
+        [
+            (["long"], TypeError, "must be an array of real numbers", "give a vector of numbers"),
+            ([[1.0, 2.0]], ValueError, "must be a vector of finite numbers", "give a vector of numbers"),
+            ([1.0, np.nan, 1.5, 3.0], ValueError, "must be a vector of finite numbers", "give finite numbers"),
+            ([True, 2.0, 1.5, 3.0], TypeError, "must be an array of real numbers", "give a vector of numbers"),
+            ([HUGE, 2.0, 1.5, 3.0], ValueError, "must hold numbers that fit into a float", "give finite numbers"),
+        ],
+    ),
+    *argument(
+        "ConstrainedSystem",
+        compiled,
+        "constant_mass",
+        [
+            ("yes", TypeError, "must be True or False; given 'yes'", "give True or False"),
+            (1, TypeError, "must be True or False; given 1", "give True or False"),
+        ],
+    ),
+    *argument(
+        "ConstrainedSystem",
+        compiled,
+        "bandwidth",
+        [(2, ValueError, "needs a constant mass matrix", "give constant_mass=True where that is so")],
+    ),
+    Case(
+        "ConstrainedSystem",
+        "a plain function as `force`",
+        lambda: compiled(force=lambda t, q, v, p, Q: None),
+        TypeError,
+        r"force must be compiled by @twoloop.callback\('force'\).*from_python",
+        "decorate it with @callback, or use from_python",
+    ),
+    Case(
+        "ConstrainedSystem",
+        "the callback of another kind as `force`",
+        lambda: compiled(force=linkage().system.functions.constraint),
+        TypeError,
+        r"force must be compiled by @twoloop.callback\('force'\)",
+        "give the callback made for this kind",
+    ),
+    Case(
+        "callback",
+        '`@callback("friction")`',
+        lambda: callback("friction"),
+        ValueError,
+        "kind must be one of mass.*given 'friction'",
+        "take one of the kinds named",
+    ),
+    Case(
+        "callback",
+        "`@callback` without a kind",
+        lambda: callback(lambda t, q, v, p, Q: None),
+        TypeError,
+        "the decorator needs the kind of callback",
+        'write @callback("force")',
+    ),
+    Case(
+        "callback",
+        "a force with the arguments `(t, q, Q)`",
+        lambda: callback("force")(lambda t, q, Q: None),
+        TypeError,
+        r"declared as the callback 'force', whose arguments are \(t, q, v, p, Q\); it has \(t, q, Q\)",
+        "take the arguments named",
+    ),
+]

@@ -1,0 +1,265 @@
+"""Every single error planted into derivatives is found, and no correct system is refused, at any scale."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests import problems
+from tests.derivative_cases import UNITS, Case, lever, linkage, shaken_pendulum, slider_crank, sprung_rod
+from twoloop import ConstrainedSystem
+from twoloop.derivatives import check_derivatives, wrong_derivative
+from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
+
+CHANGES = {
+    "sign": lambda x: -x,
+    "1e-6": lambda x: 1.000001 * x,
+    "1e-3": lambda x: 1.001 * x,
+    "1e-2": lambda x: 1.01 * x,
+    "twice": lambda x: 2.0 * x,
+    "dropped": lambda x: 0.0,
+}
+# entries that are not zero: of the linkage's C_q, which has many, one in each kind of place
+ENTRIES = {
+    slider_crank: {"jacobian": [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1)], "gamma": [0, 1]},
+    shaken_pendulum: {"jacobian": [(0, 0), (0, 1)], "constraint_rate": [0], "gamma": [0]},
+    linkage: {"jacobian": [(0, 0), (2, 2), (4, 2), (6, 8), (7, 5)], "gamma": [0, 5, 7]},
+    sprung_rod: {
+        "jacobian": [(0, 0), (0, 1)],
+        "gamma": [0],
+        "force_by_q": [(0, 0), (1, 0), (1, 1)],
+        "force_by_v": [(0, 0), (1, 1)],
+        "reaction_by_q": [(0, 1), (1, 1)],
+    },
+}
+MIXED = {
+    "lever": (lambda: lever(1e-6, 1e3), {"jacobian": [(0, 2), (1, 2), (2, 0), (2, 1), (2, 3)], "gamma": [0, 1, 2]}),
+    "far": (lambda: slider_crank(1.0, offset=3e5), {"jacobian": [(0, 0), (0, 2), (1, 1)], "gamma": [0, 1]}),
+    "fast": (
+        lambda: shaken_pendulum(1.0, omega=1e6, amplitude=1e-4),
+        {"jacobian": [(0, 0), (0, 1)], "constraint_rate": [0], "gamma": [0]},
+    ),
+}
+
+
+def planted():
+    for make, kinds in ENTRIES.items():
+        for name, unit in UNITS.items():
+            yield pytest.param(make(unit), kinds, 1e-6, id=f"{make.__name__}, {name}")
+    for name, (make, kinds) in MIXED.items():
+        yield pytest.param(make(), kinds, 1e-3 if name == "far" else 1e-6, id=name)
+
+
+@pytest.mark.parametrize(("case", "kinds", "least"), list(planted()))
+def test_every_planted_error_is_found_and_named(case, kinds, least):
+    q = np.array(case.q)
+    check_derivatives(case.system(), case.t, q)
+    for kind, entries in kinds.items():
+        for entry in entries:
+            for name, change in CHANGES.items():
+                if name == "1e-6" and least > 1e-6:
+                    continue  # 3e5 m away a step of 1 rad is known to no more digits
+                if name == "dropped" and kind == "constraint_rate":
+                    continue  # below: whether the rate or the drive is forgotten
+                with pytest.raises(ValueError, match=f"^{kind} of ") as caught:
+                    check_derivatives(case.planted(kind, entry, change), case.t, q)
+                shown = entry if isinstance(entry, int) else f"({entry[0]}, {entry[1]})"
+                assert f"entry {shown} is" in str(caught.value), (name, str(caught.value))
+
+
+def test_the_campaign_is_large():
+    n = sum(len(kinds) * len(CHANGES) for *_, kinds, _ in (param.values for param in planted()))
+    assert n >= 60
+
+
+@pytest.mark.parametrize("unit", UNITS.values())
+def test_a_forgotten_rate_is_found(unit):
+    case = shaken_pendulum(unit)
+    with pytest.raises(ValueError, match=r"^constraint_rate of .*entry 0 is"):
+        check_derivatives(case.planted("constraint_rate", 0, lambda x: 0.0), case.t, np.array(case.q))
+
+
+@pytest.mark.parametrize("unit", UNITS.values())
+def test_entries_in_each_others_place_are_found(unit):
+    case = slider_crank(unit)
+    right = case.functions["jacobian"]
+    for swapped in (lambda t, q: right(t, q)[::-1], lambda t, q: right(t, q)[:, [1, 0, 2]]):
+        with pytest.raises(ValueError, match=r"^jacobian of"):
+            check_derivatives(case.system(jacobian=swapped), 0.0, np.array(case.q))
+    gamma = case.functions["gamma"]
+    with pytest.raises(ValueError, match=r"^gamma of"):
+        check_derivatives(case.system(gamma=lambda t, q, v: gamma(t, q, v)[::-1]), 0.0, np.array(case.q))
+    # one term of a sum: the rod's part
+    with pytest.raises(ValueError, match=r"^gamma of"):
+        check_derivatives(case.system(gamma=lambda t, q, v: gamma(t, q, v * [1.0, 0.0, 1.0])), 0.0, np.array(case.q))
+
+
+# --- formulas that hold near the start only
+
+
+@pytest.mark.parametrize("unit", UNITS.values())
+@pytest.mark.parametrize("kind", ["jacobian", "gamma"])
+def test_terms_that_vanish_at_the_start_are_found_later(unit, kind):
+    r, l = unit, 2.7 * unit
+
+    def constraint(t, q):
+        return np.array([r * math.cos(q[0]) + l * math.cos(q[1]) - q[2], r * math.sin(q[0]) + l * math.sin(q[1])])
+
+    def jacobian(t, q, right=1.0):
+        top = [-right * r * math.sin(q[0]), -l * math.sin(q[1]), -1.0]
+        return np.array([top, [r * math.cos(q[0]), l * math.cos(q[1]), 0.0]])
+
+    def gamma(t, q, v, right=1.0):
+        c, s = r * v[0] ** 2, l * v[1] ** 2
+        below = right * c * math.sin(q[0]) + s * math.sin(q[1])
+        return np.array([c * math.cos(q[0]) + s * math.cos(q[1]), below])
+
+    functions = {"constraint": constraint, "jacobian": jacobian, "gamma": gamma}
+    right = Case("right", 3, functions, [0.0, 0.0, r + l])
+    if kind == "gamma":  # a sign that does not show where sin(q_0) = 0
+        wrong = right.system(gamma=lambda t, q, v: gamma(t, q, v, -1.0))
+    else:  # with its gamma differenced
+        wrong = right.system(jacobian=lambda t, q: jacobian(t, q, -1.0), gamma=None)
+    start = np.array(right.q)
+    if kind == "jacobian":
+        check_derivatives(wrong, 0.0, start)
+    crank = 0.4
+    rod = -math.asin(r * math.sin(crank) / l)
+    later = np.array([crank, rod, r * math.cos(crank) + l * math.cos(rod)])
+    v = np.array([3.0, -1.0, -unit])
+    assert wrong_derivative(right.system(), 1.0, later, v) is None
+    assert wrong_derivative(wrong, 1.0, later, v).startswith(f"{kind} of 'right' is not")
+
+
+def test_a_check_along_a_run_is_cheap():
+    calls = dict.fromkeys(("constraint", "jacobian", "constraint_rate", "gamma"), 0)
+    case = shaken_pendulum(1.0)
+
+    def counted(kind):
+        def function(*arguments):
+            calls[kind] += 1
+            return case.functions[kind](*arguments)
+
+        return function
+
+    system = case.system(**{kind: counted(kind) for kind in calls})
+    calls.update(dict.fromkeys(calls, 0))
+    assert wrong_derivative(system, 0.0, np.array(case.q), np.ones(2)) is None
+    assert calls == {"constraint": 9, "jacobian": 10, "constraint_rate": 10, "gamma": 1}
+
+
+# --- what is right is accepted
+
+
+def nasty(name, constraint, jacobian, q, t=0.0, **rest):
+    return Case(name, len(q), {"constraint": constraint, "jacobian": jacobian, **rest}, q, t)
+
+
+TABLE_T, TABLE_X = np.linspace(0.0, 1.0, 11), np.cos(np.linspace(0.0, 1.0, 11))
+AFTER_START = {"omega": 3.0, "only_after_start": True}
+CORRECT = [
+    *(make(unit) for make in ENTRIES for unit in UNITS.values()),
+    *(make() for make, _ in MIXED.values()),
+    lever(1e-3, 1.0),
+    slider_crank(1e-6, offset=1.0),
+    shaken_pendulum(1e-6, omega=1e6),
+    shaken_pendulum(1.0, omega=2e4, t=5.0),
+    shaken_pendulum(1.0, omega=1e6, amplitude=1e-4, t=100.0),
+    shaken_pendulum(1.0, offset=3e5),
+    shaken_pendulum(1.0, t=1.7e9),
+    shaken_pendulum(1e-3, omega=1e-6, t=1e6),
+    shaken_pendulum(1.0, **AFTER_START),
+    nasty("kink at the place", lambda t, q: [abs(q[0]) - q[1]], lambda t, q: [[np.sign(q[0]), -1.0]], [0.0, 0.0]),
+    *(
+        nasty(
+            f"kink {near:g} from the place",
+            lambda t, q: [q[1] - abs(q[0])],
+            lambda t, q: [[-np.sign(q[0]), 1.0]],
+            [near, near],
+        )
+        for near in (1e-1, 1e-4, 1e-8, 1e-12)
+    ),
+    nasty(
+        "clipped",
+        lambda t, q: [np.clip(q[0], -1.0, 1.0) - q[1]],
+        lambda t, q: [[float(abs(q[0]) < 1.0), -1.0]],
+        [1.0 - 1e-6, 1.0 - 1e-6],
+    ),
+    nasty(
+        "a dead zone",
+        lambda t, q: [max(0.0, q[0] - 0.5) - q[1]],
+        lambda t, q: [[float(q[0] > 0.5), -1.0]],
+        [0.4999, 0.0],
+    ),
+    nasty(
+        "a root near its end",
+        lambda t, q: [math.sqrt(1.0 - q[0] ** 2) - q[1]],
+        lambda t, q: [[-q[0] / math.sqrt(1.0 - q[0] ** 2), -1.0]],
+        [0.9999999, math.sqrt(1.0 - 0.9999999**2)],
+    ),
+    nasty(
+        "a root at its end", lambda t, q: [math.sqrt(q[0]) ** 3 - q[1]], lambda t, q: [[1.5 * math.sqrt(q[0]), -1.0]],
+        [0.0, 0.0],
+    ),
+    nasty(
+        "a table that ends at the start",
+        lambda t, q: [q[0] - np.interp(t, TABLE_T, TABLE_X)],
+        lambda t, q: [[1.0]],
+        [1.0],
+        constraint_rate=lambda t, q: [-(TABLE_X[1] - TABLE_X[0]) / 0.1],
+    ),
+    nasty(
+        "a sum of large numbers that cancel",
+        lambda t, q: [(q[0] + 1e8) - (q[1] + 1e8)],
+        lambda t, q: [[1.0, -1.0]],
+        [0.3, 0.3],
+    ),
+    nasty(
+        "a sine far out", lambda t, q: [q[0] + math.sin(q[0] + 3e5) - q[1]],
+        lambda t, q: [[1.0 + math.cos(q[0] + 3e5), -1.0]], [0.3, 0.3 + math.sin(3e5 + 0.3)],
+    ),
+    nasty(
+        "solved by iteration, to ten digits",
+        lambda t, q: [round(math.sin(q[0]), 10) - q[1]],
+        lambda t, q: [[math.cos(q[0]), -1.0]],
+        [0.3, math.sin(0.3)],
+    ),
+    nasty(
+        "nothing but zero at the start",
+        lambda t, q: [math.sin(q[0]) * q[1] + q[2]],
+        lambda t, q: [[math.cos(q[0]) * q[1], math.sin(q[0]), 1.0]],
+        [0.0, 0.0, 0.0],
+        gamma=lambda t, q, v: [math.sin(q[0]) * q[1] * v[0] ** 2 - 2.0 * math.cos(q[0]) * v[0] * v[1]],
+    ),
+]  # fmt: skip
+
+
+def ready():
+    for name, problem in {
+        "four-bar": four_bar(),
+        "collinear": four_bar((0.8, 1.2, 1.0), 2.0, 0.0, -1),
+        "flexible beam": very_flexible_beam(),
+        "stiff beam": moderately_stiff_beam(2, "beam"),
+    }.items():
+        yield pytest.param(problem.system, 0.0, problem.q0, problem.v0, id=name)
+    flat = np.array([0.5, 0.0, 0.0, 2.0, 0.0, 0.0, 2.5, 0.0, np.pi])  # C_q has a row of rounding errors there
+    yield pytest.param(four_bar((1.0, 2.0, 1.0), 2.0, theta3=2.0).system, 0.0, flat, np.zeros(9), id="without rank")
+    for t in (0.0, 5.0):
+        yield pytest.param(problems.moving_pivot(), t, *problems.moving_pivot_state(t), id=f"moving pivot at {t}")
+    yield pytest.param(problems.oblique_pendulum(), 0.0, *problems.oblique_start(), id="oblique")
+    state = problems.double_pendulum_state(np.array([0.5, 1.0]), np.array([1.0, 0.0]))
+    yield pytest.param(problems.double_pendulum(), 0.0, *state, id="double pendulum")
+    yield pytest.param(problems.pendulum(), 0.0, *problems.START, id="pendulum")
+    for case in CORRECT:
+        yield pytest.param(case.system(), case.t, case.q, np.ones(case.n_q), id=case.name)
+
+
+@pytest.mark.parametrize(("system", "t", "q", "v"), list(ready()))
+def test_correct_systems_are_accepted(system: ConstrainedSystem, t, q, v):
+    check_derivatives(system, t, np.array(q, dtype=float))
+    assert system.checked
+    assert wrong_derivative(system, t, np.array(q, dtype=float), np.array(v, dtype=float)) is None
+
+
+def test_there_are_many_correct_ones():
+    assert len(CORRECT) >= 30

@@ -1,0 +1,237 @@
+"""consistent_state: a guess put on the constraints, how far it moved, and on which assembly it is."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
+
+from twoloop.bounds import check_bounds
+from twoloop.checks import check_finite, check_indices, check_vector
+from twoloop.consistency import Violation, check_system, not_finite
+from twoloop.scales import scales_of
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+MAX_ITERATIONS = 50
+CONVERGED = 1e-2  # of what a start may be off
+SINGULAR = 1e-10  # smallest singular value of scaled columns that still count as independent
+DEAD_CENTRE = 0.05  # the same, below which a position is called near a dead centre
+
+
+class Move(NamedTuple):
+    """The largest change that the projection made."""
+
+    change: float
+    coordinate: int
+
+
+class ConsistentState(tuple[Array, Array]):
+    """What `consistent_state` returns: the tuple (q, v), with a report.
+
+    Attributes
+    ----------
+    moved_q, moved_v : Move
+        Largest change of a position and of a velocity, and of which coordinate: (change, coordinate).
+    dependent : tuple of int (rank,)
+        The columns of C_q that determine the rest best, in ascending order; none of those kept.
+    determinant_sign : int
+        Sign of the determinant of these columns of C_q, 0 where their rank is not full. Two positions with the same
+        values of the other coordinates and opposite signs are on different assemblies, with a dead centre between.
+    margin : float
+        Smallest over largest singular value of these columns, rows and columns scaled to like size: 0 at a dead centre.
+    """
+
+    moved_q: Move
+    moved_v: Move
+    dependent: tuple[int, ...]
+    determinant_sign: int
+    margin: float
+
+
+def consistent_state(
+    system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike, *, keep: Sequence[int] | None = None
+) -> ConsistentState:
+    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    t : float
+        Time, s.
+    q, v : array_like (n_q,)
+        Guess. Its distance to the constraints should be small against the mechanism.
+    keep : sequence of int, optional
+        Coordinates that stay as given, position and velocity: a crank and its speed, say. None: all may move.
+
+    Returns
+    -------
+    q, v : ndarray (n_q,)
+        With C(t, q) = 0 and C_q v + C_t = 0 to rounding, as a tuple that also says how far it moved (`moved_q`,
+        `moved_v`) and on which assembly it is (`determinant_sign`, `margin`); see `ConsistentState`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a shape is wrong, a value is not finite, `keep` leaves too little freedom, no consistent position is found
+        near the guess, or other guesses as far off would lead to another one: near a dead centre, as a rule.
+    """
+    check_system(system)
+    t = check_finite("t", t)
+    guess = check_vector("q", q, system.n_q)
+    speeds = check_vector("v", v, system.n_q)
+    kept = [] if keep is None else check_indices("keep", keep, system.n_q)
+    free = np.array([j for j in range(system.n_q) if j not in kept], dtype=int)
+    check_bounds(system, t, guess, speeds)
+    system.check_returned(t, guess, speeds)
+    reason = not_finite(system, t, guess, speeds)
+    if reason is not None:
+        raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
+    found = _position(system, t, guess, free, kept)
+    jacobian = system.jacobian(t, found)
+    change = _least_change(jacobian, free, -system.velocity_constraint(t, found, speeds))
+    velocity = speeds + change
+    scales = scales_of(system, t, found, jacobian)
+    wrong = Violation.of_velocity(system, t, found, velocity, jacobian, scales)
+    if wrong.excess > 1.0:
+        why = f"max|C_q v + C_t| stays at {_largest(wrong.values)}"
+        raise ValueError(_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
+    state = ConsistentState((found, velocity))
+    state.moved_q, state.moved_v = _move(found - guess), _move(velocity - speeds)
+    state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
+    return state
+
+
+def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int]) -> Array:
+    jacobian = system.jacobian(t, guess)
+    scales = scales_of(system, t, guess, jacobian)
+    scaled = scales.scaled(jacobian)
+    start = Violation.of_position(system, t, guess, jacobian, scales)
+    if start.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
+        why = f"max|C| stays at {_largest(start.values)}"
+        raise ValueError(_no_freedom(system, t, scaled, free, kept, why))
+    found, excess, iterations = _gauss_newton(system, t, guess, free)
+    if found is None or not excess <= CONVERGED:
+        where = guess if found is None else found
+        raise ValueError(
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
+            f"iterations max|C| is {_largest(system.constraint(t, where))}. Give a guess that is nearer to an "
+            f"assembled position{_smallest(scaled, free, kept)}"
+        )
+    if start.excess <= 1.0:
+        return found
+    moved = (found - guess) / scales.columns
+    far = float(np.abs(moved).max())
+    there = scales.scaled(system.jacobian(t, found))
+    dependent, sign, _ = _assembly(there, free)
+    weakest = far * _weakest_direction(there, free)
+    for other in (-2.0 * moved, weakest, -weakest):
+        again, excess, _ = _gauss_newton(system, t, found + other * scales.columns, free)
+        same = again is not None and excess <= CONVERGED
+        if again is not None and same:
+            block = scales.scaled(system.jacobian(t, again))[:, list(dependent)]
+            same = float(np.abs((again - found) / scales.columns).max()) <= far
+            same = same and (sign == 0 or int(np.linalg.slogdet(block)[0]) == sign)
+        if not same:
+            j = int(np.abs(moved).argmax())
+            raise ValueError(
+                f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
+                f"coordinate {j} from {guess[j]:.6g} to {found[j]:.6g}, and from other positions as far away it does "
+                f"not lead there. Give a guess that is nearer to the assembly that is meant, or farther from a dead "
+                f"centre{_smallest(there, free, kept)}"
+            )
+    return found
+
+
+def _gauss_newton(
+    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp]
+) -> tuple[Array | None, float, int]:
+    """Position (None: lost), what it is still off over what is accepted, and how many iterations it took."""
+    best, iteration = np.inf, 0
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        try:
+            jacobian, values = system.jacobian(t, q), system.constraint(t, q)
+        except (ArithmeticError, ValueError):  # an iterate outside what the callbacks are made for
+            return None, np.inf, iteration
+        if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
+            return None, np.inf, iteration
+        step = _least_change(jacobian, free, -values)
+        excess = Violation.of_position(system, t, q, jacobian, scales_of(system, t, q, jacobian)).excess
+        if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
+            return q, excess, iteration  # as far as rounding lets it
+        best = min(best, excess)
+        q = q + step
+        if not np.isfinite(q).all():
+            return None, np.inf, iteration
+    return q, best, iteration
+
+
+def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array) -> Array:
+    """The smallest change of the free coordinates that changes C by these values to first order."""
+    norms = np.linalg.norm(jacobian, axis=1)
+    norms = np.where(norms > 0.0, norms, 1.0)
+    change = np.zeros(jacobian.shape[1])
+    change[free] = np.linalg.lstsq(jacobian[:, free] / norms[:, None], values / norms, rcond=1e-13)[0]
+    return change
+
+
+def _rank(scaled: Array) -> int:
+    values = np.linalg.svd(scaled, compute_uv=False)
+    return int((values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)).sum())
+
+
+def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
+    """The dependent columns, the sign of their determinant, and how far they are from losing rank."""
+    rank = _rank(scaled[:, free])
+    if rank == 0:
+        return (), 0, 0.0
+    order = qr(scaled[:, free], mode="r", pivoting=True)[1]
+    dependent = tuple(sorted(int(j) for j in free[order[:rank]]))
+    if rank < len(scaled):
+        return dependent, 0, 0.0
+    block = scaled[:, list(dependent)]
+    values = np.linalg.svd(block, compute_uv=False)
+    return dependent, int(np.linalg.slogdet(block)[0]), float(values.min() / values.max())
+
+
+def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
+    """The direction in which the constraints hold the free coordinates least; its largest entry is 1."""
+    values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
+    held = values > SINGULAR * values.max()
+    direction = np.zeros(scaled.shape[1])
+    direction[free] = rows[held][-1] / np.abs(rows[held][-1]).max()
+    return direction
+
+
+def _smallest(scaled: Array, free: NDArray[np.intp], kept: list[int]) -> str:
+    """Say that C_q nearly loses rank at the guess, where it does."""
+    values = np.linalg.svd(scaled[:, free], compute_uv=False)
+    if len(values) and values.min() > DEAD_CENTRE * values.max():
+        return ""
+    without = f" without the columns of keep={kept}" if kept else ""
+    return f": there C_q{without} nearly loses rank, as at a dead centre"
+
+
+def _no_freedom(
+    system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
+) -> str:
+    ranks = f"rank {_rank(scaled[:, free])} of {system.n_c}"
+    if not kept:
+        return f"C_q of {system.name!r} has {ranks} at t = {t!r}, and {why}: give a guess away from this position"
+    return (
+        f"keep leaves too little freedom: without the columns {kept} C_q of {system.name!r} has {ranks} at t = {t!r}, "
+        f"and {why}. Keep fewer coordinates, or give a guess away from a dead centre"
+    )
+
+
+def _largest(values: Array) -> str:
+    return f"{float(np.abs(values).max()):.3g}"
+
+
+def _move(change: Array) -> Move:
+    j = int(np.abs(change).argmax())
+    return Move(float(change[j]), j)
