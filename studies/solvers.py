@@ -126,7 +126,7 @@ def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> R
     from references.fully_implicit import solve_fully_implicit  # type: ignore[import-untyped, import-not-found, unused-ignore]
 
     limit = {"time_limit": case.time_limit}
-    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, **limit)  # type: ignore[no-any-return, unused-ignore]
+    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, **limit)  # type: ignore[arg-type]
 
 
 def _with_start(case: Case) -> Any:

@@ -54,7 +54,7 @@ def test_a_mechanism_without_independent_coordinates(method, tolerance):
 
 
 def same_assembly(lengths, ground, result):
-    """Whether a Grashof linkage stays on its assembly: the joints that its shortest bar does not touch keep their side."""
+    """Whether a Grashof linkage stays on its assembly: the joints away from the shortest bar keep their sign."""
     bars = [*lengths, ground]
     theta = [*result.q[2::3], np.zeros_like(result.t)]
     shortest = int(np.argmin(bars))
@@ -74,7 +74,7 @@ def linkages(seed, n):
     while len(found) < n:
         lengths, ground = rng.uniform(0.3, 2.0, 3), float(rng.uniform(0.3, 2.0))
         bars = np.sort([*lengths, ground])
-        if not 1e-3 < bars[1] + bars[2] - bars[0] - bars[3]:
+        if not bars[1] + bars[2] - bars[0] - bars[3] > 1e-3:
             continue
         try:
             problem = four_bar(tuple(lengths), ground, rng.uniform(-np.pi, np.pi), int(rng.choice([-1, 1])))

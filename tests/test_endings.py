@@ -1,7 +1,6 @@
-"""How runs end that do not reach their end: interrupted, at a standstill, out of time, or by a value that is not finite."""
+"""How runs end early: interrupted, at a standstill, out of time, by values that are not finite."""
 
 import os
-import signal
 import subprocess
 import sys
 import textwrap

@@ -101,7 +101,7 @@ class Violation:
         self.allowed_left = CONSISTENT * per_row + ROUNDING * EPS * terms / scales.rows
 
     @classmethod
-    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> "Violation":
+    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
         """C(t, q) at a position."""
         terms = np.abs(jacobian) @ np.abs(q)
         values = system.constraint(t, q)
@@ -110,7 +110,7 @@ class Violation:
     @classmethod
     def of_velocity(
         cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
-    ) -> "Violation":
+    ) -> Violation:
         """C_q v + C_t at a state, beside what is fast there: velocities, drives, and what forces can bring about."""
         rate = system.constraint_rate(t, q)
         fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
@@ -187,4 +187,3 @@ def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str |
     values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in system.given}
     wrong = [kind for kind, value in values.items() if not np.isfinite(value).all()]
     return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None
-

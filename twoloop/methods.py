@@ -158,8 +158,8 @@ class Newmark:
         Parameters of (12), in which beta = 1/4 is the average-acceleration method. Other gamma than 1/2, and beta
         near 1/6, for which the error estimate vanishes, go with fixed steps only.
     error_tol : float, optional
-        err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this; the error
-        of a run then goes with error_tol^(2/3). None: when the largest component of e / h, the error per unit step, is
+        err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
+        error of a run goes with error_tol^(2/3). None: when the largest component of e / h, the error per unit step, is
         at most r atol + rtol |v|, so that the error of a run is proportional to the tolerance; 1 / r is the shortest
         time scale so far, on which velocities and accelerations change the coordinates.
     inner_tol : float, optional

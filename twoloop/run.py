@@ -264,10 +264,10 @@ class Run:
         if code == STAGNATED:
             return (
                 Status.STAGNATED,
-                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.last:.2g} s long on average, where steps of "
-                f"{pace.best:.2g} s were taken before, and the rest would take {(t1 - t) / pace.last:.1g} of them. Look "
-                "for a singular position or a stiff force near this time, or take another method; with max_steps the "
-                "run goes on up to that number of steps.",
+                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.last:.2g} s long on average, after "
+                f"steps of {pace.best:.2g} s before, and the rest needs {(t1 - t) / pace.last:.1g} of them. Look for a "
+                "singular position or a stiff force near this time, or take another method; with max_steps the run "
+                "goes on up to that number of steps.",
             )
         if failure == common.NOT_FINITE:
             return (
@@ -318,8 +318,8 @@ class Run:
     def _check_again(self, t: Array, table: Array, status: Status, message: str) -> tuple[Status, str]:
         """Status and message, unless a derivative is wrong where the run went."""
         n = self.system.n_q
-        places = np.unique(np.linspace(0, len(t), LATER_CHECKS + 1).astype(int)[1:] - 1) if len(t) else []
-        states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in places]
+        inner = np.arange(1, LATER_CHECKS + 1) * len(t) // (LATER_CHECKS + 1)
+        states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in np.unique(inner) if 0 < k < len(t)]
         states.append((float(self.clock[self.a.T]), self.state[:n], self.state[n : 2 * n]))
         for instant, q, v in states:
             wrong = wrong_derivative(self.system, instant, q, v)

@@ -162,7 +162,9 @@ def test_order_on_nonlinear_constraints(monkeypatch):
 
 def test_chosen_by_size():
     def chosen(system, q0, v0):
-        run = run_module.Run(system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, np.full(system.n_q, 1e-6), 1e-3)
+        run = run_module.Run(
+            system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, np.full(system.n_q, 1e-6), 1e-3
+        )
         return int(run.functions.flags[common.BANDWIDTH])
 
     for n_elements, bandwidth in ((4, -1), (8, -1), (16, 11)):

@@ -67,10 +67,10 @@ def _not_finite(notes, kind, t, q):
 
 @compiled
 def _finite_vector(x):
+    finite = True
     for j in range(x.size):
-        if not np.isfinite(x[j]):
-            return False
-    return True
+        finite = finite and np.isfinite(x[j])
+    return finite
 
 
 @compiled

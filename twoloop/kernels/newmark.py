@@ -32,8 +32,8 @@ def _rate(q, v, a):
 def _error(options, tolerances, rate, h, q, v, a, a1):
     """Of e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for any beta and gamma = 1/2.
 
-    The largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 as the global error
-    is. With ERROR_TOL > 0 the 2-norm of e over ERROR_TOL (the paper's err_out).
+    The largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 like the error of
+    the run. With ERROR_TOL > 0 the 2-norm of e over ERROR_TOL (the paper's err_out).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0

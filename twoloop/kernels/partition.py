@@ -1,6 +1,15 @@
 """LU coordinate partitioning: which coordinates are independent."""
 
-from twoloop.kernels.common import DONE, N_FACTORIZATIONS, N_PARTITIONS, ORIENTATION, SENSITIVITY, SINGULAR, compiled, inlined
+from twoloop.kernels.common import (
+    DONE,
+    N_FACTORIZATIONS,
+    N_PARTITIONS,
+    ORIENTATION,
+    SENSITIVITY,
+    SINGULAR,
+    compiled,
+    inlined,
+)
 from twoloop.kernels.linalg import lu_solve
 
 RANK_TOLERANCE = 1e-11  # a pivot below this fraction of the largest one counts as zero

@@ -2,9 +2,9 @@
 
 The difference is of the order of the step's error on one and the same assembly of the mechanism. On another assembly it
 is not, however smooth the independent coordinates are, and a mechanism without any (every coordinate prescribed) has no
-other error estimate. Where two assemblies come close to one another, a large step may end on the wrong one by a hair; it
-has then passed a zero of det C_qd, which a motion does only through a singular position. So a change of this sign needs
-a prediction that is nearly exact, which short steps through a singular position have and a change of assembly has not.
+other error estimate. Where two assemblies come close to one another, a large step may end on the wrong one with a small
+difference; it has then passed a zero of det C_qd, which a motion does only through a singular position. So a change of
+this sign needs a prediction that is nearly exact, as short steps through a singular position have it.
 """
 
 from twoloop.kernels.common import (
