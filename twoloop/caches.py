@@ -32,7 +32,7 @@ UNWRITABLE = (
 )
 CHECKSUM = hashlib.sha256().digest_size
 
-# libraries whose functions are told apart by name; the versions of numba and numpy are part of every index and digest
+# libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
 
@@ -103,8 +103,8 @@ class _Cache(FunctionCache):
 class _Files:
     """The files of one function, one for each key, each behind its checksum.
 
-    A file that is damaged or out of date counts as missing. Numba's own keep an index, through which
-    two processes that write at the same time may lead one function to the machine code of another.
+    A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
+    write at the same time may lead one function to the machine code of another.
     """
 
     def __init__(self, folder: str, name: str, stamp: Any):
