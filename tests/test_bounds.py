@@ -1,4 +1,4 @@
-"""Indices out of bounds are found before machine code writes to the memory of others, at every entry point."""
+"""Indices out of bounds are found before machine code reads or writes outside its arrays, at every entry point."""
 
 import types
 

@@ -1,4 +1,4 @@
-"""Machine code on disk: read again when nothing changed, made anew when anything did, never a reason to fail."""
+"""Machine code on disk: read again when nothing changed, rebuilt when anything did, never a reason to fail."""
 
 import os
 import subprocess
@@ -187,7 +187,7 @@ DAMAGES = {
 }
 
 
-def test_damaged_files_are_made_anew(folder):
+def test_damaged_files_are_rebuilt(folder):
     folder.mechanism(**{name: "q[0]" for name in DAMAGES})
     folder.values()
     for name, damage in DAMAGES.items():
@@ -197,7 +197,7 @@ def test_damaged_files_are_made_anew(folder):
     assert folder.values() == {name: (1.0, 1) for name in DAMAGES}
 
 
-def test_a_file_of_another_function_is_made_anew(folder):
+def test_a_file_of_another_function_is_rebuilt(folder):
     folder.mechanism(one="q[0]", two="2.0 * q[0]")
     folder.values()
     (one,), (two,) = (list(folder.cache.glob(f"*/mechanism.{name}-*.nbc")) for name in ("one", "two"))

@@ -26,7 +26,7 @@ class PythonFunctions:
     """Plain Python functions of one system, called through the compiled `through_python`.
 
     These find them by the handle, which is the only parameter of the system. It holds in this process and in forks of
-    it; unpickled elsewhere, the functions are registered anew.
+    it; unpickled elsewhere, the functions are registered again.
     """
 
     registry: ClassVar[WeakValueDictionary[int, "PythonFunctions"]] = WeakValueDictionary()

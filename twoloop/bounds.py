@@ -1,4 +1,4 @@
-"""No compiled callback goes out of the bounds of its arrays: machine code would read or write the memory of others.
+"""No compiled callback goes out of the bounds of its arrays: machine code would read or write other memory.
 
 Each callback first runs once in Python, its compiled helpers too, where an index too large is an `IndexError`; what
 runs only compiled is compiled a second time with numba's own check. Branches that are not taken then are not seen.

@@ -27,12 +27,12 @@ from numba.core.serialize import dumps
 from numba.core.types import Type
 
 UNWRITABLE = (
-    "twoloop: machine code cannot be kept on disk, so every process compiles anew. Set NUMBA_CACHE_DIR to a folder "
+    "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that can be written"
 )
 CHECKSUM = hashlib.sha256().digest_size
 
-# libraries whose functions are told apart by name; the versions of numba and numpy are part of every index and digest
+# libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
 
@@ -54,7 +54,7 @@ def compile_kept(
         The only one that it will have.
     watched : (str, str) or None
         What the machine code depends on beside the file of the function, see `watch`: when the first changes, all is
-        made anew; the second tells functions apart that share their source. None: the machine code is not kept.
+        compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
     announcement : str
         Said on stderr, once a process, before it compiles.
     **options
@@ -103,8 +103,8 @@ class _Cache(FunctionCache):
 class _Files:
     """The files of one function, one for each key, each behind its checksum.
 
-    A file that is damaged, or was made of something else, is as good as none. Numba's own keep an index, through which
-    two processes that write at the same time may lead one function to the machine code of another.
+    A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
+    write at the same time may lead one function to the machine code of another.
     """
 
     def __init__(self, folder: str, name: str, stamp: Any):
@@ -123,7 +123,7 @@ class _Files:
             unfinished.unlink(missing_ok=True)
 
     def load(self, key: Any) -> Any:
-        """What numba made for a key; None if it is to be made anew."""
+        """What numba made for a key; None if it is missing."""
         try:
             content = self._path(key).read_bytes()
         except OSError:

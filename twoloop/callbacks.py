@@ -187,6 +187,9 @@ if callback.__doc__:  # not so with python -OO
     )
 
 
+_OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # of numba: a division by zero is an infinity, as in the kernels
+
+
 def compile_callback(
     kind: str, function: Callable[..., Any], watched: tuple[str, str] | None, named: Callable[..., Any] | None = None
 ) -> Dispatcher:
@@ -194,8 +197,10 @@ def compile_callback(
 
     `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
     """
+    if watched is not None:
+        watched = f"{watched[0]} {_OPTIONS}", watched[1]
     try:
-        return compile_kept(function, KINDS[kind].signature, watched, error_model="numpy")
+        return compile_kept(function, KINDS[kind].signature, watched, **_OPTIONS)
     except Exception as error:  # numba lets some of its own assertions through
         raise TypeError(_why_not(kind, named or function, error)) from None
 

@@ -32,14 +32,14 @@ FUNCTIONS = types.NamedTuple(
 
 @typeof_impl.register(Functions)
 def _type_of_functions(value: Any, context: Any) -> Any:
-    """What numba takes any `Functions` for: without this, each system's own functions, and it would compile anew."""
+    """Types any `Functions` alike; otherwise numba would compile the kernels again for the callbacks of each system."""
     return FUNCTIONS
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH = range(3)
-GIVEN = {name: place for place, name in enumerate(OPTIONAL, start=3)}  # whether an optional callback is given
-N_FLAGS = 3 + len(GIVEN)
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FIRST_GIVEN = range(4)
+GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
+N_FLAGS = FIRST_GIVEN + len(GIVEN)
 GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN = (
     GIVEN[name] for name in ("gamma", "force_by_q", "force_by_v", "reaction_by_q")
 )
