@@ -210,3 +210,15 @@ def test_a_projection_can_be_started_from_at_any_scale(unit):
     assert v[0] == 3.0
     assert accepted(system, q, v)
     assert np.abs(system.constraint(0.0, q)).max() < 1e-15 * 10.0 * unit
+
+
+@pytest.mark.parametrize("unit", UNITS.values())
+@pytest.mark.parametrize("method", ["SunRadau5", "DOP853", "PaperIRK"])
+def test_every_state_of_a_run_is_a_start(unit, method):
+    problem = four_bar((unit, 2.0 * unit, 1.5 * unit), 3.0 * unit)
+    end = 2.0 * math.sqrt(unit)
+    times = np.linspace(0.0, end, 11)
+    result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, 1e-3, 1e-3 * unit, t_eval=times)
+    assert result.success
+    for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True):
+        check_start(problem.system, t, q, v)

@@ -72,7 +72,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     whether Newton's method converges, not what it converges to.
     """
     jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
-    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+    if jacobian.size == 0 or not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
         return None
     generic = _generic_velocities(jacobian, rate, q)[-1]
     generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))

@@ -25,7 +25,12 @@ MECHANISMS = [
             ((True, 2.0, 1.5), TypeError, "must be an array of real numbers", "give three numbers"),
         ],
     ),
-    *argument("four_bar", four_bar, "ground", [*FEW_POSITIVES, INFINITE]),
+    *argument(
+        "four_bar",
+        four_bar,
+        "ground",
+        [*FEW_POSITIVES, (np.inf, ValueError, "must be finite; given inf", "give metres")],
+    ),
     *argument(
         "four_bar",
         four_bar,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.callbacks import callback
-from twoloop.checks import check_finite, check_positive, check_vector
+from twoloop.checks import check_finite, check_vector
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
 
@@ -136,8 +136,9 @@ def four_bar(
     lengths_array = check_vector("lengths", lengths, 3)
     if not (lengths_array > 0.0).all():
         raise ValueError(f"lengths must be positive; given {tuple(lengths_array.tolist())}")
-    check_positive("ground", ground)
-    ground, theta3 = float(ground), check_finite("theta3", theta3)
+    ground, theta3 = check_finite("ground", ground), check_finite("theta3", theta3)
+    if not ground > 0.0:
+        raise ValueError(f"ground must be positive; given {ground!r}")
     if isinstance(branch, bool) or branch not in (-1, 1):
         raise ValueError(
             f"branch must be 1 (joint 1-2 above the line from O to joint 2-3) or -1 (below); given {branch!r}"
