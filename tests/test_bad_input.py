@@ -137,7 +137,7 @@ def test_a_mass_that_is_not_positive_definite(mass, constant):
 
 def test_a_callback_whose_shape_changes_later_names_the_time():
     system = pendulum(force=lambda t, q, v: np.zeros(2 if t < 0.5 else 3))
-    refuses(ValueError, r"force of system 'pendulum'.*t = 0\.5.*shape \(3,\)", system)
+    refuses(ValueError, r"force of system 'pendulum'.*t = 0\.[5-9].*shape \(3,\)", system)
 
 
 # --- what goes wrong later

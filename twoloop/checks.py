@@ -148,9 +148,9 @@ def check_positive(name: str, value: Any, infinite: bool = False) -> None:
 
 def check_tolerance(name: str, value: ArrayLike, n_q: int) -> Array:
     """Return a tolerance as an array (n_q,): a positive number for all coordinates, or one for each."""
-    if isinstance(value, (int, float, np.integer, np.floating)):
+    if not isinstance(value, (list, tuple, np.ndarray)) and np.ndim(value) == 0:
         check_positive(name, value)
-        return np.full(n_q, float(value))
+        return np.full(n_q, value, dtype=np.float64)
     array = check_real(name, value)
     if array.shape != (n_q,):
         raise ValueError(
