@@ -21,6 +21,7 @@ ANYWHERE = (0, 1, -1)  # around the place; where the callbacks are not defined t
 FORWARD = (1, -1)  # for times at the start: callbacks need not work before it
 TIME = 0.1  # s: first guess at how fast constraints move
 NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
+FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
@@ -262,7 +263,7 @@ def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
     if not (driven & (moved > 0.0)).any():
         return [v]
     faster = float(np.median(np.abs(rate[driven & (moved > 0.0)]) / moved[driven & (moved > 0.0)]))
-    return [v, faster * v]
+    return [v, min(faster, FASTEST) * v]
 
 
 def _time_scale(q: Array, v: Array) -> float:

@@ -27,6 +27,7 @@ FIRST = 2.0**-5  # the first half-width, of the scale
 RATIO = 16.0  # of one half-width to the next
 SMALLER, LARGER = 11, 8  # half-widths that are tried on either side
 FINER, WIDER, CLOSER = 4.0, 8, 24  # ratio and numbers of the intervals that have to confirm that an entry is wrong
+BESIDE = (0.55, 1.8, 3.1)  # of the half-width of an estimate: those that may confirm it first
 RIPPLES = 3  # narrower intervals after which a smooth function shows rounding only
 LEAST_SPACINGS = 256.0  # half-width, in spacings of floating-point numbers at the place
 SETTLED = 2e-7  # of an entry: agreement, with the error of the difference, at which no other half-width is tried
@@ -35,7 +36,7 @@ DECAYED = 0.01  # of the first coefficients: the last of a function that the poi
 DECAYING = 0.2  # the last two of them to those before, where these are not rounding: else they are a ripple
 NOTHING = 100.0  # times rounding: a function that varies by no more does not vary
 SAFETY = 5.0  # times the estimated error of the difference
-FROZEN = 1e4  # times rounding of what is seen: inside, a function that stands still may add larger numbers
+FROZEN = 1e4  # times rounding of what is seen: a function may add larger numbers inside, but hardly so much larger
 FLAT = 3  # intervals, of different widths, on which a function that does not vary has the derivative 0
 TINY = 1e-12  # of the largest entry: such an entry counts as zero
 
@@ -63,7 +64,7 @@ class _Window:
     error: Array
     flat: NDArray[np.bool_]
     nothing: NDArray[np.bool_]  # varies by no more than rounding
-    ripple: Array  # the last coefficients, where they are more than rounding
+    ripple: Array  # the last coefficients, where rounding cannot be the reason
 
 
 def _window(function: Function, place: float, width: float, side: int, noise: Array) -> _Window | None:
@@ -94,7 +95,7 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
     last = np.abs(coefficients[TAIL + 2 :]).max(axis=0)
     still = tail <= NOTHING * level
     resolved = ((tail <= DECAYED * head) & (still | (last <= DECAYING * tail))) | (still & (head <= NOTHING * level))
-    ripple = np.where(tail > NOTHING * level, tail, 0.0)
+    ripple = np.where(tail > FROZEN * level, tail, 0.0)
     nothing = np.maximum(head, tail) <= NOTHING * level
     return _Window(slope, np.where(resolved, error, np.inf), np.ptp(values, axis=0) == 0.0, nothing, ripple)
 
@@ -197,9 +198,12 @@ def confirms(
     One disagreement may be an accident, and what moves little and fast (a fine ripple on a long way) shows on narrow
     intervals only. Where one of them finds another derivative, nothing is certain.
     """
-    width = 0.55 * float(best.width[entry])
-    found = _window(function, place, width, best.side, noise)
-    if found is None:
+    width = float(best.width[entry])
+    for part in BESIDE:
+        found = _window(function, place, part * width, best.side, noise)
+        if found is not None and np.isfinite(found.error[entry]):
+            break
+    else:
         return False
     apart = abs(given - float(found.slope[entry]))
     if apart <= 0.6 * SAFETY * found.error[entry] or abs(found.slope[entry] - best.slope[entry]) >= 0.5 * apart:
