@@ -25,7 +25,7 @@ FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
 GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
-STAGNATION_PACE = 1e-3  # ... against the best pace of the run before, and ...
+STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
 STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
@@ -193,7 +193,7 @@ class Run:
             if spent < CHUNK_TIME:
                 self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], BUFFER_STEPS)
             limited = self.control[a.MAX_STEPS] < np.inf
-            if code == a.PAUSED and pace.stagnates(self.clock[a.T], int(filled[1]), t1) and not limited:
+            if pace.stagnates(self.clock[a.T], out_steps[: filled[1], a.H], t1) and code == a.PAUSED and not limited:
                 code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
@@ -264,8 +264,8 @@ class Run:
         if code == STAGNATED:
             return (
                 Status.STAGNATED,
-                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.last:.2g} s long on average, after "
-                f"steps of {pace.best:.2g} s before, and the rest needs {(t1 - t) / pace.last:.1g} of them. Look for a "
+                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average, after steps of "
+                f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
                 "singular position or a stiff force near this time, or take another method; with max_steps the run "
                 "goes on up to that number of steps.",
             )
@@ -350,23 +350,21 @@ INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() return
 
 
 class _Pace:
-    """Mean length of the accepted steps, over windows, to see that a run does not get anywhere."""
+    """Lengths of the accepted steps, to see that a run does not get anywhere."""
 
     def __init__(self, t0: float):
-        self.t, self.window_t, self.window_n = t0, t0, 0
-        self.best = self.last = 0.0
+        self.window_t, self.window_n = t0, 0
+        self.longest = self.mean = 0.0
 
-    def stagnates(self, t: float, n: int, t1: float) -> bool:
-        """Whether the run has come to a standstill, after a chunk of n accepted steps that ended at t."""
-        if n >= FIRST_CHUNK // 2:
-            self.best = max(self.best, (t - self.t) / n)
-        self.t = t
-        self.window_n += n
+    def stagnates(self, t: float, h: Array, t1: float) -> bool:
+        """Whether the run has come to a standstill, after accepted steps h that ended at t."""
+        self.longest = max(self.longest, float(h.max(initial=0.0)))
+        self.window_n += len(h)
         if self.window_n < STAGNATION_STEPS:
             return False
-        self.last = (t - self.window_t) / self.window_n
+        self.mean = (t - self.window_t) / self.window_n
         self.window_t, self.window_n = t, 0
-        return self.last < STAGNATION_PACE * self.best and t1 - t > STAGNATION_LEFT * self.last
+        return self.mean < STAGNATION_PACE * self.longest and t1 - t > STAGNATION_LEFT * self.mean
 
 
 _REASONS = {

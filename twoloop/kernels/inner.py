@@ -113,10 +113,10 @@ def _positions(f, w, t, q, tolerance):
         w.counters[N_INNER] += 1
         correction = 0.0
         for k in range(w.C.size):
-            q[w.dependent[k]] -= w.C[k]
-            correction = max(correction, abs(w.C[k]))
             if not np.isfinite(w.C[k]):
                 return _not_finite(w.notes, _CONSTRAINT, t, q)
+            q[w.dependent[k]] -= w.C[k]
+            correction = max(correction, abs(w.C[k]))
         if correction <= tolerance:
             return DONE
         if correction > CONTRACTION * before:
