@@ -18,7 +18,7 @@ from studies.motion_report import VISIBLE
 from studies.report import number
 from studies.runs import ASTRAY
 from studies.solvers import GEAR_ORDERS, IRK, NEWMARK, QUARTER, gear
-from studies.violation_report import SLOPE, TIMES
+from studies.violation import SLOPE, TIMES
 
 PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it
 STEP = 0.02  # s
