@@ -14,7 +14,7 @@ from studies.claims_verdicts import (
     pick,
     span,
 )
-from studies.motion_report import VISIBLE
+from studies.motion import VISIBLE
 from studies.report import number
 from studies.runs import ASTRAY
 from studies.solvers import GEAR_ORDERS, IRK, NEWMARK, QUARTER, gear
