@@ -81,8 +81,8 @@ def _short(rows: pd.DataFrame, series: dict[str, Array], visible: float) -> Figu
         lower.set(xlabel="t (s)", yscale="log")
     axes[0, 0].set_ylabel("y3 (m)")
     axes[1, 0].set_ylabel("largest error of y3 so far (m)")
-    _limit(axes[1, 0], 0.0, visible)
-    _legend(figure, axes.flat)
+    _limit(axes[1, 1], visible)
+    _legend(figure, (*axes[1], *axes[0]))
     return figure
 
 
@@ -98,9 +98,10 @@ def _last(rows: pd.DataFrame, series: dict[str, Array], visible: float) -> Figur
     return figure
 
 
-def _limit(panel: Axes, t: float, visible: float) -> None:
-    """Write the limit of what is visible above its line."""
-    panel.annotate(f"{visible:g} m", (t, visible), (0, 2), textcoords="offset points", fontsize=8)
+def _limit(panel: Axes, visible: float) -> None:
+    """Write the limit of what is visible beside its line, right of the panel."""
+    place = panel.get_yaxis_transform()
+    panel.text(1.01, visible, f"{visible:g} m", transform=place, va="center", fontsize=8)
 
 
 def _error(rows: pd.DataFrame, series: dict[str, Array], visible: float) -> Figure:
@@ -116,9 +117,9 @@ def _error(rows: pd.DataFrame, series: dict[str, Array], visible: float) -> Figu
             error = np.maximum(series[key(row, "log")], SMALLEST)
             panel.plot(t, error, label=row["solver"], markevery=(3 * k % 10, 10), **look)
         panel.axhline(visible, color="black", lw=0.8, ls=":")
-        _limit(panel, t[0], visible)
         panel.set(xscale="log", yscale="log", xlabel="t (s)")
         panel.set_title(title, fontsize=9)
         panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+    _limit(axes[1], visible)
     axes[0].set_ylabel("largest error of y3 so far (m)")
     return figure
