@@ -14,11 +14,11 @@ from studies.claims_verdicts import (
     pick,
     span,
 )
-from studies.motion_report import VISIBLE
+from studies.motion import VISIBLE
 from studies.report import number
 from studies.runs import ASTRAY
 from studies.solvers import GEAR_ORDERS, IRK, NEWMARK, QUARTER, gear
-from studies.violation_report import SLOPE, TIMES
+from studies.violation import SLOPE, TIMES
 
 PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it
 STEP = 0.02  # s

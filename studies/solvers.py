@@ -235,6 +235,7 @@ LINE_UP: dict[str, float] = {
     NEWMARK: 1e-9,
     QUARTER: 1e-9,
     **dict.fromkeys(PRESETS, 1e-8),
+    "Newmark": 1e-6,  # of order 2: ten times the steps at 1e-8
     CANONICAL: 0.01,
     **{f"IDA, {form}": 1e-8 for form in IDA_FORMS},
     IDA_C: 1e-8,

@@ -1,12 +1,116 @@
-"""The motion study: quick run, redraw, and what must hold in its rows."""
+"""The motion study: its sentences turn with the rows, and what must hold in the rows of a quick run."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from studies import motion
-from studies.motion_report import VISIBLE, needed
-from studies.report import load_rows, load_series
-from studies.solvers import gear
+from studies.cases import four_bar
+from studies.cli import Call
+from studies.motion import VISIBLE, find, needed
+from studies.motion_figures import DRAWN, GRID_LAST, GRID_SHORT, key
+from studies.render import number_of_words
+from studies.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
+from studies.store import Output
+
+
+def rows():
+    """Medians of a full run, made up but like them."""
+    good = {"status": "REACHED_END", "message": "", "problem": "four-bar", "t_end": 100.0, "floor": 1e-11, "repeat": 0}
+    good |= {"error_q": 1e-6, "cpu_s": 1.0, "n_evaluations": 1e4, "kinetic": 22.5, "range_y3": 0.726, "err_out": np.nan}
+    good |= {"error_y3": 5e-3, "error_y3_short": 1e-6, "top": 0.0, "top_late": -1e-4, "energy": -1e-3, "growth": 2.0}
+    good |= {"good_until": 100.0, "lost": False, "astray": False, "h": np.nan, "tol": np.nan}
+    lines = []
+
+    def add(group, name, value, **more):
+        solver = CATALOGUE[name]
+        told = {"family": solver.family, "called_from": solver.called_from, "solver": name, "group": group}
+        told |= {"keeps_constraints": solver.keeps_constraints, solver.setting: value}
+        lines.append({**good, **told, **more})
+
+    for name, value in LINE_UP.items():
+        add("line-up", name, value, growth=1.0 if name == CANONICAL else 2.0)
+    for order in GEAR_ORDERS:
+        for step in (0.02, 0.01, 0.005):
+            short = 0.2 * (50.0 * step) ** order / 4.0 ** (order - 1)
+            energy = 0.1 if order == 3 else -0.1
+            more = {"error_y3_short": short, "error_y3": 10.0 * short, "energy": energy}
+            add("GSTIFF stand-in", gear(order), step, **more)
+    for step in (0.01, 0.005):
+        add("Exudyn", "Exudyn, HHT", step, error_y3=30.0 * step**2)
+    return pd.DataFrame(lines)
+
+
+def text_of(folder, made, quick=False):
+    series = {"log": np.geomspace(0.1, 100.0, 9), "truth short": GRID_SHORT, "truth last": GRID_LAST}
+    for _, row in made.iterrows():
+        series[key(row, "log")] = 1e-9 * series["log"]
+        if (row["solver"], None if pd.isna(row["h"]) else row["h"]) in DRAWN:
+            series |= {key(row, "short"): GRID_SHORT, key(row, "short_error"): GRID_SHORT, key(row, "last"): GRID_LAST}
+    with Output(Call("motion", quick, folder, False, "")) as output:
+        motion.report(output, made, series, "stamp")
+    return (folder / "motion.md").read_text()
+
+
+def test_the_report_is_short_and_whole(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert number_of_words(text) < 1000
+    for name in ("short", "long", "error"):
+        assert all((tmp_path / f"motion_{name}.{suffix}").stat().st_size > 10_000 for suffix in ("png", "svg"))
+    assert "[motion.csv](motion.csv)" in text and "Runs that did not" not in text
+
+
+def test_sentences_turn_with_the_rows(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert "As the paper says, both procedures reach and do not pass y3 = 0" in text
+    assert "h = 0.02 s, over 2 s: visibly wrong at order 1, 2 and 3 of 6 orders" in text
+    assert "With h = 0.01 s it is visibly wrong at order 1 and 2." in text
+    assert "Both statements hold for order 3 (with any limit of the visible from 1.6e-3 to 0.013 m)." in text
+    assert "visibly wrong at order 1, 2 and 3, not at all orders. The paper: obviously wrong." in text
+    assert "loses energy at order 1, 2, 4, 5 and 6 and gains energy at order 3 (accurate start)" in text
+    assert "as both two-loop procedures do. " in text and "Neither two-loop procedure is." in text
+    assert "but p = 1.0 with the canonical form" in text
+
+    made = rows()
+    stand_in, long = made["group"] == "GSTIFF stand-in", made["h"] == 0.02
+    made.loc[made["solver"] == NEWMARK, ["top", "error_y3", "error_y3_short"]] = [0.01, 0.5, 0.02]
+    made.loc[stand_in, ["error_y3", "error_y3_short"]] = [0.5, 1e-3]
+    made.loc[stand_in & long, "error_y3_short"] = 0.5
+    made.loc[stand_in & (made["solver"] == gear(3)), "energy"] = -1.0
+    made.loc[made["solver"] == CANONICAL, "growth"] = 2.5
+    made.loc[made.index[-1], ["status", "message", "error_y3"]] = ["SOLVER_FAILED", "why", np.nan]
+    text = text_of(tmp_path, made)
+    assert f"this does not hold for `{NEWMARK}`." in text
+    assert "visibly wrong at every order, as the paper says of Gstiff" in text
+    assert "With h = 0.01 s it is visibly wrong at no order, as the paper says of Gstiff." in text
+    assert "the stand-in is visibly wrong at every order. The paper: obviously wrong." in text
+    assert "loses energy at order 1, 2, 3, 4, 5 and 6 (accurate start)" in text
+    assert "not both two-loop procedures do" in text and "Not both two-loop procedures follow" in text
+    assert "is no exception with p = 2.5" in text and "| solver failed | why |" in text
+
+    made.loc[stand_in, ["error_y3", "error_y3_short"]] = 1e-3
+    text = text_of(tmp_path, made)
+    assert "visibly wrong at no order. The paper says that Gstiff differs" in text
+    assert "There is no order at which both statements hold" in text
+    assert "visibly wrong at no order. The paper: obviously wrong." in text
+    assert "obviously wrong" not in text_of(tmp_path, made, quick=True)  # which is not of 100 s
+
+
+def test_the_step_needed_lies_between_one_that_suffices_and_one_that_does_not():
+    made = rows()
+    made = made[made["group"] == "GSTIFF stand-in"]
+    assert 0.005 < needed(made, gear(3)) < 0.01
+    assert needed(made, gear(1)) is None
+    assert needed(made, gear(5), 10.0) == 0.02  # the longest tried; nothing extrapolated
+
+
+def test_the_full_study_lists_its_runs_once():
+    case = four_bar.cases(False)[0]
+    made = motion.runs(case, False)
+    assert len({run.key(0) for run in made}) == len(made)
+    found = {(run.solver.name, run.value if run.solver.setting == "h" else None) for run in made}
+    assert found >= DRAWN
+    assert len(motion.runs(case, True)) < 40
 
 
 @pytest.fixture(scope="module")
@@ -17,18 +121,17 @@ def out(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def rows(out):
-    return load_rows(out / "motion.csv")[0]
+def made(out):
+    return pd.read_csv(out / "motion.csv", comment="#")
 
 
-def at(rows, order, step, start="accurate"):
-    return rows[(rows["solver"] == gear(order, start)) & (rows["h"] == step)].iloc[0]
+def at(made, order, step, start="accurate"):
+    return find(made, "GSTIFF stand-in", gear(order, start), step)
 
 
 def test_report_and_figures_can_be_drawn_again(out):
     text = (out / "motion.md").read_text()
-    assert "Assumed geometry" in text and "stand-in for ADAMS GSTIFF" in text
-    pictures = [out / f"motion_{name}.png" for name in ("short", "long", "error")]
+    pictures = [out / f"motion_{name}.{suffix}" for name in ("short", "long", "error") for suffix in ("png", "svg")]
     for picture in pictures:
         picture.unlink()
     motion.main(["--quick", "--out", str(out), "--redraw"])
@@ -37,40 +140,35 @@ def test_report_and_figures_can_be_drawn_again(out):
     assert (out / "motion_series.npz").stat().st_size < 300_000
 
 
-def test_the_stand_in_of_order_2_is_visibly_wrong_at_a_long_step_only(rows):
-    assert at(rows, 2, 0.02)["error_y3_short"] > 3.0 * VISIBLE
-    assert at(rows, 2, 0.01)["error_y3_short"] < VISIBLE < at(rows, 2, 0.01)["error_y3"]
-    assert at(rows, 2, 0.01)["energy"] < -0.5  # damped
+def test_the_stand_in_of_order_2_is_visibly_wrong_at_a_long_step_only(made):
+    assert at(made, 2, 0.02)["error_y3_short"] > 3.0 * VISIBLE
+    assert at(made, 2, 0.01)["error_y3_short"] < VISIBLE < at(made, 2, 0.01)["error_y3"]
+    assert at(made, 2, 0.01)["energy"] < -0.5  # damped
 
 
-def test_its_error_falls_with_the_step_as_its_order_says_after_an_accurate_start_only(rows):
+def test_its_error_falls_with_the_step_as_its_order_says_after_an_accurate_start_only(made):
     for order, start, least in ((2, "accurate", 1.8), (5, "accurate", 4.0)):
-        fall = at(rows, order, 0.01, start)["error_y3_short"] / at(rows, order, 0.005, start)["error_y3_short"]
+        fall = at(made, order, 0.01, start)["error_y3_short"] / at(made, order, 0.005, start)["error_y3_short"]
         assert np.log2(fall) > least
-    ramp = at(rows, 5, 0.01, "ramp")["error_y3_short"] / at(rows, 5, 0.005, "ramp")["error_y3_short"]
+    ramp = at(made, 5, 0.01, "ramp")["error_y3_short"] / at(made, 5, 0.005, "ramp")["error_y3_short"]
     assert np.log2(ramp) < 2.5
 
 
-def test_the_papers_procedures_reach_and_do_not_pass_zero(rows):
-    ours = rows[rows["solver"].isin(("PaperIRK", "PaperNewmark (beta = 1/2)"))]
+def test_the_papers_procedures_reach_and_do_not_pass_zero(made):
+    ours = made[made["solver"].isin((IRK, NEWMARK))]
     assert len(ours) == 2 and (ours["error_y3_short"] < 1e-5).all() and (ours["top"] < 1e-6).all()
     assert (ours["top_late"] > -1e-4).all()
 
 
-def test_a_run_that_fails_is_a_row_with_what_it_reached(rows):
-    failed = rows[rows["solver"] == "Exudyn, GeneralizedAlpha 1"].iloc[0]
+def test_a_run_that_fails_is_a_row_with_what_it_reached(made):
+    failed = made[made["solver"] == "Exudyn, GeneralizedAlpha 1"].iloc[0]
     assert failed["status"] == "SOLVER_FAILED" and np.isnan(failed["error_y3"])
     assert failed["error_y3_short"] > 0.0 and 2.0 < failed["good_until"] < 10.0
 
 
-def test_the_step_needed_lies_between_one_that_suffices_and_one_that_does_not(rows):
-    step = needed(rows, gear(5))
-    assert 0.01 < step < 0.02
-    assert np.isnan(needed(rows, gear(2)))
-    assert needed(rows, gear(5), 10.0) == 0.02  # the longest tried; nothing extrapolated
-
-
-def test_curves_of_the_figures_follow_the_truth(out):
-    series = load_series(out / "motion_series.npz")
-    ours = next(x for name, x in series.items() if name.startswith("PaperIRK") and name.endswith("long"))
-    assert np.abs(ours - series["truth long"]).max() < 5e-3  # a cubic between steps of 0.06 s
+def test_errors_between_the_steps_are_those_at_the_steps(made):
+    """The errors of y3 every 2 ms, from interpolated deviations, are no other than those at the common instants."""
+    both = made[(made["group"] == "line-up") & made["error_y3"].notna()]
+    assert (both["error_y3"] <= 1.5 * both["error_q"]).all()
+    fresh = both.set_index("solver").loc["Gauss12"]
+    assert fresh["error_y3"] < 1e-8  # with steps of some hundredths of a second

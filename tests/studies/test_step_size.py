@@ -1,61 +1,81 @@
-"""The step-size study: quick run, redraw, and what must hold in its rows."""
+"""The step-size study: its sentences turn with the rows, and what must hold in the rows of a quick run."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from studies import step_size
-from studies.report import load_rows, load_series
-from studies.solvers import IRK, NEWMARK, QUARTER
+from studies.cases import four_bar
+from studies.cli import Call
+from studies.render import number_of_words
+from studies.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.step_size import OTHERS, PAPER
+from studies.store import Output
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("step_size")
-    step_size.main(["--quick", "--out", str(folder)])
-    return folder
+def rows():
+    """Medians of a full run, made up but like them."""
+    good = {"status": "REACHED_END", "message": "", "problem": "four-bar", "t_end": 100.0, "repeat": 0, "period": 2.25}
+    good |= {"error_q": 1e-3, "cpu_s": 1.0, "n_evaluations": 1e5, "n_steps": 1000, "h_median": 0.06, "h_low": 0.02}
+    good |= {"h_high": 0.1, "h_max": 0.2, "share_steps": 0.99, "share_time": 0.999, "retried": 0.4}
+    good |= {"retried_switch": 0.5, "n_rejected_error": 400.0, "n_rejected_convergence": 50.0, "n_partitions": 101.0}
+    good |= {"err_out": np.nan, "tol": np.nan}
+    newmark = {"h_median": 3e-4, "n_steps": 300_000, "n_evaluations": 1e6, "retried": 1e-3, "retried_switch": 0.1}
+    told = {"n_partitions": None, "retried": None, "retried_switch": None}
+    told |= {"n_rejected_error": None, "n_rejected_convergence": None}
+    lines = []
+
+    def add(group, name, value, **more):
+        solver = CATALOGUE[name]
+        line = {"family": solver.family, "keeps_constraints": solver.keeps_constraints, "solver": name, "group": group}
+        lines.append({**good, **line, solver.setting: value, **more})
+
+    for name in PAPER:
+        add("paper", name, 1e-9, **({} if name == IRK else newmark))
+    for name in PRESETS:
+        add("two-loop", name, 1e-5)
+    for name in OTHERS:
+        add("others", name, 1e-5, **told)
+    return pd.DataFrame(lines)
 
 
-@pytest.fixture(scope="module")
-def rows(out):
-    return load_rows(out / "step_size.csv")[0].set_index("solver")
+def text_of(folder, made, quick=False):
+    curve = np.array([[0.0, 1.0, 2.0], [0.06, 0.05, 0.06]])
+    series = {f"{name} {kind}": curve for name in PAPER for kind in ("whole", "zoom", "error", "convergence", "switch")}
+    series |= {"truth": curve, f"{IRK} convergence": np.empty((2, 0))}  # no such attempt is no error
+    with Output(Call("step_size", quick, folder, False, "")) as output:
+        step_size.report(output, made, series, "stamp")
+    return (folder / "step_size.md").read_text()
 
 
-def test_report_and_figures_can_be_drawn_again(out):
-    text = (out / "step_size.md").read_text()
-    assert "Assumed geometry" in text and "99." in text
-    pictures = [out / name for name in ("step_size.png", "step_size_others.png")]
-    for picture in pictures:
-        picture.unlink()
-    step_size.main(["--quick", "--out", str(out), "--redraw"])
-    assert (out / "step_size.md").read_text() == text
-    assert all(picture.stat().st_size > 10_000 for picture in pictures)
-    assert (out / "step_size_series.npz").stat().st_size < 300_000
+def test_the_report_is_short_and_whole(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert number_of_words(text) < 1000
+    for name in ("step_size.png", "step_size.svg", "step_size_others.png", "step_size_others.svg"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    assert "[step_size.csv](step_size.csv)" in text and "not told" in text and "Runs that did not" not in text
 
 
-def test_runge_kutta_steps_are_mostly_longer_than_the_papers_002_s(rows):
-    assert rows.loc[IRK, "share_time"] > 0.99 and rows.loc[IRK, "share_steps"] > 0.95
-    assert 0.03 < rows.loc[IRK, "h_median"] < 0.1
-    assert rows.loc[NEWMARK, "share_steps"] == 0.0
+def test_sentences_turn_with_the_rows(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert "As the paper says, they are longer than 0.02 s most of the time." in text
+    assert "200 times as long as that of `PaperNewmark`" in text
+    assert "Runge–Kutta has its attempts rejected more often." in text
+    assert "100 times, 2.2 times a period. In all 10 two-loop runs" in text
 
-
-def test_newmarks_steps_differ_by_the_cube_root_of_their_error_constants(rows):
-    ratio = rows.loc[QUARTER, "h_median"] / rows.loc[NEWMARK, "h_median"]
-    assert ratio == pytest.approx(4.0 ** (1.0 / 3.0), rel=0.05)
-
-
-def test_rejections_are_shares_of_steps_and_known_for_ours(rows):
-    assert rows["retried"].notna().all() and rows["retried"].between(0.0, 1.0).all()
-    irk = rows.loc[IRK]
-    assert irk["retried"] > 10.0 * rows.loc[NEWMARK, "retried"] > 0.0
-    assert irk["retried"] * irk["n_steps"] <= irk["n_rejected_error"] + irk["n_rejected_convergence"]
-
-
-def test_curves_hold_the_marks_and_the_whole_run(out):
-    series = load_series(out / "step_size_series.npz")
-    whole = next(x for name, x in series.items() if name.startswith(IRK) and name.endswith("whole"))
-    errors = next(x for name, x in series.items() if name.startswith(IRK) and name.endswith("error"))
-    assert whole[0, 0] == 0.0 and 9.8 < whole[0, -1] < 10.0
-    assert errors.shape[1] > 10 and np.isin(errors[1], whole[1]).all()
+    made = rows()
+    ours = made["group"] != "others"
+    made.loc[made["solver"] == IRK, ["share_time", "h_median", "retried"]] = [0.3, 1e-4, 1e-4]
+    made.loc[ours, "retried_switch"] = 0.0
+    made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
+    text = text_of(tmp_path, made)
+    assert "that does not hold here" in text and "contrary to the paper" in text
+    assert "rejected no more often" in text and "In none of the 10 two-loop runs" in text
+    assert "| solver failed | why |" in text
+    made.loc[made["solver"] == "Gauss6", "retried_switch"] = 0.9
+    assert "In 1 of the 10 two-loop runs" in text_of(tmp_path, made)
+    made["retried_switch"] = np.nan
+    assert "No run says how often" in text_of(tmp_path, made)
 
 
 def test_of_many_steps_the_extremes_are_drawn():
@@ -66,3 +86,59 @@ def test_of_many_steps_the_extremes_are_drawn():
     assert drawn.shape[1] <= step_size.CURVE
     assert drawn[1].min() == 1e-5 and drawn[1].max() == 1e-1
     assert np.array_equal(step_size._curve(t[:9], h[:9]), [t[:9], h[:9]])
+
+
+def test_the_full_study_lists_its_runs_once():
+    made = step_size.runs(four_bar.cases(False)[0], False)
+    assert len({run.key(0) for run in made}) == len(made)
+    assert "IDA, stabilised" in {run.solver.name for run in made}
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("step_size")
+    step_size.main(["--quick", "--out", str(folder)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(out):
+    return pd.read_csv(out / "step_size.csv", comment="#").set_index("solver")
+
+
+def test_report_and_figures_can_be_drawn_again(out):
+    text = (out / "step_size.md").read_text()
+    pictures = [out / f"step_size{name}.{suffix}" for name in ("", "_others") for suffix in ("png", "svg")]
+    for picture in pictures:
+        picture.unlink()
+    step_size.main(["--quick", "--out", str(out), "--redraw"])
+    assert (out / "step_size.md").read_text() == text
+    assert all(picture.stat().st_size > 10_000 for picture in pictures)
+    assert (out / "step_size_series.npz").stat().st_size < 300_000
+
+
+def test_runge_kutta_steps_are_mostly_longer_than_the_papers_002_s(made):
+    assert made.loc[IRK, "share_time"] > 0.99 and made.loc[IRK, "share_steps"] > 0.95
+    assert 0.03 < made.loc[IRK, "h_median"] < 0.1
+    assert made.loc[NEWMARK, "share_steps"] == 0.0
+
+
+def test_newmarks_steps_differ_by_the_cube_root_of_their_error_constants(made):
+    ratio = made.loc[QUARTER, "h_median"] / made.loc[NEWMARK, "h_median"]
+    assert ratio == pytest.approx(4.0 ** (1.0 / 3.0), rel=0.05)
+
+
+def test_rejections_are_shares_of_steps_and_known_for_ours(made):
+    ours = made[made["family"] == "two-loop"]
+    assert ours["retried"].notna().all() and ours["retried"].between(0.0, 1.0).all()
+    assert made[made["family"] != "two-loop"]["retried"].isna().all()
+    irk = made.loc[IRK]
+    assert irk["retried"] > 10.0 * made.loc[NEWMARK, "retried"] > 0.0
+    assert irk["retried"] * irk["n_steps"] <= irk["n_rejected_error"] + irk["n_rejected_convergence"]
+
+
+def test_curves_hold_the_marks_and_the_whole_run(out):
+    with np.load(out / "step_size_series.npz") as series:
+        whole, errors = series[f"{IRK} whole"], series[f"{IRK} error"]
+    assert whole[0, 0] == 0.0 and 9.8 < whole[0, -1] < 10.0
+    assert errors.shape[1] > 10 and np.isin(errors[1], whole[1]).all()
