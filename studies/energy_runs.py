@@ -106,7 +106,9 @@ CONTROLLED: dict[str, dict[str, list[Variant]]] = {
 TOL, ERR_OUT = 1e-5, 1e-7  # Rtol = Atol; err_out of PaperNewmark
 LSODA, PROJECTED = "LSODA, index 1", "DOP853, projected"
 ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
-OTHERS: dict[str, dict[str, tuple[float, ...]]] = {  # solver: values of its setting, of which a quick run takes the first
+OTHERS: dict[
+    str, dict[str, tuple[float, ...]]
+] = {  # values of the setting; quick: the first
     SWITCHING: {
         OWN_EXPLICIT: (1e-6, 1e-8, 1e-10, 1e-12),
         "Gauss12": (1e-5, 1e-7),
