@@ -241,7 +241,7 @@ def choice_table(found: dict[str, Any]) -> str:
                 line += ["none" if kind in at else "–", ""] if run is None else [_setting(run), number(run["cpu_s"])]
         lines.append(line)
     header = ["largest energy error", "no drift: ours", "CPU (s)", "no drift: other", "CPU (s)"]
-    return table([*header, "drifting: ours", "CPU (s)", "drifting: other", "CPU (s)"], lines)
+    return table([*header, "not free of it: ours", "CPU (s)", "not free of it: other", "CPU (s)"], lines)
 
 
 def _setting(run: dict[str, Any]) -> str:
@@ -360,7 +360,7 @@ def _points(axes: Axes, points: pd.DataFrame, what: str, label: str) -> None:
 
 def series_of(rows: pd.DataFrame) -> tuple[pd.DataFrame, Series]:
     """The rows without the windows of their runs, and these as series, named by the place of the row."""
-    series = {}
+    series: Series = {}
     for key, row in rows.iterrows():
         if isinstance(row["window_t"], list):
             series |= {f"t{key}": np.array(row["window_t"]), f"mean{key}": np.array(row["window_mean"])}

@@ -37,7 +37,7 @@ from studies.energy_drift import (
     verdict,
     windows,
 )
-from studies.energy_runs import H, LONG, TURNING, case_of, crank, instants, measure, period_of, runs
+from studies.energy_runs import LONG, TURNING, H, case_of, crank, instants, measure, period_of, runs
 from studies.render import number_of_words
 from studies.solvers import IDA_C, OWN_EXPLICIT
 from studies.store import Output
@@ -200,7 +200,7 @@ def test_failed_and_lost_runs_are_shown(rows, text_of):
     rows = changed(rows, f"{ON_ONE}'{BDF_LOOP}'", energy=math.nan, swing=math.nan, **gone)
     text = text_of(changed(rows, f"case == '{SWITCHING}' and solver == 'LSODA, index 1'", lost=True))
     assert "not converged at 0.1 s |" in text and "## Runs that did not reach the end" in text
-    assert "| `LSODA, index 1`, 1e-6 | Python | lost |" in text
+    assert "| `LSODA, index 1`, 1e-8 | Python | lost |" in text
 
 
 def test_a_run_that_does_not_converge_is_a_row():
