@@ -81,3 +81,9 @@ def verdict(row: pd.Series) -> str:
 def bound(row: pd.Series) -> float:
     """The greatest change of the energy over a run, J, that the scatter of its windows does not exclude."""
     return float((abs(row["slope"]) + RESOLVED * row["slope_error"]) * row["t_end"])
+
+
+def name_of(row: pd.Series) -> str:
+    """Method with what is not the default."""
+    extra = ["momenta"] * (row["variables"] == "momenta") + ["symmetric partition"] * (row["partition"] == "symmetric")
+    return ", ".join([row["solver"], *extra])
