@@ -10,7 +10,7 @@ import pandas as pd
 
 from studies import cli
 from studies.claims import beam, errata, experiments, introduction, linkage, method
-from studies.claims.rows import STUDIES, Rows, read, stamps
+from studies.claims.rows import STUDIES, Rows, read
 from studies.claims.verdicts import Claim, Judge, Judgement, Verdict, load
 from studies.cli import Call, StudyError
 from studies.index import write_index
@@ -33,12 +33,16 @@ def judged(rows: Rows) -> dict[str, tuple[Claim, Judgement]]:
 
 def findings_of(pairs: Judged) -> dict[str, Any]:
     """Verdicts and numbers by claim, and how many of each verdict."""
+    circular: dict[str, list[str]] = {}
+    for key, (claim, each) in pairs.items():
+        if each.verdict is Verdict.CIRCULAR:
+            circular.setdefault(claim.circular, []).append(key)
     counts = Counter(found.verdict.value for _, found in pairs.values())
     return {
         "n": len(pairs),
         "counts": {verdict.value: counts[verdict.value] for verdict in Verdict},
         "claims": {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()},
-        "circular": {key: claim.circular for key, (claim, each) in pairs.items() if each.verdict is Verdict.CIRCULAR},
+        "circular": [{"why": why, "claims": keys} for why, keys in circular.items()],
         "not_run": {key: each.why for key, (_, each) in pairs.items() if each.verdict is Verdict.NOT_RUN},
     }
 
@@ -67,7 +71,7 @@ def claims_table(pairs: Judged) -> str:
 def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
     """Write findings, rows and both reports; the findings."""
     pairs = judged(rows)
-    findings = findings_of(pairs) | {"experiments": dict(rows.experiments), "sources": stamps(output.path)}
+    findings = findings_of(pairs) | {"experiments": dict(rows.experiments)}
     output.save_findings(findings)
     output.save_rows(csv_rows(pairs), line)
     more = {"stamp": line, "quick": output.call.quick}

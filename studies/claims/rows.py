@@ -42,17 +42,6 @@ def read(folder: Path) -> dict[str, pd.DataFrame]:
     return found
 
 
-def stamps(folder: Path) -> dict[str, str]:
-    """Command, date and commit of the rows, by study."""
-    found = {}
-    for name in STUDIES:
-        path = folder / f"{name}.csv"
-        if path.is_file():
-            parts = path.read_text().split("\n", 1)[0].removeprefix("# ").split("; ")
-            found[name] = ", ".join(part for part in parts if part.startswith(("20", "commit")))
-    return found
-
-
 def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
     if name == "beam" and "error_tip" in table:  # the error by which the beams are judged
         table["error_q"] = table["error_tip"]
