@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 
 BUFFER_ROWS = 1024
 BUFFER_STEPS = 4096
-FIRST_CHUNK = 32  # attempts before Python looks for the first time; twice as many each time up to BUFFER_STEPS
+FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
+FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
+SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
@@ -87,7 +89,8 @@ class Run:
         self.control[advance.PREDICTIVE] = plan.predictive
         self.control[advance.LEAST_ERROR] = plan.least_error
         self.control[advance.MAX_STEPS] = np.inf
-        self.control[advance.MAX_ATTEMPTS] = FIRST_CHUNK
+        first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
+        self.control[advance.MAX_ATTEMPTS] = max(1, first_chunk // max(1, system.n_q // SMALL))
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
         self.clock[advance.H_LIMIT] = plan.limit_start
