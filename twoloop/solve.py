@@ -91,8 +91,8 @@ def solve_dae(
     progress : bool, optional
         True: show a bar (needs the package rich).
     time_limit : float, optional
-        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is looked at about every 0.1 s, but not
-        within a step, and of a small system not before a thousand steps.
+        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is looked at about every 0.1 s, but
+        not within a step, and for a small compiled system not before a thousand steps.
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences, at the first start of a system and at a few
         states of every run, outside the time that `stats.cpu_time` counts.
