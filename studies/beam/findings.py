@@ -76,6 +76,8 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     found: dict[str, Any] = {"name": name, "w_max": w_max, "t_end": float(paper["t_end"]), "paper": ours}
     found["figure"] = f"beam_{name.replace(' ', '_')}.png"
     found["at"] = [at(runs[runs["solver"] != EXUDYN], error) for error in TARGETS]
+    best = [None if line["best"] is None else line["best"]["solver"] for line in found["at"]]
+    found["one_best"] = best[0] is not None and len(set(best)) == 1
     known = [line for line in found["at"] if line["newmark_over_paper"] is not None]
     found["newmark_cheaper"] = [line["error"] for line in known if line["newmark_over_paper"] < 1.0]
     found["newmark_dearer"] = [line["error"] for line in known if line["newmark_over_paper"] >= 1.0]
