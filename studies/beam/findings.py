@@ -22,6 +22,7 @@ from studies.beam.runs import (
 )
 from studies.cases.beam import SOFT, STIFF
 from studies.cli import StudyError
+from studies.render import number
 from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
 
 TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
@@ -30,6 +31,7 @@ PAPER_STEPS = {SOFT: 1e-3, STIFF: 1e-5}  # s, its step sizes by order of magnitu
 EXPLICIT_SOLVERS = (OWN_EXPLICIT, EXPLICIT)
 NEWTONS = (NEWTON, NEWTON_4, NEWTON_5, NEWTON_GAUSS)
 STIFF_E = 2e8  # N/m^2
+STEPS_OVER = 10.0  # h w_max from which a step does not follow the fastest vibration: more than one and a half periods
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -49,6 +51,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "growth_w_max": w_max[STIFF] / w_max[SOFT],
     }
     found["growth_as_frequency"] = bool(0.5 < growth["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
+    own = runs[(runs["solver"] == EXUDYN) & runs["error_tip"].notna()]
+    found["exudyn"] = [number(1e3 * float(floor)) for floor in own.groupby("case", sort=False)["floor"].first()]
     found["n_failed"], found["n_runs"] = int((runs["status"] != "REACHED_END").sum()), len(runs)
     return found | _limits(rows) | _growth(rows)
 
@@ -76,12 +80,14 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     found: dict[str, Any] = {"name": name, "w_max": w_max, "t_end": float(paper["t_end"]), "paper": ours}
     found["figure"] = f"beam_{name.replace(' ', '_')}.png"
     found["at"] = [at(runs[runs["solver"] != EXUDYN], error) for error in TARGETS]
+    largest = runs[runs["error_tip"].notna()].groupby("solver")[["error_tip", "floor"]].max()
+    found["unresolved"] = sorted(str(name) for name in largest.index[largest["error_tip"] <= largest["floor"]])
+    found |= _longest_step(runs[runs["solver"] != EXUDYN], w_max)
     best = [None if line["best"] is None else line["best"]["solver"] for line in found["at"]]
     found["one_best"] = best[0] is not None and len(set(best)) == 1
     known = [line for line in found["at"] if line["newmark_over_paper"] is not None]
     found["newmark_cheaper"] = [line["error"] for line in known if line["newmark_over_paper"] < 1.0]
     found["newmark_dearer"] = [line["error"] for line in known if line["newmark_over_paper"] >= 1.0]
-    found["exudyn"] = _exudyn(runs[runs["solver"] == EXUDYN])
     return found | _sensitivity(rows, name)
 
 
@@ -109,15 +115,14 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     return found
 
 
-def _exudyn(runs: pd.DataFrame) -> dict[str, Any] | None:
-    """Exudyn's least error on its own cable, and the time of that run; None where it was not run."""
-    reached = runs[runs["error_tip"].notna()]
-    if reached.empty:
-        return None
-    best = reached.loc[reached["error_tip"].astype(float).idxmin()]
-    within = [{"error": error, "cpu_s": tables.time_for(reached, error)} for error in TARGETS]
-    found = {"error": best["error_tip"], "cpu_s": best["cpu_s"], "floor": best["floor"]}
-    return found | {"at": [line for line in within if np.isfinite(line["cpu_s"])]}
+def _longest_step(runs: pd.DataFrame, w_max: float) -> dict[str, Any]:
+    """The longest median step, times w_max, of a run within 1 mm, and whether it steps over the fastest vibrations."""
+    good = runs[(runs["error_tip"] <= TARGETS[1]) & runs["h_median"].notna()]
+    if good.empty:
+        return {"longest": None, "steps_over": False}
+    run = good.loc[good["h_median"].astype(float).idxmax()]
+    x = float(run["h_median"]) * w_max
+    return {"longest": {"solver": run["solver"], "x": x}, "steps_over": x > STEPS_OVER}
 
 
 def _first(ranked: pd.DataFrame) -> dict[str, Any] | None:

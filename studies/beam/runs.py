@@ -12,7 +12,7 @@ from studies.bench import Array, Case, Run, Solver
 from studies.cases import beam
 from studies.cases.beam import SOFT, STIFF
 from studies.metrics import ASTRAY
-from studies.solvers import CATALOGUE, IDA_C, IDA_C_ORDER_2, IRK, NEWMARK, OWN_EXPLICIT, QUARTER, two_loop
+from studies.solvers import CATALOGUE, IDA_C, IDA_C_ORDER_2, IRK, NEWMARK, OWN_EXPLICIT, QUARTER
 from twoloop import ConstrainedSystem, Result, RungeKutta, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.ancf_beam import tip_height
@@ -34,12 +34,13 @@ LOOSE = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4)  # of runs with Newton's method, re
 PAPER_TOLERANCES = (1e-1, 1e-3, PAPER_TOL, 1e-7)  # its error is that of rounding from the loosest on
 ERR_OUT = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 3e-10)  # of PaperNewmark
 NEWMARK_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # its steps shrink with the cube root
-SLOW_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)  # of SciPy's implicit solvers
-PEER_TOLERANCES = (1e-2, 1e-4, 1e-6)  # of the package solve_dae, all Python
+SLOW_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)  # of SciPy's implicit solvers
+PEER_TOLERANCES = (1e-2, 1e-4)  # of the package solve_dae, all Python
 PEERS = ("Radau, solve_dae", "Radau9, solve_dae", "BDF, solve_dae")
 EXUDYN_STEPS = (1000, 2000, 5000, 10_000, 20_000, 50_000)
 EXUDYN_FINE = (100_000, 200_000)  # of the motion against which Exudyn is judged: its own
 INSTANTS = 1000
+ONCE = (PAPER, NEWMARK, QUARTER, NEWTON_GAUSS, "SunRadau5", "Gauss6", "Newmark")  # seconds a run on the stiff beam
 QUICK = (PAPER, NEWTON, NEWTON_4, "BDF", "Gauss6", OWN_EXPLICIT)  # IDA takes seconds to compile
 QUICK_TOLERANCES = (1e-1, 1e-3)
 
@@ -55,7 +56,8 @@ def with_less_known(problem: Problem, tangent: bool = False) -> ConstrainedSyste
 
 
 def _two_loop(method: str | Method, case: Case, tol: float, repeat: int) -> Result:
-    return two_loop(method, case.problem, case.t_end, tol, repeat)
+    problem, span = case.problem, (0.0, case.t_end)
+    return solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
 
 
 def _by_differences(case: Case, tol: float, repeat: int) -> Result:
@@ -109,7 +111,7 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
             values = values_of(solver, case)
             if quick:
                 values = (PAPER_TOL,) if solver.name == PAPER else QUICK_TOLERANCES
-            long = solver.called_from == "Python" or (name == STIFF and solver.name in (PAPER, NEWMARK, QUARTER))
+            long = solver.called_from == "Python" or (name == STIFF and solver.name in ONCE)
             for value in values:
                 short = (
                     not quick and not long and (solver.setting == "h" or value in LOOSE or solver.family != "two-loop")
