@@ -1,6 +1,7 @@
 """The beam study: its measures, its sentences on changed rows, the quick run."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -317,3 +318,9 @@ def test_what_stiffness_does_to_newton_and_to_fixed_point_iteration(quick_rows):
         grown[solver] = each[-1] / each[0]
     assert grown[PAPER] > 2.5  # sqrt(10), as the frequencies
     assert grown[NEWTON] < 2.0
+
+
+def test_a_case_names_its_own_tolerances():
+    soft = next(case for case in load(True) if case.name == "very flexible beam")
+    assert beam_runs.solvers()["BDF"].grid(soft) == soft.tolerances
+    assert beam_runs.solvers()["BDF"].grid(replace(soft, tolerances=None)) == beam_runs.solvers()["BDF"].values
