@@ -1,106 +1,255 @@
-"""The beam study: quick run, redraw, what must hold in its rows, and its measures by themselves."""
+"""The beam study: its measures, its sentences on changed rows, the quick run."""
+
+import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from studies import beam
-from studies.beam_limits import PAPER_SWEEPS, bisect, free_limit, frequencies, gauss_seidel_rate, jacobi_rate
-from studies.beam_report import goals
-from studies.beam_runs import (
-    BDF,
-    CASES,
-    NEWTON,
-    PAPER,
-    SOFT,
-    STIFF,
-    BeamJob,
-    collect,
-    measure,
-    thinned,
-    true_motion,
-)
-from studies.beam_tables import cheapest, cpu_for
-from studies.report import load_rows, load_series, save_rows
+from studies import beam, index
+from studies.beam import runs as beam_runs
+from studies.beam import study
+from studies.beam.findings import TARGETS, findings_of
+from studies.beam.growth import CHANGES, MESH, START
+from studies.beam.limits import GAUSS_SEIDEL, JACOBI, bisect, free_limit, frequencies, gauss_seidel_rate, jacobi_rate
+from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, PAPER_TOL, cases, measure, runs, tip_error
+from studies.bench import Run, attempt
+from studies.cases import load
+from studies.cases.beam import MAKE, SOFT, STIFF
+from studies.cli import Call, StudyError
+from studies.render import number_of_words
+from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
+from studies.store import Output
+from studies.tables import medians
 from twoloop import solve_dae
-from twoloop.mechanisms import ancf_beam, four_bar
+from twoloop.mechanisms import ancf_beam
 from twoloop.tableaux import gauss, sun_radau_iib
 
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("beam")
-    beam.main(["--quick", "--out", str(folder)])
-    return folder
+W_MAX = {SOFT: 3358.5, STIFF: 33585.0}
 
 
-@pytest.fixture(scope="module")
-def rows(out):
-    return load_rows(out / "beam.csv")[0]
+def rows(t_end=2.0):
+    """Rows like those of a full run, made up: medians of three solvers' runs and of all else."""
+    common = {"group": "run", "status": "REACHED_END", "message": "", "t_end": t_end, "floor": 1e-9, "repeat": 0}
+    common |= {"called_from": "compiled", "keeps_constraints": True, "violation_q": 1e-17, "violation_v": 1e-17}
+    common |= {"energy": np.nan, "n_rejected": 100.0, "n_rejected_convergence": 80.0, "tol": np.nan, "h": np.nan}
+    times = {PAPER: 5.0, NEWMARK: 2.0, QUARTER: 1.0, "BDF": 0.3, NEWTON: 0.05, OWN_EXPLICIT: 0.2, IDA_C: 0.4}
+    times |= {IDA_C_ORDER_2: 0.1, DIFFERENCES: 0.06, EXUDYN: 0.5}
+    families = {IDA_C: "SUNDIALS", IDA_C_ORDER_2: "SUNDIALS", EXUDYN: "Exudyn"}
+    made = []
+    for case, factor in ((SOFT, 1.0), (STIFF, 10.0)):
+        for solver, seconds in times.items():
+            for k, error in enumerate((1e-1, 5e-3, 5e-4, 5e-5)):
+                line = {"case": case, "solver": solver, "family": families.get(solver, "two-loop"), "error_q": error}
+                line |= {"error_tip": error, "cpu_s": factor * seconds * (k + 1), "n_evaluations": factor * 1e5}
+                line |= {"n_steps": factor * 1e3, "h_median": 1.0 / W_MAX[case], "h_max": 2.0 / W_MAX[case]}
+                made.append({**common, **line, "tol": PAPER_TOL if solver == PAPER and k == 3 else 10.0**-k})
+    limits = {GAUSS_SEIDEL: (3.221, 0.457), JACOBI: (4.64, 3.9)}
+    for solver, (theory, measured) in limits.items():
+        line = {"group": "limit", "solver": solver, "theory": theory, "measured": measured, "free": 3.225}
+        made.append(line)
+    made += [{"group": "growth test", "solver": GAUSS_SEIDEL, "tol": 10.0**-k, "measured": 0.9 / k} for k in (1, 2, 8)]
+    for case, w_max in W_MAX.items():
+        for k, measured in enumerate((0.03, 0.9, 1.1, 1.5)):
+            line = {"group": "along", "case": case, "measured": measured, "w_max": 1.01 * w_max, "straight": w_max}
+            made.append({**line, "t_end": 0.1 * k})
+        for change in CHANGES:
+            largest = {MESH: 0.4 if case == SOFT else 0.03, START: 0.4 if case == SOFT else 3e-4}.get(change, 1e-3)
+            made.append({"group": "sensitivity", "case": case, "solver": change, "before": largest, "largest": largest})
+    for kind, steps in (("dense", 2.0), ("banded", 1.0)):
+        for n in (4, 64):
+            made.append({"group": "elements", "solver": kind, "n_elements": n, "n_steps": 50.0, "cpu_s": steps * n})
+    for modulus in (2e8, 2e10):
+        for solver, tol, count in ((PAPER, 1e-5, 1e-3 * modulus**0.5), (NEWTON, 1e-2, 100.0)):
+            line = {"group": "modulus", "modulus": modulus, "solver": solver, "tol": tol, "t_end": 2.0, "floor": 0.0}
+            made.append({**line, "n_evaluations": count, "error_q": 1e-5 if solver == NEWTON else np.nan})
+    return pd.DataFrame(made)
 
 
-def pick(rows, **equal):
-    for column, value in equal.items():
-        rows = rows[rows[column] == value]
-    return rows
+def text_of(tmp_path, made, quick=False):
+    with Output(Call("beam", quick, tmp_path, False, "")) as output:
+        study.report(output, made, "stamp")
+    return (tmp_path / "beam.md").read_text()
 
 
-def test_report_and_figures_can_be_drawn_again(out):
-    text = (out / "beam.md").read_text()
-    assert "The start is assumed" in text and "nan" not in text
-    pictures = [out / f"beam_{name}.png" for name in ("motion", "cost", "sensitivity", "growth")]
-    for picture in pictures:
-        picture.unlink()
-    beam.main(["--quick", "--out", str(out), "--redraw"])
-    assert (out / "beam.md").read_text() == text
-    assert all(picture.stat().st_size > 10_000 for picture in pictures)
-    assert (out / "beam_series.npz").stat().st_size < 300_000
+def test_the_report_is_short_and_whole(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert number_of_words(text) < 1100 and "nan" not in text
+    for name in ("beam_very_flexible", "beam_moderately_stiff", "beam_growth"):
+        assert f"({name}.png)" in text
+        assert (tmp_path / f"{name}.png").exists() and (tmp_path / f"{name}.svg").exists()
+    found = json.loads((tmp_path / "beam.json").read_text())
+    assert [at["error"] for at in found["cases"][0]["at"]] == [1e-2, 1e-3, 1e-4] == list(TARGETS)
+    assert "4.64" in text and "3.22" in text and "0.457" in text
 
 
-def test_a_failed_run_is_a_row_of_the_report(out, rows, tmp_path):
-    for name in ("beam.csv", "beam_series.npz"):
-        (tmp_path / name).write_bytes((out / name).read_bytes())
-    failed = rows.copy()
-    what = pick(rows, group="run", solver=BDF, case=STIFF).index[0]
-    failed.loc[what, ["error_tip", "error_middle", "error_energy"]] = np.nan
-    failed.loc[what, ["status", "t_reached"]] = ["NOT_CONVERGED", 0.05]
-    save_rows(tmp_path / "beam.csv", failed, "changed by a test")
-    beam.main(["--quick", "--out", str(tmp_path), "--redraw"])
-    assert "| not converged at 0.05 s |" in (tmp_path / "beam.md").read_text()
+def test_the_advice_turns_with_the_rows(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert f"Moderately stiff: take `{NEWTON}` at each of these errors." in text
+    assert f"| moderately stiff | 0.1 mm | `{NEWTON}` 1.8 s | `{IDA_C_ORDER_2}` 3.7 s | 2.0 |" in text
+    assert (
+        "its Newmark procedure, which takes less time" in text
+        and "Runge–Kutta takes less time than Newmark" not in text
+    )
+    made = rows()
+    made.loc[made["solver"] == IDA_C_ORDER_2, "cpu_s"] /= 100.0
+    made.loc[made["solver"] == PAPER, "cpu_s"] /= 100.0
+    text = text_of(tmp_path, made)
+    assert f"Moderately stiff: take `{IDA_C_ORDER_2}` at each of these errors; it is not ours." in text
+    assert "Runge–Kutta takes less time than Newmark" in text and "its Newmark procedure, which" not in text
+    made = rows()
+    made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "cpu_s"] = 1e-3
+    text = text_of(tmp_path, made)
+    assert f"take `{IDA_C_ORDER_2}` (not ours) for 10 mm, `{IDA_C_ORDER_2}` (not ours) for 1 mm, `{NEWTON}` for" in text
+    made = rows()
+    loosest = made["error_tip"] > 1e-3
+    made.loc[(made["solver"] == PAPER) & loosest & (made["case"] == STIFF), "cpu_s"] = 0.1
+    assert "of the paper's procedures Newmark is cheaper at 1e-4 m, Runge–Kutta at 1e-2 and 1e-3 m" in text_of(
+        tmp_path, made
+    )
 
 
-def test_every_quick_run_follows_the_reference(rows):
-    runs = pick(rows, group="run")
-    assert (runs["status"] == "REACHED_END").all()
-    assert runs["error_tip"].max() < 1e-3
-    assert pick(rows, group="truth")["error_tip"].max() < 1e-8
+def test_the_cheapest_implicit_method_may_be_bdf():
+    made = rows()
+    assert findings_of(medians(made))["cases"][0]["at"][0]["implicit"]["solver"] == NEWTON
+    made.loc[made["solver"] == "BDF", "cpu_s"] = 1e-3
+    made.loc[made["solver"] == OWN_EXPLICIT, "cpu_s"] = 1e-4
+    at = findings_of(medians(made))["cases"][0]["at"][0]
+    assert at["implicit"]["solver"] == "BDF" and at["best"]["solver"] == OWN_EXPLICIT and at["best"]["explicit"]
 
 
-def test_newton_takes_far_fewer_evaluations_in_the_stiff_case(rows):
-    counts = {
-        solver: pick(rows, group="run", case=STIFF, solver=solver)["n_evaluations"].min() for solver in (PAPER, NEWTON)
-    }
-    assert counts[PAPER] > 300.0 * counts[NEWTON]
+def test_what_matters_more_is_said_for_each_beam(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert "Very flexible: the mesh and the assumed start matter more" in text
+    assert "Moderately stiff: the mesh matters more than 0.1 % of E or g; the assumed start does not." in text
+    assert "All three errors are below that" in text
+    made = rows()
+    sensitivity = made["group"] == "sensitivity"
+    made.loc[sensitivity & made["solver"].isin((MESH, START)) & (made["case"] == SOFT), "largest"] = 5e-4
+    made.loc[sensitivity & (made["solver"] == MESH) & (made["case"] == STIFF), "largest"] = 9e-4
+    made.loc[sensitivity & (made["solver"] == START) & (made["case"] == STIFF), "largest"] = 2e-3
+    text = text_of(tmp_path, made)
+    assert "Very flexible: neither the mesh nor the assumed start matters more" in text
+    assert "Moderately stiff: the assumed start matters more than 0.1 % of E or g; the mesh does not." in text
+    assert "All three errors are below that" not in text and "Errors of 0.1 mm are below that" in text
 
 
-def test_the_papers_steps_are_of_its_orders_of_magnitude(rows):
-    steps = {case: pick(rows, group="run", case=case, solver=PAPER)["h_median"].iloc[0] for case in CASES}
-    assert 1e-4 < steps[SOFT] < 3e-3
-    assert 1e-5 < steps[STIFF] < 1e-4
+def test_the_step_limit_is_reconciled_by_numbers_or_not(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert "So 0.457 is no limit of a run's steps" in text
+    assert "With 1e-1 and 1e-8 in place of 1e-2 it is 0.90 and 0.11" in text
+    made = rows()
+    made.loc[(made["group"] == "along"), "measured"] = 0.2  # shorter than the accepted steps
+    assert "do not explain in both beams" in text_of(tmp_path, made)
+    made = rows()
+    made.loc[made["group"] == "growth test", "measured"] = 0.457
+    text = text_of(tmp_path, made)
+    assert "do not explain in both beams" in text and "It hardly depends on these 1e-2" in text
 
 
-def test_sweeps_have_the_rates_and_limits_of_theory(rows):
-    limits = pick(rows, group="limit").set_index("solver")
-    others = limits.drop(index=PAPER_SWEEPS)
-    np.testing.assert_allclose(others["rate"], others["rate_theory"], rtol=0.06)
-    assert (limits["measured"] < 1.001 * limits["theory"]).all()
-    for beta, limit in ((0.25, 2.0), (0.5, np.sqrt(2.0))):
-        row = limits.loc[f"Newmark, beta = {beta:g}"]
-        assert abs(row["theory"] - limit) < 1e-9 and row["measured"] > 0.93 * limit
-    assert abs(limits.loc[PAPER_SWEEPS, "free"] / limits.loc[PAPER_SWEEPS, "theory"] - 1.0) < 3e-3
+def test_growth_turns_with_the_rows(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert "the step limit of fixed-point iteration explains it" in text and "hardly change (1.0 times)" in text
+    made = rows()
+    made.loc[(made["case"] == STIFF) & (made["solver"] == PAPER), "n_evaluations"] *= 10.0
+    made.loc[(made["modulus"] == 2e10) & (made["solver"] == NEWTON), "n_evaluations"] *= 5.0
+    text = text_of(tmp_path, made)
+    assert "the step limit alone does not explain it" in text and "grow by 5.0 times" in text
 
 
-def test_theory_of_the_sweeps():
+def test_failures_and_what_is_not_there_are_told(tmp_path):
+    made = rows()
+    peer = made[made["solver"] == "BDF"].iloc[:1].assign(solver="Radau, solve_dae", family="solve_dae")
+    peer = peer.assign(status="NOT_AVAILABLE", message="the package solve_dae is not installed")
+    numbers = ["error_q", "error_tip", "cpu_s", "n_evaluations", "n_steps", "h_median"]
+    text = text_of(tmp_path, pd.concat([peer.assign(**dict.fromkeys(numbers, np.nan)), made], ignore_index=True))
+    assert "the package solve_dae is not installed" in text and "| not available |" in text
+    assert "Runs that did not reach the end" not in text_of(tmp_path, made)
+    with pytest.raises(StudyError, match="lack those of group 'along'"):
+        findings_of(made[made["group"] != "along"])
+
+
+def test_exudyn_is_judged_by_its_own_motion_and_not_ranked(tmp_path):
+    made = rows()
+    made.loc[made["solver"] == EXUDYN, "cpu_s"] = 1e-6
+    found = findings_of(medians(made))["cases"][0]
+    assert found["at"][0]["best"]["solver"] != EXUDYN
+    assert "settled to 1e-6 and 1e-6 mm, and not ranked" in text_of(tmp_path, made)
+    assert "Exudyn's cable" not in text_of(tmp_path, made[made["solver"] != EXUDYN])
+
+
+def test_whether_vibrations_are_stepped_over_is_read_from_the_steps(tmp_path):
+    text = text_of(tmp_path, rows())
+    assert text.count("the fast vibrations have to be followed") == 2
+    made = rows()
+    made.loc[(made["case"] == STIFF) & (made["solver"] == NEWTON), "h_median"] = 200.0 / W_MAX[STIFF]
+    text = text_of(tmp_path, made)
+    assert f"Moderately stiff: the fast vibrations need not be followed. Within 1 mm `{NEWTON}`" in text
+    assert text.count("the fast vibrations have to be followed") == 1
+
+
+def test_the_study_lists_all_cells_once():
+    known = cases(False)
+    made = list(runs(known, False))
+    assert len({run.key(0) for run in made}) == len(made)
+    names = {run.solver.name for run in made}
+    assert {PAPER, NEWTON, DIFFERENCES, "BDF", OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2, EXUDYN} <= names
+    assert {"Radau, index 1", "BDF, index 1", "Radau, solve_dae", "BDF, solve_dae"} <= names
+    own = next(run for run in made if run.solver.name == PAPER and run.value == PAPER_TOL)
+    assert own.settings == {"tol": PAPER_TOL} and own.group == "run"
+    assert sum(run.repeats for run in runs(cases(True), True)) < 40
+
+
+def test_the_cases_are_on_the_bench():
+    found = {case.name: case for case in load(True)}
+    assert found["very flexible beam"].tags == ("stiff", "vibrations wanted")
+    assert found["moderately stiff beam"].tags == ("stiff", "vibrations irrelevant")
+    assert not found["very flexible beam"].conserved  # the base does work
+
+
+def test_errors_are_those_of_the_tip_and_a_run_that_ends_early_has_none():
+    case = cases(True)[SOFT]
+    problem, span = case.problem, (0.0, case.t_end)
+    result = solve_dae(problem.system, span, problem.q0, problem.v0, method=NEWTON, rtol=1e-8, atol=1e-8)
+    assert tip_error(case, result) < 1e-9 and case.reference.floor < 1e-8
+    result.q[-5, -1] += 1e-3
+    assert abs(tip_error(case, result) - 1e-3) < 1e-8
+    early = solve_dae(problem.system, span, problem.q0, problem.v0, method=NEWTON, max_steps=3)
+    assert tip_error(case, early) is None
+    row = measure(Run(case, beam_runs.solvers()[NEWTON], 1e-8, "run"), early)
+    assert row["error_tip"] is None and row["astray"] and row["t_reached"] < case.t_end
+
+
+def test_the_reference_is_that_of_three_ways():
+    case = cases(True)[STIFF]
+    assert "Gauss12 differs by" in case.reference.source and "without constraints" in case.reference.source
+    q, v = case.reference.states(np.array([0.0]))
+    np.testing.assert_array_equal(q[:, 0], case.problem.q0)
+    np.testing.assert_array_equal(v[:, 0], case.problem.v0)
+
+
+def test_newton_by_differences_is_the_same_run_but_for_its_jacobians():
+    case = cases(True)[STIFF]
+    own, other = (
+        attempt(Run(case, beam_runs.solvers()[name], 1e-1), 0)[0] for name in ("RadauIIA7, Newton", DIFFERENCES)
+    )
+    assert own.success and other.success
+    more = other.stats.n_evaluations - own.stats.n_evaluations
+    assert more > case.problem.q0.size * own.stats.n_jacobians / 4  # differences by groups of columns
+    assert abs(own.stats.n_accepted - other.stats.n_accepted) < 0.3 * own.stats.n_accepted
+
+
+def test_exudyn_is_measured_against_itself():
+    pytest.importorskip("exudyn")
+    case = cases(True)[STIFF]
+    run = Run(case, beam_runs.solvers()[EXUDYN], case.t_end / 50_000, "run")
+    result, status, _ = attempt(run, 0)
+    row = measure(run, result)
+    assert status == "REACHED_END" and row["floor"] <= row["error_tip"] < 1e-3
+
+
+def test_theory_of_fixed_point_iteration():
     sun = sun_radau_iib(3)
     assert abs(jacobi_rate(sun, 1.0 / 0.215314) - 1.0) < 1e-5
     assert abs(jacobi_rate(gauss(2), 2.0 * np.sqrt(3.0)) - 1.0) < 1e-12
@@ -112,95 +261,66 @@ def test_theory_of_the_sweeps():
 
 
 def test_frequencies_are_those_of_the_published_case():
-    assert abs(frequencies(CASES[SOFT]())[-1] - 3358.5) < 0.05
+    problem = MAKE[SOFT]()
+    assert abs(frequencies(problem)[-1] - 3358.5) < 0.05
+    assert abs(frequencies(problem, problem.q0)[-1] - 3358.5) < 0.05
 
 
-def test_what_stiffness_does_to_newton_and_to_sweeps(rows):
-    modulus = pick(rows, group="modulus")
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("beam")
+    beam.main(["--quick", "--out", str(folder)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def quick_rows(out):
+    return pd.read_csv(out / "beam.csv", comment="#")
+
+
+def test_the_quick_study_runs_and_is_drawn_again(out):
+    text = (out / "beam.md").read_text()
+    assert "Quick run" in text and "The start" not in text.split("How it was measured")[0]
+    assert "6278" not in text and "56.2" not in text  # the paper's seconds are not for so short a motion
+    for name in ("beam_growth.png", "beam_very_flexible.svg"):
+        (out / name).unlink()
+    beam.main(["--quick", "--out", str(out), "--redraw"])
+    assert (out / "beam.md").read_text() == text and (out / "beam_growth.png").exists()
+    assert beam.__doc__.splitlines()[0] in index.first_screen(out, True)
+
+
+def test_quick_runs_follow_the_reference_and_newton_needs_far_fewer_evaluations(quick_rows):
+    made = quick_rows[quick_rows["group"] == "run"]
+    assert (made["status"] == "REACHED_END").all() and made["error_tip"].max() < 0.02
+    counts = made[made["case"] == STIFF].groupby("solver")["n_evaluations"].min()
+    assert counts[PAPER] > 100.0 * counts[NEWTON]
+    steps = made[made["solver"] == PAPER].set_index("case")["h_median"]
+    assert 1e-4 < steps[SOFT] < 3e-3 and 1e-5 < steps[STIFF] < 1e-4
+
+
+def test_limits_are_those_of_theory_and_the_papers_test_is_no_limit(quick_rows):
+    limits = quick_rows[quick_rows["group"] == "limit"].set_index("solver")
+    assert (limits["measured"] < 1.001 * limits["theory"]).all()
+    for beta, limit in ((0.25, 2.0), (0.5, np.sqrt(2.0))):
+        row = limits.loc[f"Newmark, beta = {beta:g}"]
+        assert abs(row["theory"] - limit) < 1e-9 and row["measured"] > 0.93 * limit
+    assert abs(limits.loc[GAUSS_SEIDEL, "free"] / limits.loc[GAUSS_SEIDEL, "theory"] - 1.0) < 3e-3
+    tests = quick_rows[quick_rows["group"] == "growth test"].set_index("tol")["measured"]
+    assert tests[1e-1] > 2.0 * tests[1e-4] > 2.0 * tests[1e-8] > 0.0
+
+
+def test_what_stiffness_does_to_newton_and_to_fixed_point_iteration(quick_rows):
+    modulus = quick_rows[quick_rows["group"] == "modulus"]
     grown = {}
     for solver, tol in ((NEWTON, 1e-2), (PAPER, 1e-5)):
-        line = pick(modulus, solver=solver, tol=tol).sort_values("modulus")
+        line = modulus[(modulus["solver"] == solver) & (modulus["tol"] == tol)].sort_values("modulus")
         each = (line["n_evaluations"] / line["t_end"]).to_numpy()
         grown[solver] = each[-1] / each[0]
     assert grown[PAPER] > 2.5  # sqrt(10), as the frequencies
     assert grown[NEWTON] < 2.0
 
 
-def test_the_soft_beam_feels_its_mesh_and_its_start_most(out):
-    series = load_series(out / "beam_series.npz")
-    assert series["sensitivity: t"][-1] == np.float32(0.2)
-
-    def largest(case, name):
-        return np.abs(series[f"sensitivity: {case}, {name}"]).max()
-
-    for name in ("8 elements", "start of the whole beam"):
-        assert largest(SOFT, name) > 3.0 * largest(STIFF, name) > 0.0
-        assert largest(SOFT, name) > 10.0 * largest(SOFT, "g + 0.1 %") > 0.0
-
-
-def test_errors_are_those_of_the_tip_and_a_run_that_ends_early_has_none():
-    problem = CASES[SOFT]()
-    job = BeamJob(SOFT, NEWTON, 1e-3, 0.1)
-    truth = true_motion(problem, 0.1)
-    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "RadauIIA5", 1e-8, 1e-8, t_eval=job.times)
-    row = measure(job, result, problem, truth)
-    assert row["error_tip"] < 1e-9 and row["error_energy"] < 1e-6
-    result.q[-5, -1] += 1e-3
-    assert abs(measure(job, result, problem, truth)["error_tip"] - 1e-3) < 1e-8
-    early = solve_dae(
-        problem.system, (0.0, 0.1), problem.q0, problem.v0, "RadauIIA5", 1e-8, 1e-8, t_eval=job.times, max_steps=3
-    )
-    row = measure(job, early, problem, truth)
-    assert row["status"] == "MAX_STEPS" and np.isnan(row["error_tip"])
-
-
-def test_a_solver_that_is_not_there_is_a_row(monkeypatch):
-    def absent(problem, tol, times):
-        raise RuntimeError("no such library")
-
-    monkeypatch.setitem(beam.collect.__globals__["SOLVERS"], NEWTON, absent)
-    made, _ = collect([BeamJob(SOFT, NEWTON, 1e-3, 0.1)], {SOFT: true_motion(CASES[SOFT](), 0.1)})
-    assert made[0]["status"] == "SOLVER_FAILED" and made[0]["message"] == "no such library"
-
-
-def run_row(solver, error, cpu, case=SOFT):
-    return {"group": "run", "case": case, "solver": solver, "error_tip": error, "cpu_s": cpu, "tol": error}
-
-
-def test_cost_at_the_target_lies_between_two_runs():
-    rows = pd.DataFrame([run_row(NEWTON, 1e-3, 1.0), run_row(NEWTON, 1e-5, 100.0), run_row(PAPER, 1e-9, 7.0)])
-    assert abs(cpu_for(rows, SOFT, NEWTON) - 10.0) < 1e-9
-    assert cpu_for(rows, SOFT, PAPER) == 7.0  # the loosest run there is
-    assert np.isnan(cpu_for(rows, SOFT, BDF)) and np.isnan(cpu_for(rows, STIFF, NEWTON))
-    assert cheapest(rows, SOFT, NEWTON)["cpu_s"] == 100.0 and cheapest(rows, SOFT, BDF) is None
-
-
-def test_goals_follow_the_rows(rows):
-    def reached(changed):
-        return {line[0]: line[2] for line in goals(changed)}
-
-    changed = rows.copy()
-    slow = (changed["group"] == "run") & (changed["solver"] == PAPER)
-    changed.loc[slow, "cpu_s"] = 1e5
-    before, after = reached(rows), reached(changed)
-    asked = [goal for goal in before if goal.startswith("the paper's procedure")]
-    assert len(asked) == 2 and all(before[goal] == "yes" and after[goal] == "no" for goal in asked)
-    asked = [goal for goal in before if goal.startswith("Newton's method, ")]
-    assert all(after[goal] == "yes" for goal in asked)
-    for words in ("faster than IDA", "4 to 64 elements", "E = 2e10"):  # none of these in the quick run
-        assert {before[goal] for goal in before if words in goal} == {"not measured"}
-
-
-def test_thinned_steps_keep_the_extremes():
-    h = np.full(5000, 1e-3)
-    h[[7, 4000]] = 1e-6, 1e-1
-    curve = thinned(h)
-    assert curve.shape[0] == 4 and curve.shape[1] <= 400
-    assert curve[1].min() == 1e-6 and curve[3].max() == 1e-1 and abs(curve[0, 1] - 0.012) < 2e-3
-    few = thinned(np.array([1.0, 2.0]))
-    np.testing.assert_array_equal(few, [[0.0, 1.0], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]])
-
-
-def test_other_mechanisms_have_no_reference_here():
-    with pytest.raises(ValueError, match="problem must be a beam of ancf_beam"):
-        true_motion(four_bar(), 0.1)
+def test_a_case_names_its_own_tolerances():
+    soft = next(case for case in load(True) if case.name == "very flexible beam")
+    assert beam_runs.solvers()["BDF"].grid(soft) == soft.tolerances
+    assert beam_runs.solvers()["BDF"].grid(replace(soft, tolerances=None)) == beam_runs.solvers()["BDF"].values
