@@ -133,7 +133,7 @@ class Solver:
     values : tuple of float
         Values of the setting, loose to tight. Empty: those of the case, for "h".
     fixed : mapping
-        Settings that do not vary, for the row.
+        Settings that do not vary, numbers or texts, for the row.
     own_accelerations : bool
         Whether the accelerations in its results are not those of eq. (6) at its q and v.
     """
@@ -145,7 +145,7 @@ class Solver:
     setting: str
     run: Callable[[Case, float, int], Result]
     values: tuple[float, ...] = ()
-    fixed: Mapping[str, float] = field(default_factory=dict)
+    fixed: Mapping[str, float | str] = field(default_factory=dict)
     own_accelerations: bool = False
 
     def grid(self, case: Case) -> tuple[float, ...]:
@@ -170,7 +170,7 @@ class Run:
     repeats: int = 3
 
     @property
-    def settings(self) -> dict[str, float]:
+    def settings(self) -> dict[str, float | str]:
         """Names and values of the settings, for the row."""
         return {**self.solver.fixed, self.solver.setting: self.value}
 

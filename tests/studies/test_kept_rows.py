@@ -1,17 +1,12 @@
-"""Rows survive an exception, a kill and a torn line; rows of other sources or settings are not mixed in."""
+"""Rows survive an exception and a torn line; rows of other sources or settings are not mixed in."""
 
 import json
 import math
-import subprocess
-import sys
-import textwrap
-import time
 
 import pytest
 
 from studies import kept_rows
 from studies.kept_rows import KeptRows
-from studies.report import ROOT
 
 # json.loads stands for a run: a job is the text of its row, and a text that is no JSON fails
 SETTINGS = {"quick": True}
@@ -103,47 +98,3 @@ def test_an_edited_file_is_not_guessed_at(path):
     path.write_text(path.read_text().replace('{"key": "a"', '{"key" "a"'))
     with pytest.raises(ValueError, match="line 2 is not a row"), KeptRows(path, SETTINGS):
         pass
-
-
-KILLED = """
-    import sys, time
-    from pathlib import Path
-    from studies.energy import jobs, measure
-    from studies.kept_rows import KeptRows
-
-    def run(job):
-        if job is None:
-            time.sleep(1000.0)
-        return measure(job)
-
-    if __name__ == "__main__":
-        keyed = {repr(job): job for job in list(jobs(quick=True))[-3:]}
-        with KeptRows(Path(sys.argv[1]), {}) as kept:
-            kept.collect({**keyed, "never": None}, run, 1)
-"""
-
-
-def test_a_killed_study_goes_on_and_ends_with_the_same_rows(tmp_path, path):
-    from studies.energy import jobs, measure
-
-    script = tmp_path / "killed.py"
-    script.write_text(textwrap.dedent(KILLED))
-    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
-    with subprocess.Popen([sys.executable, script, path], env=environment, stdout=subprocess.PIPE) as study:
-        while not path.exists() or path.read_text().count("\n") < 3:  # the head and two rows
-            assert study.poll() is None
-            time.sleep(0.01)
-        study.kill()
-        study.communicate(timeout=120)  # ends when its worker has gone too
-    chosen = {repr(job): job for job in list(jobs(quick=True))[-3:]}
-    with KeptRows(path, {}) as kept:
-        assert 2 <= kept.n_taken_over <= 3
-        rows = kept.collect(chosen, measure, 1)
-    for row, job in zip(rows, chosen.values(), strict=True):
-        fresh = json.loads(json.dumps(measure(job)))
-        assert row.keys() == fresh.keys()
-        for name, value in fresh.items():  # two processes may round differently: each may have compiled for itself
-            if isinstance(value, float | int | list):
-                assert row[name] == pytest.approx(value, rel=0.01, abs=1e-9), name
-            elif not isinstance(value, dict):
-                assert row[name] == value, name
