@@ -66,6 +66,8 @@ class Case:
         Coordinates by which "out of phase" is judged. None: all.
     step_sizes : tuple of float or None
         s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
+    tolerances : tuple of float or None
+        For solvers that have one. None: those of the solver, from 1e-3 down; a stiff case asks for looser ones.
     time_limit : float
         CPU seconds that a run may use.
     timed : float
@@ -86,6 +88,7 @@ class Case:
     invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
     watched: tuple[int, ...] | None = None
     step_sizes: tuple[float, ...] | None = None
+    tolerances: tuple[float, ...] | None = None
     time_limit: float = 60.0
     timed: float = 0.1
     tags: tuple[str, ...] = ()
@@ -150,6 +153,8 @@ class Solver:
 
     def grid(self, case: Case) -> tuple[float, ...]:
         """The values of the setting to run on a case."""
+        if self.setting == "tol" and case.tolerances:
+            return case.tolerances
         return self.values or case.steps()
 
 

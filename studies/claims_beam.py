@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from studies.beam_runs import EXPLICIT, NEWTON, PAPER, PAPER_TOL, SOFT, STIFF
+from studies.beam.runs import EXPLICIT, NEWTON, PAPER, PAPER_TOL
+from studies.cases.beam import SOFT, STIFF
 from studies.claims_algebra import Row, row
 from studies.claims_verdicts import Claim, Judgement, NoRows, Rows, grade, one, pick, value
 from studies.report import number

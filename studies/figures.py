@@ -16,6 +16,7 @@ from studies.store import Output
 from studies.tables import time_for
 
 MOST_LINES = 7
+ERROR = "largest position error over the run (m, rad)"
 
 mpl.rcParams.update(
     {
@@ -106,10 +107,10 @@ def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOS
     return [solver for solver in dict.fromkeys(rows["solver"]) if solver in best]
 
 
-def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str) -> Figure:
+def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR) -> Figure:
     """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
 
-    Errors that the reference does not resolve are not drawn.
+    `error` says what the column error_q is. Errors that the reference does not resolve are not drawn.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str) -> Fi
         counted = runs[runs["n_evaluations"].notna()]
         right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **look)
     for axes, what in ((left, "CPU time (s)"), (right, "evaluations")):
-        _log_axes(axes, "largest position error over the run (m, rad)", what)
+        _log_axes(axes, error, what)
     handles, labels = left.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside right upper", title="filled: keeps constraints\n[c] compiled, [P] Python"

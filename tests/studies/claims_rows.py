@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pandas as pd
 
-from studies.beam_runs import EXPLICIT, NEWTON, PAPER, SOFT, STIFF
+from studies.beam.runs import EXPLICIT, NEWTON, PAPER
+from studies.cases.beam import SOFT, STIFF
 from studies.energy_drift import GAUSS, ONE, PAPER_IRK, SUN, SWITCHING
 from studies.solvers import GEAR_ORDERS, IRK, NEWMARK, PRESETS, QUARTER, gear
 

@@ -1,0 +1,5 @@
+"""`python -m studies.beam`."""
+
+from studies.beam.study import main
+
+main()
