@@ -5,14 +5,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from references.four_bar_minimal import MinimalFourBar
 from twoloop import ConstrainedSystem
+from twoloop.mechanisms import Problem
 from twoloop.tableaux import Tableau
 
 Array = NDArray[np.float64]
 
 NEWTON_TOL = 1e-14
 MAX_NEWTON = 30
-HOPELESS = 1e6  # a change from sweep to sweep beyond which nothing converges any more
+MAX_ITERATIONS = 200  # as in the kernel
+HOPELESS = 1e6  # a change from one iteration to the next beyond which nothing converges any more
+
+
+def true_states(problem: Problem, n: int) -> list[tuple[float, Array, Array]]:
+    """Times and true states of a linkage at n phases of a period, rest left out."""
+    truth = MinimalFourBar.from_parameters(problem.parameters)
+    t = truth.period * (np.arange(n) + 0.37) / n
+    q, v = truth.states(t)
+    return list(zip(t.tolist(), q.T, v.T, strict=True))
 
 
 def independents(jacobian: Array) -> list[int]:
@@ -43,14 +54,14 @@ def kkt(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[Array,
 
 @dataclass
 class Step:
-    """The outer loop of one step, sweep by sweep; the independents keep y_n, h and the prediction of the stages.
+    """The outer loop of one step, iteration by iteration, from an explicit Euler prediction.
 
     Attributes
     ----------
     A_stage, V_stage : ndarray (s, n_q)
         The stages' K = [a, v].
     q1, v1 : ndarray (n_q,)
-        End of the step after the last sweep, on the constraints.
+        End of the step after the last iteration, on the constraints.
     """
 
     system: ConstrainedSystem
@@ -59,7 +70,6 @@ class Step:
     h: float
     q: Array
     v: Array
-    frozen: bool = False  # y_d stays what it was at the beginning of the step, as where (3), (4) are not embedded
 
     def __post_init__(self) -> None:
         self.independent = independents(self.system.jacobian(self.t, self.q))
@@ -69,6 +79,12 @@ class Step:
         a1, _ = kkt(self.system, self.t + self.h, self.q1, self.v1)
         stages = self.tableau.stages
         self.A_stage, self.V_stage = np.tile(a1, (stages, 1)), np.tile(self.v1, (stages, 1))
+
+    def continue_from(self, before: "Step") -> None:
+        """Predict the stages from those of the step before, by the polynomial through them, instead of by Euler."""
+        x, c = (before.h + self.h * self.tableau.c) / before.h, self.tableau.c
+        weights = np.linalg.solve(np.vander(c).T, np.vander(x, len(c)).T).T
+        self.A_stage, self.V_stage = weights @ before.A_stage, weights @ before.V_stage
 
     def dependents(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Dependent positions by (15), dependent velocities by (14)."""
@@ -84,14 +100,13 @@ class Step:
         v = np.linalg.solve(matrix, np.concatenate([-self.system.constraint_rate(t, q), v[self.independent]]))
         return q, v
 
-    def sweep(self) -> tuple[float, float]:
-        """One sweep, stage after stage; the change by (32), as it should read, and the norm of (33)."""
+    def iterate(self) -> tuple[float, float]:
+        """One iteration, stage after stage; the change by (32), as it should read, and the norm of (33)."""
         q_old, v_old = self.q1, self.v1
         A, b, c = self.tableau.A, self.tableau.b, self.tableau.c
         for j in range(self.tableau.stages):
             q, v = self._moved(A[j])
-            if not self.frozen:
-                q, v = self.dependents(self.t + c[j] * self.h, q, v)
+            q, v = self.dependents(self.t + c[j] * self.h, q, v)
             self.A_stage[j], _ = kkt(self.system, self.t + c[j] * self.h, q, v)
             self.V_stage[j] = v
         self.q1, self.v1 = self.dependents(self.t + self.h, *self._moved(b))
@@ -110,18 +125,18 @@ class Step:
         v[i] += self.h * weights @ self.A_stage[:, i]
         return q, v
 
-    def converge(self, tolerance: float, sweeps: int) -> tuple[bool, bool]:
-        """Sweep until (32) holds; whether it came to that, and whether (33) would have given the step up before."""
+    def converge(self, tolerance: float) -> tuple[int | None, bool]:
+        """Iterate until (32) holds; after how many iterations (None: never), and whether (33) was violated before."""
         before, refused = np.inf, False
-        for _ in range(sweeps):
+        for n in range(1, MAX_ITERATIONS + 1):
             try:
-                change, norm = self.sweep()
+                change, norm = self.iterate()
             except np.linalg.LinAlgError:
-                return False, True
+                return None, True
             if not norm < HOPELESS:
-                return False, True
+                return None, True
             if change <= tolerance:
-                return True, refused
+                return n, refused
             refused |= norm > before
             before = norm
-        return False, refused
+        return None, refused
