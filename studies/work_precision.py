@@ -18,6 +18,8 @@ ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", "Newmark", "PaperIRK, Atol = Rtol varied", "PaperNewmark, beta = 1/4", "IDA, index1")
 DEFAULT = "SunRadau5"  # of solve_dae
+EMPTY = ("ours", "others", "ida", "default_over")
+SETTINGS = ("tol", "h", "err_out")
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
@@ -29,14 +31,37 @@ def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
 
 
 def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
-    """The cheapest of ours and of others on one case at one error, and how the default does."""
+    """The cheapest of ours, of others and of IDA on one case at one error, how the default does, and what beats it."""
     ranked = tables.ranking(rows, error)
+    found: dict[str, Any] = {"error": error, **dict.fromkeys(EMPTY), "before_default": {}}
     if ranked.empty:
-        return {"error": error, "ours": None, "others": None, "default_over": None}
-    own = ranked["family"] == "two-loop"
+        return found
+    own, ida = ranked["family"] == "two-loop", ranked["family"] == "SUNDIALS"
+    found |= {"ours": best(ranked[own]), "others": best(ranked[~own]), "ida": best(ranked[ida])}
     default = ranked[ranked["solver"] == DEFAULT]["cpu_s"]
-    over = None if default.empty or not own.any() else float(default.iloc[0] / ranked[own]["cpu_s"].iloc[0])
-    return {"error": error, "ours": best(ranked[own]), "others": best(ranked[~own]), "default_over": over}
+    if not default.empty:
+        found["default_over"] = float(default.iloc[0] / ranked[own]["cpu_s"].iloc[0])
+        cheaper = ranked["cpu_s"] < default.iloc[0]
+        kinds = {"ours": own, "others": ~own}
+        found["before_default"] = {kind: ranked[cheaper & which]["solver"].tolist() for kind, which in kinds.items()}
+    return found
+
+
+def before_default(at: Sequence[dict[str, Any]], kind: str) -> list[str]:
+    """Solvers of ours or of others that are cheaper than the default at every error that it reaches."""
+    lists = [line["before_default"][kind] for line in at if line["default_over"] is not None]
+    return [name for name in lists[0] if all(name in each for each in lists)] if lists else []
+
+
+def out_of_phase(runs: pd.DataFrame) -> list[dict[str, Any]]:
+    """Of each solver with runs out of phase, the one at its finest setting; `tol`, `h` or `err_out` names it."""
+    found = []
+    for solver, own in runs[runs["astray"].astype(bool)].groupby("solver", sort=False):
+        setting = next(name for name in SETTINGS if name in own and own[name].notna().any())
+        run = own.loc[own[setting].astype(float).idxmin()]
+        line = {"solver": str(solver), "setting": setting, "value": float(run[setting])}
+        found.append(line | {key: float(run[key]) for key in ("error_q", "cpu_s")})
+    return found
 
 
 def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any]]:
@@ -59,7 +84,10 @@ def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any
             if factors[by] >= DOMINATED:
                 called = rows[rows["solver"] == solver]["called_from"].iloc[0]
                 line = {"solver": solver, "by": by, "factor": factors[by], "n": len(own), "called_from": str(called)}
-                found.append(line)
+                over = {place: cost / times[by][place] for place, cost in own.items()}
+                where = min(over, key=over.__getitem__)  # the row in which it does best
+                row = {"case": where[0], "error": where[1], "cpu_s": own[where], "by_s": times[by][where]}
+                found.append(line | row)
     return found
 
 
@@ -73,7 +101,7 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
         at = [class_of(runs, error) for error in ERRORS]
         over = [line["default_over"] for line in at if line["default_over"] is not None]
         reached = runs[runs["error_q"].notna()]
-        astray = reached[reached["astray"].astype(bool)]["solver"].unique()
+        astray = out_of_phase(reached)
         listed.append(
             {
                 "name": case.name,
@@ -83,7 +111,9 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
                 "at": at,
                 "default_dominated": bool(over) and min(over) > 1.0,
                 "default_over": [min(over), max(over)] if over else [],
-                "astray": sorted(str(name) for name in astray),
+                "default_by": before_default(at, "ours"),
+                "default_by_others": before_default(at, "others"),
+                "astray": astray,
                 "drift": _drift(reached),
                 "figure": f"work_precision_{_slug(case.name)}.png",
                 "note": case.note,
