@@ -246,7 +246,7 @@ def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):
     assert text.count(": not run yet") + text.count("(not run yet:") == 10 + len(index.STUDIES)
     assert "Not judged by quick runs" in index.first_screen(tmp_path, True)
     (tmp_path / "beam.json").write_text("{")
-    with pytest.raises(StudyError, match="beam.json cannot be read.*studies.beam again"):
+    with pytest.raises(StudyError, match=r"beam.json cannot be read.*studies.beam again"):
         index.first_screen(tmp_path, False)
 
 
