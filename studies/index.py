@@ -107,7 +107,7 @@ def _at_energy(at: dict[str, Any]) -> dict[str, Any]:
 
 
 def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The cheapest solver of all at each accuracy; accuracies at which it is the same one are joined."""
+    """The cheapest solvers of all, each with the accuracies at which it is that, and what the other kind costs."""
     made: list[dict[str, Any]] = []
     for line in at:
         runs = [(line[which]["cpu_s"], which) for which in ("ours", "others") if line[which] is not None]
@@ -116,11 +116,18 @@ def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         which = min(runs)[1]
         best, other = line[which], line["others" if which == "ours" else "ours"]
         over = None if other is None else other["cpu_s"] / best["cpu_s"]
-        if not made or made[-1]["solver"] != best["solver"]:
-            pick = {key: best[key] for key in ("solver", "called_from", "keeps")}
-            made.append(pick | {"ours": which == "ours", "accuracies": [], "over": []})
-        made[-1]["accuracies"].append(line["accuracy"])
-        made[-1]["over"] += [] if over is None else [over]
+        pick = next((known for known in made if known["solver"] == best["solver"]), None)
+        if pick is None:
+            pick = {
+                "solver": best["solver"],
+                "keeps": best["keeps"],
+                "ours": which == "ours",
+                "accuracies": [],
+                "over": [],
+            }
+            made.append(pick)
+        pick["accuracies"].append(line["accuracy"])
+        pick["over"] += [] if over is None else [over]
     return made
 
 
@@ -144,6 +151,43 @@ def _cells(whose: str, best: dict[str, Any] | None) -> list[str]:
     drifts = "" if best["keeps"] else " (drifts off)"
     costs = [number(best["cpu_s"]), evaluations, number(best["violation_q"])]
     return [f"{whose}: `{best['solver']}`{drifts}", *costs, best["energy"], best["called_from"]]
+
+
+def dominated(found: dict[str, dict[str, Any]]) -> str:
+    """The table of solvers that some one other beats everywhere, each with the row in which it does best."""
+    header = [
+        "solver",
+        "called from",
+        "beaten by",
+        "errors",
+        "time: at least",
+        "where it does best",
+        "CPU (s)",
+        "against",
+    ]
+    lines = []
+    for line in found.get("work_precision", {}).get("dominated", []):
+        where = f"{power(line['error'])}, {line['case']}"
+        cells = [
+            f"`{line['solver']}`",
+            line["called_from"],
+            f"`{line['by']}`",
+            line["n"],
+            f"× {number(line['factor'])}",
+        ]
+        evaluations = "not told" if line["evaluations"] is None else f"× {number(line['evaluations'])}"
+        lines.append([*cells, where, line["cpu_s"], line["by_s"], evaluations])
+    return table([*header, "evaluations there"], lines) if lines else ""
+
+
+def out_of_phase(found: dict[str, dict[str, Any]]) -> str:
+    """The table of settings at which a solver is out of phase, the finest of each."""
+    lines = []
+    for case in found.get("work_precision", {}).get("cases", []):
+        for run in case["astray"]:
+            setting = f"{run['setting']} = {power(run['value'])}"
+            lines.append([f"`{run['solver']}`", case["name"], setting, run["error_q"], run["cpu_s"]])
+    return table(["solver", "mechanism", "finest such setting", "error", "CPU (s)"], lines) if lines else ""
 
 
 def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
@@ -175,8 +219,10 @@ def first_screen(folder: Path, quick: bool) -> str:
         files = [f"{name}.{suffix}" for suffix in ("md", "png") if (folder / f"{name}.{suffix}").is_file()]
         studies.append({"name": name, "about": about, "file": files[0] if files else None})
     figure = (folder / "energy_cost.png").is_file()
-    times = per_evaluation(classes(findings(folder)))
-    return _render("index.md.j2", folder, studies=studies, quick=quick, energy_figure=figure, times=times)
+    found = findings(folder)
+    bad = {"dominated": dominated(found), "out_of_phase": out_of_phase(found)}
+    times = per_evaluation(classes(found))
+    return _render("index.md.j2", folder, studies=studies, quick=quick, energy_figure=figure, times=times, bad=bad)
 
 
 def write_index(output: Output) -> None:

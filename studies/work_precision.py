@@ -67,11 +67,13 @@ def out_of_phase(runs: pd.DataFrame) -> list[dict[str, Any]]:
 def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any]]:
     """Solvers that some one other beats at every error that they reach on every case: name, by which, least factor."""
     times: dict[str, dict[tuple[str, float], float]] = {}
+    counts: dict[tuple[str, str, float], float] = {}
     for (case, solver), runs in rows.groupby(["case", "solver"], sort=False):
         for error in errors:
             cost = tables.time_for(runs, error)
             if cost == cost:
                 times.setdefault(str(solver), {})[str(case), error] = cost
+                counts[str(solver), str(case), error] = tables.time_for(runs, error, "n_evaluations")
     found = []
     for solver, own in times.items():
         factors = {
@@ -87,6 +89,7 @@ def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any
                 over = {place: cost / times[by][place] for place, cost in own.items()}
                 where = min(over, key=over.__getitem__)  # the row in which it does best
                 row = {"case": where[0], "error": where[1], "cpu_s": own[where], "by_s": times[by][where]}
+                row["evaluations"] = counts[(solver, *where)] / counts[(by, *where)]
                 found.append(line | row)
     return found
 

@@ -116,7 +116,7 @@ def screen(tmp_path, cases=(), dominated=(), **others):
 
 def test_the_first_screen_turns_with_the_findings(tmp_path):
     worse = {"solver": "slow", "by": "ours", "factor": 3.0, "n": 6, "called_from": "Python"}
-    worse |= {"case": "crane", "error": 1e-4, "cpu_s": 0.6, "by_s": 0.2}
+    worse |= {"case": "crane", "error": 1e-4, "cpu_s": 0.6, "by_s": 0.2, "evaluations": 1.5}
     text = screen(tmp_path, [case()], [worse])
     assert (
         "| smooth, rigid: crane, 1.0 s | 1e-4 | ours: `ours` | 0.10 |" in text
@@ -125,8 +125,9 @@ def test_the_first_screen_turns_with_the_findings(tmp_path):
     assert "for 1e-4 take `ours` (the cheapest of others takes 2.0 times as long). IDA takes 3.0 times" in text
     assert "takes 1.0 µs from compiled code and 20 µs from Python" in text
     assert "so that evaluations should be compared, too" in text
-    assert "`slow` (called from Python): `ours` takes at most 1/3.0 of its time" in text
-    assert "Where it does best, 1e-4 on crane, it takes 0.60 s against 0.20 s" in text
+    assert "| `slow` | Python | `ours` | 6 | × 3.0 | 1e-4, crane | 0.60 | 0.20 | × 1.5 |" in text
+    assert "takes at most 0.50 of their time. Of those called from Python" in text
+    assert "Of those called from Python" not in screen(tmp_path, [case()], [worse | {"called_from": "compiled"}])
     faster = at_error(others=THEIRS | {"cpu_s": 0.05}, ida=None)
     text = screen(tmp_path, [case(at=[faster])])
     assert "takes 1.0 µs from compiled code and 5.0 µs from Python" in text
@@ -141,16 +142,15 @@ def test_the_first_screen_turns_with_the_findings(tmp_path):
 
 
 def test_picks_are_joined_where_the_solver_is_the_same():
-    lines = [
-        {"accuracy": f"1e-{k}", "ours": BEST | {"cpu_s": cpu}, "others": THEIRS}
-        for k, cpu in ((2, 0.1), (4, 0.1), (6, 0.4))
-    ]
+    prices = ((2, 0.1), (4, 0.4), (6, 0.1))
+    lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"cpu_s": cpu}, "others": THEIRS} for k, cpu in prices]
     found = index.picks(lines)
     assert [(pick["solver"], pick["accuracies"]) for pick in found] == [
-        ("ours", ["1e-2", "1e-4"]),
-        ("theirs", ["1e-6"]),
+        ("ours", ["1e-2", "1e-6"]),
+        ("theirs", ["1e-4"]),
     ]
     assert found[0]["over"] == pytest.approx([2.0, 2.0]) and found[1]["over"] == pytest.approx([2.0])
+    assert index.picks([{"accuracy": "1e-2", "ours": None, "others": None}]) == []
 
 
 def test_the_default_is_named_where_it_is_dominated_and_by_which(tmp_path):
@@ -184,11 +184,13 @@ def test_classes_come_in_their_order_and_the_long_one_from_the_energy(tmp_path):
 
 def test_runs_out_of_phase_are_listed_with_their_row(tmp_path):
     run = {"solver": "loose", "setting": "tol", "value": 1e-3, "error_q": 0.5, "cpu_s": 0.1}
-    assert "`loose` tol = 1e-3 (error 0.50)." in screen(tmp_path, [case(astray=[run])])
-    assert "Out of phase" not in screen(tmp_path, [case()])
+    assert "| `loose` | crane | tol = 1e-3 | 0.50 | 0.10 |" in screen(tmp_path, [case(astray=[run])])
+    assert "Out of phase" not in screen(tmp_path, [case()]) and "is out of phase" in screen(tmp_path, [case()])
     found = {"one_constant": True, "newmark_astray": ["1e-3"], "irk_astray": [], "newmark_over_irk": []}
     text = screen(tmp_path, [case()], table3=found)
-    assert "`PaperNewmark` with err_out = 1e-3, `PaperIRK` with err_out = none" in text
+    assert "on the linkage: `PaperNewmark` with err_out = 1e-3 ([Table 3]" in text
+    text = screen(tmp_path, [case()], table3=found | {"irk_astray": ["1e-3"]})
+    assert "err_out = 1e-3, `PaperIRK` with err_out = 1e-3 (" in text
     assert "in phase with all settings" in screen(tmp_path, [case()], table3=found | {"newmark_astray": []})
 
 
@@ -235,7 +237,9 @@ def test_each_promise_has_its_opposite(tmp_path):
 
     steps = {"holds": True, "longer": True, "irk": {"share_time": 0.99}, "long": 0.02, "ratios": [170.0, 270.0]}
     steps |= {"evaluations_ratio": [10.0, 20.0]}
-    assert "Large steps*: holds; 99 %" in screen(tmp_path, step_size=steps)
+    assert "Large steps*: holds; steps longer than 0.02 s cover all but 1.0 % of the time" in screen(
+        tmp_path, step_size=steps
+    )
     assert "Large steps*: does not hold" in screen(tmp_path, step_size=steps | {"longer": False})
 
 
