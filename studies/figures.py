@@ -46,6 +46,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Gauss6": (SKY, "D"),
     "SunRadau5": (PINK, "v"),
     "RadauIIA5": (ORANGE, "^"),
+    "RadauIIA7, Newton": (BROWN, "^"),
     "BDF": (GREEN, "P"),
     "Newmark": (GREY, "h"),
     "PaperIRK": (YELLOW, "H"),

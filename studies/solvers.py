@@ -17,7 +17,7 @@ from studies.bench import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.plan import Method
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of all solvers that have one
 ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
@@ -29,7 +29,7 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
-CANONICAL = "Gauss6, momenta, symmetric"
+CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", OWN_BDF)
 PRESETS = (*IMPLICIT, OWN_EXPLICIT)  # of twoloop, with their own options
@@ -62,7 +62,7 @@ def _time_limit(solve: Callable[..., Result], case: Case) -> dict[str, Any]:
 
 
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance)
+    return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance, time_limit=case.time_limit)
 
 
 def _paper_irk(case: Case, tolerance: float, repeat: int) -> Result:
@@ -81,7 +81,7 @@ def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repea
 
 def _canonical(case: Case, step: float, repeat: int) -> Result:
     method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    return solve_dae(*_start(case), method=method, step_size=step)
+    return solve_dae(*_start(case), method=method, step_size=step, time_limit=case.time_limit)
 
 
 def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
@@ -171,6 +171,8 @@ def _all() -> Iterator[Solver]:
     for preset in PRESETS:
         method = "DOP853" if preset == OWN_EXPLICIT else preset
         yield Solver(preset, "two-loop", "compiled", True, "tol", partial(_preset, method), TOLERANCES)
+    newton = partial(_preset, RungeKutta(radau_iia(4), "newton"))
+    yield Solver(NEWTON_4, "two-loop", "compiled", True, "tol", newton, TOLERANCES)
     yield Solver(CANONICAL, "two-loop", "compiled", True, "h", _canonical)
     for form in IDA_FORMS:
         keeps, run = form == "stabilised", partial(_ida, form)

@@ -1,25 +1,41 @@
 """Every mechanism of the comparison with the same solvers: what each accuracy costs, and which solver to take."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
 
 from studies import cases, cli, figures, tables
-from studies.bench import Case, collect
+from studies.bench import Case, Run, collect
 from studies.cli import StudyError
 from studies.compare import runs_of
 from studies.index import write_index
 from studies.render import number, power, render, table
-from studies.solvers import COMPARED
+from studies.solvers import COMPARED, IDA_C_ORDER_2, NEWTON_4
 from studies.store import Output
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
-FURTHER = ("Gauss6", "Newmark", "PaperIRK, Atol = Rtol varied", "PaperNewmark, beta = 1/4", "IDA, index1")
+FURTHER = ("Gauss6", "PaperIRK, Atol = Rtol varied", "PaperNewmark, beta = 1/4", "IDA, index1")
+STIFF = (NEWTON_4, IDA_C_ORDER_2)  # beside them on stiff cases, where `studies.beam` has the paper's procedures
+TIGHT = 1e-4  # from here on a run of a stiff case takes seconds, and is made once
 DEFAULT = "SunRadau5"  # of solve_dae
 EMPTY = ("ours", "others", "ida", "default_over")
 SETTINGS = ("tol", "h", "err_out")
+
+
+def runs(case: Case, quick: bool) -> list[Run]:
+    """The runs of a case; of stiff ones, once where they take seconds, and fewer of those called from Python."""
+    stiff = "stiff" in case.tags
+    made = runs_of(case, COMPARED if quick else (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
+    if quick or not stiff:
+        return made
+    coarse = case.tolerances[::2]
+    made = [run for run in made if run.solver.called_from == "compiled" or run.value in coarse]
+    return [
+        replace(run, repeats=1) if run.solver.called_from == "Python" or run.value <= TIGHT else run for run in made
+    ]
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
@@ -159,10 +175,9 @@ def _work(words: Sequence[str] | None) -> None:
         if call.redraw:
             rows, line = output.load_rows()
         else:
-            solvers = COMPARED if call.quick else (*COMPARED, *FURTHER)
-            runs = [run for case in cases.load(call.quick) for run in runs_of(case, solvers, call.quick)]
+            listed = [run for case in cases.load(call.quick) for run in runs(case, call.quick)]
             with output.kept() as kept:
-                rows = collect(runs, kept)
+                rows = collect(listed, kept)
             line = cli.stamp(call.command)
             output.save_rows(rows, line)
         report(output, rows, line)

@@ -55,6 +55,15 @@ def test_cases_are_found_by_listing_the_folder():
     assert all(a.t_end <= b.t_end for a, b in zip(quick, full, strict=True))
 
 
+def test_stiff_cases_have_their_own_solvers_and_slow_runs_are_made_once():
+    for case in cases.load(False):
+        made = work_precision.runs(case, False)
+        names = {run.solver.name for run in made}
+        assert (names >= set(work_precision.STIFF)) == ("stiff" in case.tags)
+        once = {run.repeats == 1 for run in made if run.solver.called_from == "Python"}
+        assert once == {"stiff" in case.tags} and len({run.key(0) for run in made}) == len(made)
+
+
 @pytest.mark.slow
 def test_the_quick_study_runs_and_is_drawn_again(tmp_path):
     words = ["--quick", "--out", str(tmp_path)]
