@@ -49,15 +49,21 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
+def cases_of(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The mechanisms compared, in the order of their classes."""
+    known = list(CLASSES)
+    cases = [(tuple(case["tags"]), case) for case in found.get("work_precision", {}).get("cases", [])]
+    cases.sort(key=lambda pair: known.index(pair[0]) if pair[0] in known else len(known))
+    return [case for _, case in cases]
+
+
 def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """One entry a class of problem and mechanism: the cheapest of ours and of others at each accuracy."""
-    known = list(CLASSES)
-    cases = found.get("work_precision", {}).get("cases", [])
-    listed = [(tuple(case["tags"]), case) for case in cases]
-    listed.sort(key=lambda pair: known.index(pair[0]) if pair[0] in known else len(known))
     made = [
-        _entry(CLASSES.get(tags, ", ".join(tags) or "other"), case, [_at_error(at) for at in case["at"]])
-        for tags, case in listed
+        _entry(
+            CLASSES.get(tuple(case["tags"]), ", ".join(case["tags"]) or "other"), case, list(map(_at_error, case["at"]))
+        )
+        for case in cases_of(found)
     ]
     if "energy" in found:
         long = found["energy"]["long"]
@@ -183,7 +189,7 @@ def dominated(found: dict[str, dict[str, Any]]) -> str:
 def out_of_phase(found: dict[str, dict[str, Any]]) -> str:
     """The table of settings at which a solver is out of phase, the finest of each."""
     lines = []
-    for case in found.get("work_precision", {}).get("cases", []):
+    for case in cases_of(found):
         for run in case["astray"]:
             setting = f"{run['setting']} = {power(run['value'])}"
             lines.append([f"`{run['solver']}`", case["name"], setting, run["error_q"], run["cpu_s"]])
@@ -203,7 +209,7 @@ def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
 def _render(template: str, folder: Path, **more: Any) -> str:
     found = findings(folder)
     entries = classes(found)
-    compared = {"classes": entries, "cases": found.get("work_precision", {}).get("cases", [])}
+    compared = {"classes": entries, "cases": cases_of(found)}
     compared |= {"default": found.get("work_precision", {}).get("default")}
     text = environment().get_template(template).render(s=found, **compared, choice=choice(entries), **more)
     while "\n\n\n" in text:

@@ -12,7 +12,7 @@ from studies.cli import StudyError
 from studies.compare import runs_of
 from studies.index import write_index
 from studies.render import number, power, render, table
-from studies.solvers import COMPARED, IDA_C_ORDER_2, NEWTON_4
+from studies.solvers import COMPARED, IDA_C_ORDER_2, NEWTON_4, TOLERANCES
 from studies.store import Output
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
@@ -29,9 +29,11 @@ def runs(case: Case, quick: bool) -> list[Run]:
     """The runs of a case; of stiff ones, once where they take seconds, and fewer of those called from Python."""
     stiff = "stiff" in case.tags
     made = runs_of(case, COMPARED if quick else (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
-    if quick or not stiff:
+    if not stiff:
         return made
-    coarse = case.tolerances[::2]
+    if quick:  # others take too long
+        return [run for run in made if run.solver.called_from == "compiled"]
+    coarse = (case.tolerances or TOLERANCES)[::2]
     made = [run for run in made if run.solver.called_from == "compiled" or run.value in coarse]
     return [
         replace(run, repeats=1) if run.solver.called_from == "Python" or run.value <= TIGHT else run for run in made
