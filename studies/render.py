@@ -66,7 +66,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def environment() -> jinja2.Environment:
-    """The environment of all templates: filters `num`, `power`, `pct`, `listed`, and `table(header, rows)`."""
+    """The environment of all templates: filters `num`, `power`, `pct`, `listed`, `code`, and `table(header, rows)`."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,
@@ -75,7 +75,7 @@ def environment() -> jinja2.Environment:
         keep_trailing_newline=True,
         autoescape=False,  # markdown, from our own data
     )
-    made.filters |= {"num": number, "power": power, "pct": percent, "listed": listed}
+    made.filters |= {"code": "`{}`".format, "num": number, "power": power, "pct": percent, "listed": listed}
     made.globals["table"] = table
     return made
 

@@ -14,11 +14,10 @@ import numpy as np
 
 from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
-from studies.runs import Job
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.plan import Method
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of all solvers that have one
 ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
@@ -30,7 +29,7 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
-CANONICAL = "Gauss6, momenta, symmetric"
+CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", OWN_BDF)
 PRESETS = (*IMPLICIT, OWN_EXPLICIT)  # of twoloop, with their own options
@@ -45,24 +44,6 @@ COMPARED = (
     *("DOP853 (two-loop)", "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
     *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
 )
-
-
-class CatalogueSolver(Solver):
-    """What studies that are not on the bench yet ask of a solver."""
-
-    @property
-    def two_loop(self) -> bool:
-        return self.family == "two-loop"
-
-    @property
-    def own_a(self) -> bool:
-        return self.own_accelerations
-
-    def job(self, group: str, problem: Problem, t_end: float, value: float, repeats: int = 3) -> Job:
-        """One run at the setting `value` as a job of `runs.py`."""
-        case = Case(problem.name, problem, t_end, n_instants=2000)
-        settings = {**self.fixed, self.setting: value}
-        return Job(group, self.name, problem, partial(self.run, case, value), settings, repeats)
 
 
 def two_loop(method: str | Method, problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
@@ -81,7 +62,7 @@ def _time_limit(solve: Callable[..., Result], case: Case) -> dict[str, Any]:
 
 
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance)
+    return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance, time_limit=case.time_limit)
 
 
 def _paper_irk(case: Case, tolerance: float, repeat: int) -> Result:
@@ -100,7 +81,7 @@ def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repea
 
 def _canonical(case: Case, step: float, repeat: int) -> Result:
     method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    return solve_dae(*_start(case), method=method, step_size=step)
+    return solve_dae(*_start(case), method=method, step_size=step, time_limit=case.time_limit)
 
 
 def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
@@ -173,61 +154,63 @@ def gear(order: int, start: str = "accurate") -> str:
 def paper_irk_at(err_in: float) -> Solver:
     """The paper's Runge-Kutta procedure along err_out, Atol = Rtol = 1e-5."""
     run, fixed = partial(_paper_irk_out, err_in), {"err_in": err_in, "tol": PAPER_TOL}
-    return CatalogueSolver(IRK, "two-loop", "compiled", True, "err_out", run, ERR_OUT, fixed)
+    return Solver(IRK, "two-loop", "compiled", True, "err_out", run, ERR_OUT, fixed)
 
 
 def paper_newmark_at(err_in: float, beta: float = 0.5) -> Solver:
     """The paper's Newmark procedure along err_out."""
     name, run = NEWMARK if beta == 0.5 else QUARTER, partial(_paper_newmark, beta, err_in)
-    return CatalogueSolver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
+    return Solver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
 
 
-def _all() -> Iterator[CatalogueSolver]:
-    entry = CatalogueSolver
-    yield paper_irk_at(ERR_IN)  # type: ignore[misc]
-    yield entry(IRK_LINE, "two-loop", "compiled", True, "tol", _paper_irk, TOLERANCES)
-    yield paper_newmark_at(ERR_IN)  # type: ignore[misc]
-    yield paper_newmark_at(ERR_IN, 0.25)  # type: ignore[misc]
+def _all() -> Iterator[Solver]:
+    yield paper_irk_at(ERR_IN)
+    yield Solver(IRK_LINE, "two-loop", "compiled", True, "tol", _paper_irk, TOLERANCES)
+    yield paper_newmark_at(ERR_IN)
+    yield paper_newmark_at(ERR_IN, 0.25)
     for preset in PRESETS:
         method = "DOP853" if preset == OWN_EXPLICIT else preset
-        yield entry(preset, "two-loop", "compiled", True, "tol", partial(_preset, method), TOLERANCES)
-    yield entry(CANONICAL, "two-loop", "compiled", True, "h", _canonical)
+        yield Solver(preset, "two-loop", "compiled", True, "tol", partial(_preset, method), TOLERANCES)
+    newton = partial(_preset, RungeKutta(radau_iia(4), "newton"))
+    yield Solver(NEWTON_4, "two-loop", "compiled", True, "tol", newton, TOLERANCES)
+    yield Solver(CANONICAL, "two-loop", "compiled", True, "h", _canonical)
     for form in IDA_FORMS:
         keeps, run = form == "stabilised", partial(_ida, form)
-        yield entry(f"IDA, {form}", "SUNDIALS", "Python", keeps, "tol", run, TOLERANCES, own_accelerations=True)
+        yield Solver(f"IDA, {form}", "SUNDIALS", "Python", keeps, "tol", run, TOLERANCES, own_accelerations=True)
     loose = {"max_order": 2, "error_test": "positions"}
     for name, options in ((IDA_C, dict[str, Any]()), (IDA_C_ORDER_2, loose)):
         run = partial(_ida_c, options)
-        yield entry(name, "SUNDIALS", "compiled", True, "tol", run, TOLERANCES, own_accelerations=True)
+        yield Solver(name, "SUNDIALS", "compiled", True, "tol", run, TOLERANCES, own_accelerations=True)
     for name in ("Radau", "Radau9", "BDF"):
         run = partial(_fully_implicit, name)
-        yield entry(f"{name}, solve_dae", "solve_dae", "Python", True, "tol", run, TOLERANCES, own_accelerations=True)
+        yield Solver(f"{name}, solve_dae", "solve_dae", "Python", True, "tol", run, TOLERANCES, own_accelerations=True)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
-        yield entry(
+        yield Solver(
             f"{name}, index 1", "SciPy", "Python", False, "tol", partial(_index1, name, "none", None), TOLERANCES
         )
     for name in ("DOP853", "RK45"):
         run = partial(_index1, name, "projection", None)
-        yield entry(f"{name}, projected", "SciPy", "Python", True, "tol", run, TOLERANCES)
+        yield Solver(f"{name}, projected", "SciPy", "Python", True, "tol", run, TOLERANCES)
     for name in ("LSODA", "DOP853"):
         for alpha in ALPHAS:
             run, fixed = partial(_index1, name, "baumgarte", alpha), {"alpha": alpha}
             line = baumgarte(name, alpha)
-            yield entry(line, "SciPy", "Python", False, "tol", run, TOLERANCES, fixed, own_accelerations=True)
+            yield Solver(line, "SciPy", "Python", False, "tol", run, TOLERANCES, fixed, own_accelerations=True)
     for solver in EXUDYN:
         run = partial(_exudyn, solver, {})
-        yield entry(f"Exudyn, {solver}", "Exudyn", "compiled", True, "h", run, own_accelerations=True)
+        yield Solver(f"Exudyn, {solver}", "Exudyn", "compiled", True, "h", run, own_accelerations=True)
     for radius in (1.0, 0.6):
         run, fixed = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius}), {"spectral_radius": radius}
         line = f"Exudyn, GeneralizedAlpha {radius:g}"
-        yield entry(line, "Exudyn", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
+        yield Solver(line, "Exudyn", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
     for order in GEAR_ORDERS:
         for start in GEAR_STARTS:
             run, fixed = partial(_gear, order, start), {"order": order}
-            yield entry(gear(order, start), "stand-in", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
+            line = gear(order, start)
+            yield Solver(line, "stand-in", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
 
 
-CATALOGUE: dict[str, CatalogueSolver] = {solver.name: solver for solver in _all()}
+CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
 
 # one sensible setting of each, for studies that show a run of every solver: two-loop procedures first
 LINE_UP: dict[str, float] = {

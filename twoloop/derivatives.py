@@ -90,8 +90,8 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
             return None
         given = -right
         noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))
-        bent = _bent(system, t, q, generic)
-        found = _along_a_run(bent, scale, noise, given, spacing)
+        rate_along = _along_a_line(system, t, q, generic)
+        found = _along_a_run(rate_along, scale, noise, given, spacing)
         suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
     return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
 
@@ -160,9 +160,9 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
             continue
         noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))
         rounding = _rounding(lambda x, v=v: system.gamma(t, x, v), given, q)  # type: ignore[misc]
-        turned = _minus(_bent(system, t, q, v))
-        bent = _Comparison(system, "gamma", t, turned, 0.0, given, spacing=_spacing(t, q, v))
-        wrong = bent.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
+        turned = _minus(_along_a_line(system, t, q, v))
+        compared = _Comparison(system, "gamma", t, turned, 0.0, given, spacing=_spacing(t, q, v))
+        wrong = compared.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
         if wrong is not None:
             return wrong
     return None
@@ -281,7 +281,7 @@ def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
     return lambda s: system.constraint(t + s, q + s * v)
 
 
-def _bent(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
+def _along_a_line(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
     """C_q v + C_t along a straight motion."""
     return lambda s: system.velocity_constraint(t + s, q + s * v, v)
 
@@ -322,7 +322,7 @@ def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arr
         try:
             force, jacobian = system.force(t, q, v), system.jacobian(t, q)
             by_q, by_v = system.force(t, q + step, v) - force, system.force(t, q, v + step) - force
-            bent = system.jacobian(t, q + step) - jacobian
+            change = system.jacobian(t, q + step) - jacobian
         except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
             continue
         level = ROUNDING * float(np.abs(force).max()) / shift
@@ -330,7 +330,7 @@ def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arr
         look("the derivative of force by v", j, by_v / shift, level)
         level = ROUNDING * float(np.abs(jacobian).max()) / shift
         for k in range(system.n_c):
-            look(f"the second derivative of constraint {k} by q", j, bent[k] / shift, level)
+            look(f"the second derivative of constraint {k} by q", j, change[k] / shift, level)
     if where:
         raise ValueError(
             f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "

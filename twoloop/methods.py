@@ -14,7 +14,7 @@ from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
 ILL_CONDITIONED = 1e8  # eigenvectors of A, as in kernels/newton.py; one over it: an eigenvalue that counts as zero
 NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
-NEWMARK_OUTER_SHARE = 1e-3  # of err_out; Newmark sweeps converge so fast that this costs next to nothing
+NEWMARK_OUTER_SHARE = 1e-3  # of err_out; its fixed-point iterations converge so fast that this costs next to nothing
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,15 @@ class RungeKutta:
     tableau : Tableau
         Any tableau of `twoloop.tableaux`.
     outer : {"auto", "fixed-point", "newton", "paper"}
-        "fixed-point": sweeps on the stage accelerations, predicted from the step before, with a growth test.
+        "fixed-point": iteration on the stage accelerations, predicted from the step before, with a growth test.
         "newton": simplified Newton on the stage accelerations, its linear algebra in the eigenvectors of the tableau's
-        A, with derivatives from the tangents that the system gives, else by differences of the two-loop right side,
-        kept while it converges fast. For stiff problems, where sweeps need h w_max below a constant. Its error estimate
-        is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error` has no effect.
-        "auto": "fixed-point" until sweeps converge slowly and Newton's method, on trial, takes three times fewer
+        A, with derivatives from the tangents that the system gives, else by differences of the two-loop right-hand
+        side, kept while it converges fast. For stiff problems, where fixed-point iteration needs h w_max below a
+        constant. Its error estimate is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error` has no
+        effect.
+        "auto": "fixed-point" until that converges slowly and Newton's method, on trial, takes three times fewer
         evaluations for a second of motion; and back again.
-        "paper": sweeps on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
+        "paper": fixed-point iteration on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
         The step size follows the error and, but with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
         Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
@@ -52,12 +53,12 @@ class RungeKutta:
         IIIE) with a fixed step then is symplectic as long as the partition stays. A mass matrix M(t, q) is
         differenced along the motion. Costs about a tenth more.
     partition : {"lasting", "symmetric"}
-        "lasting": a partition stays until it is worn. "symmetric": each step has the partition that full pivoting
-        finds in the middle of the step, the same forwards and backwards, so that fixed steps with a symmetric tableau
-        (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. On conservative mechanisms that swing
-        back the way they came, `RungeKutta(gauss(3), variables="momenta", partition="symmetric")` with fixed steps then
-        shows no drift of the energy; where motion does not reverse, as of a turning crank, only momenta under one
-        lasting partition do. Step-size control spoils both properties.
+        "lasting": a partition stays until its pivots have become too small. "symmetric": each step has the partition
+        that full pivoting finds in the middle of the step, the same forwards and backwards, so that fixed steps with a
+        symmetric tableau (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. On conservative
+        mechanisms that swing back the way they came, `RungeKutta(gauss(3), variables="momenta", partition="symmetric")`
+        with fixed steps then shows no drift of the energy; where motion does not reverse, as of a turning crank, only
+        momenta under one lasting partition do. Step-size control spoils both properties.
 
     Raises
     ------
@@ -238,11 +239,11 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
       3.1 bases the criterion on y_i and y_d, Sect. 3.3 on y_i only; the latter is followed.
     - (26): "Rotol" is read as Rtol. (27): n is 2 n_q, because z holds positions and velocities.
     - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
-    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta sweep iterates the K_i, and so does this. Its step 2
+    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta method iterates the K_i, and so does this. Its step 2
       predicts K_i = f(t_n + c_i h, y_{n+1}); here one K, at (t_{n+1}, y_{n+1}), predicts all.
     - Left open by the text and chosen: the K_i are calculated one after another with the latest of the others, as the
       loop is printed; the accepted state is that of the two half steps; Newton starts from the last iterate of the
-      same stage; err_in bounds the largest correction; 200 sweeps at the most; the first step size, by solve_dae;
+      same stage; err_in bounds the largest correction; 200 iterations at the most; the first step size, by solve_dae;
       c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
     - A step also ends as after (33) when the inner loop does not converge: 25 iterations, a correction of more than
       half the one before, or a singular C_qd.

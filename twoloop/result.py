@@ -52,7 +52,7 @@ class Statistics:
     n_accepted, n_rejected_error, n_rejected_convergence : int or None
         Steps accepted, steps that failed the error test, steps whose loops did not converge.
     n_outer : int or None
-        Sweeps of the outer loop (a sweep evaluates every stage once).
+        Iterations of the outer loop (each evaluates every stage once).
     n_inner : int or None
         Newton iterations of the inner loop.
     n_evaluations : int or None
@@ -64,7 +64,7 @@ class Statistics:
         Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, of the partitionings,
         and for Newton's method in the outer loop.
     n_jacobians : int or None
-        Times the derivatives of the right side were made for Newton's method in the outer loop.
+        Times the derivatives of the right-hand side were made for Newton's method in the outer loop.
     cpu_time : float
         Process time of the integration, s; compilation and checks of the input not included.
     """

@@ -60,59 +60,209 @@ def test_one_study_runs_by_its_name(monkeypatch):
     assert ran == [["--quick"]]
 
 
+BEST = {"solver": "ours", "cpu_s": 0.1, "cpu_q1": 0.1, "cpu_q3": 0.1, "n_evaluations": 1e5, "keeps": True}
+BEST |= {"called_from": "compiled", "violation_q": 1e-15, "energy": -1e-3}
+THEIRS = BEST | {"solver": "theirs", "cpu_s": 0.2, "keeps": False, "called_from": "Python", "n_evaluations": 1e4}
+NOTHING = {"ours": None, "others": None, "ida": None, "default_over": None}
+
+
+def at_error(error=1e-4, **changed):
+    return {"error": error, "ours": BEST, "others": THEIRS, "ida": BEST | {"cpu_s": 0.3}, "default_over": 2.0} | changed
+
+
 def case(**changed):
     """A case as `work_precision` finds it."""
-    best = {"solver": "ours", "cpu_s": 0.1, "cpu_q1": 0.1, "cpu_q3": 0.1, "n_evaluations": 100.0, "keeps": True}
-    best |= {"called_from": "compiled", "violation_q": 1e-15, "energy": 1e-3}
-    at = [{"error": 1e-4, "ours": best, "others": best | {"solver": "theirs", "keeps": False}, "default_over": 2.0}]
-    found = {"name": "crane", "tags": ["stiff"], "t_end": 1.0, "floor": 1e-9, "at": at, "figure": "crane.png"}
-    found |= {"default_dominated": True, "default_over": [2.0, 3.0], "astray": [], "drift": None, "note": ""}
+    found = {"name": "crane", "tags": ["smooth"], "t_end": 1.0, "floor": 1e-9, "at": [at_error()]}
+    found |= {"figure": "crane.png", "default_dominated": True, "default_over": [2.0, 3.0], "default_by": ["ours"]}
+    return found | {"default_by_others": [], "astray": [], "drift": None, "note": ""} | changed
+
+
+def long_run(name, cpu_s, calm=True):
+    run = BEST | {"name": name, "cpu_s": cpu_s, "calm": calm, "drifts": not calm, "energy": 2e-3, "drift": 0.1}
+    return run | {"verdict": "no drift" if calm else "drifts", "n_evaluations": None}
+
+
+def energy(**changed):
+    """Findings of the study of energy."""
+    none = {"ours": None, "others": None}
+    free = {"ours": long_run("Gauss(3)", 2.0), "others": long_run("alpha", 3.0)}
+    at = [{"energy": 0.02, "no_drift": free, "drift": none | {"others": long_run("LSODA", 1.0, calm=False)}}]
+    long = {
+        "case": "switching",
+        "t_end": 1e4,
+        "kinetic": 20.0,
+        "at": at,
+        "alternatives": [long_run("LSODA", 1.0, False)],
+    }
+    found = {"long": long, "sun": long_run("Sun", 1.0, calm=False), "canonical": long_run("Sun, momenta", 1.0)}
     return found | changed
 
 
-def screen(tmp_path, cases, dominated=(), **others):
-    found = {"cases": cases, "dominated": list(dominated), "limit": 2.0, "default": "SunRadau5"}
-    for name, each in {"work_precision": found, **others}.items():
+def beam(differences_s, paper_s=4.5):
+    at = {"error": 1e-4, "paper_s": paper_s, "differences_s": differences_s, "best": {"solver": "IDA", "cpu_s": 0.01}}
+    return {"cases": [{"name": "moderately stiff", "at": [at]}]}
+
+
+def screen(tmp_path, cases=(), dominated=(), **others):
+    found = {"cases": list(cases), "dominated": list(dominated), "limit": 2.0, "default": "SunRadau5"}
+    for path in tmp_path.glob("*.json"):
+        path.unlink()
+    if cases:
+        others["work_precision"] = found
+    for name, each in others.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(each))
     return index.first_screen(tmp_path, False)
 
 
 def test_the_first_screen_turns_with_the_findings(tmp_path):
     worse = {"solver": "slow", "by": "ours", "factor": 3.0, "n": 6, "called_from": "Python"}
+    worse |= {"case": "crane", "error": 1e-4, "cpu_s": 0.6, "by_s": 0.2, "evaluations": 1.5}
     text = screen(tmp_path, [case()], [worse])
-    assert "| crane (stiff) | 1e-4 | `ours` | 0.10 |" in text and "`theirs` (drifts)" in text
-    assert "is never the cheapest of ours: it takes 2.0 to 3.0 times as long" in text
-    assert "`slow` (called from Python): `ours` takes at most 1/3.0 of its time" in text
-    text = screen(tmp_path, [case(default_dominated=False, default_over=[1.0, 2.0])])
-    assert "is the cheapest of ours at one of these errors" in text and "is dominated everywhere" in text
-    nothing = [{"error": 1e-4, "ours": None, "others": None, "default_over": None}]
-    text = screen(tmp_path, [case(at=nothing, default_dominated=False, default_over=[])])
+    assert (
+        "| smooth, rigid: crane, 1.0 s | 1e-4 | ours: `ours` | 0.10 |" in text
+        and "other: `theirs` (drifts off)" in text
+    )
+    assert "for 1e-4 take `ours` (the cheapest of others takes 2.0 times as long). IDA takes 3.0 times" in text
+    assert "takes 1.0 µs from compiled code and 20 µs from Python" in text
+    assert "so that evaluations should be compared, too" in text
+    assert "| `slow` | Python | `ours` | 6 | × 3.0 | 1e-4, crane | 0.60 | 0.20 | × 1.5 |" in text
+    assert "takes at most 0.50 of their time. Of those called from Python" in text
+    assert "Of those called from Python" not in screen(tmp_path, [case()], [worse | {"called_from": "compiled"}])
+    faster = at_error(others=THEIRS | {"cpu_s": 0.05}, ida=None)
+    text = screen(tmp_path, [case(at=[faster])])
+    assert "takes 1.0 µs from compiled code and 5.0 µs from Python" in text
+    near = THEIRS | {"n_evaluations": 4e5}
+    assert "should be compared, too" not in screen(tmp_path, [case(at=[at_error(others=near)])])
+    text = screen(tmp_path, [case(at=[faster])])
+    assert "take `theirs`, which is not ours and drifts off the constraints (our cheapest takes 2.0 times" in text
+    assert "IDA does not reach 1e-4" in text and "is dominated everywhere" in text
+    text = screen(tmp_path, [case(at=[{"error": 1e-4, **NOTHING}], default_dominated=False, default_over=[])])
     assert "reaches none of these errors" in text and "none reaches it" in text
+    assert "no solver compared reaches any of these errors" in text
+
+
+def test_picks_are_joined_where_the_solver_is_the_same():
+    prices = ((2, 0.1), (4, 0.4), (6, 0.1))
+    lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"cpu_s": cpu}, "others": THEIRS} for k, cpu in prices]
+    found = index.picks(lines)
+    assert [(pick["solver"], pick["accuracies"]) for pick in found] == [
+        ("ours", ["1e-2", "1e-6"]),
+        ("theirs", ["1e-4"]),
+    ]
+    assert found[0]["over"] == pytest.approx([2.0, 2.0]) and found[1]["over"] == pytest.approx([2.0])
+    assert index.picks([{"accuracy": "1e-2", "ours": None, "others": None}]) == []
+
+
+def test_the_default_is_named_where_it_is_dominated_and_by_which(tmp_path):
+    text = screen(tmp_path, [case(default_by=["Gauss12", "DOP853"], default_by_others=["LSODA"])])
+    assert "**Not the default** on crane: `SunRadau5` is never the cheapest of ours and takes 2.0 to 3.0 times" in text
+    assert "every error that it reaches: `Gauss12` and `DOP853`, and of other solvers `LSODA`." in text
+    text = screen(tmp_path, [case(default_by=[])])
+    assert "No one of ours is cheaper at every error" in text
+    text = screen(tmp_path, [case(default_dominated=False, default_over=[1.0, 2.0])])
+    assert "is the cheapest of ours at one of these errors" in text and "Not the default" not in text
+
+
+def test_classes_come_in_their_order_and_the_long_one_from_the_energy(tmp_path):
+    stiff = case(name="beam", tags=["stiff", "vibrations wanted"], at=[at_error(ours=BEST | {"energy": None})])
+    other = case(name="robot", tags=["odd"])
+    text = screen(tmp_path, [other, stiff, case()], energy=energy())
+    places = [text.index(f"| {label}: ") for label in ("smooth, rigid", "stiff, vibrations wanted", "odd", index.LONG)]
+    assert places == sorted(places) and "not conserved" in text
+    assert "for 0.020 J take `LSODA`, which is not ours" in text and "2e-3 (drifts)" in text
+    assert "not told" in text and "1 of the 1 solvers" in text
+    calm = energy()
+    calm["long"]["alternatives"] = [long_run("Gauss(3)", 2.0)]
+    calm["long"]["at"][0]["drift"]["others"] = None
+    text = screen(tmp_path, [case()], energy=calm)
+    assert (
+        "for 0.020 J take `Gauss(3)`" in text
+        and "2e-3 (no drift)" in text
+        and "none of the solvers in the table" in text
+    )
+
+
+def test_runs_out_of_phase_are_listed_with_their_row(tmp_path):
+    run = {"solver": "loose", "setting": "tol", "value": 1e-3, "error_q": 0.5, "cpu_s": 0.1}
+    assert "| `loose` | crane | tol = 1e-3 | 0.50 | 0.10 |" in screen(tmp_path, [case(astray=[run])])
+    assert "Out of phase" not in screen(tmp_path, [case()]) and "is out of phase" in screen(tmp_path, [case()])
+    found = {"one_constant": True, "newmark_astray": ["1e-3"], "irk_astray": [], "newmark_over_irk": []}
+    text = screen(tmp_path, [case()], table3=found)
+    assert "on the linkage: `PaperNewmark` with err_out = 1e-3 ([Table 3]" in text
+    text = screen(tmp_path, [case()], table3=found | {"irk_astray": ["1e-3"]})
+    assert "err_out = 1e-3, `PaperIRK` with err_out = 1e-3 (" in text
+    assert "in phase with all settings" in screen(tmp_path, [case()], table3=found | {"newmark_astray": []})
 
 
 def test_what_the_paper_promised_turns_with_the_findings(tmp_path):
     found = {"newmark_dearer_everywhere": True, "newmark_over_irk": [2.0, 6.0], "one_constant": False}
-    found |= {"irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0]}
+    found |= {"irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0], "newmark_astray": [], "irk_astray": []}
     text = screen(tmp_path, [case()], table3=found)
     assert "holds on the linkage at every error compared, by 2.0 to 6.0 times" in text
-    assert "do not follow the paper's up to one factor (8.0 to 15 for Runge" in text
+    assert "not reproduced up to one factor: the paper's over ours is 8.0 to 15 for Runge" in text
     text = screen(tmp_path, [case()], table3=found | {"newmark_dearer_everywhere": False, "one_constant": True})
-    assert "does not hold at every error" in text and "times follow the paper's up to one factor" in text
+    assert "does not hold at every error" in text and "Table 3 are reproduced up to one factor" in text
 
 
-def test_an_empty_folder_says_what_to_run(tmp_path):
+def claims(verdict):
+    more = {"verdict": verdict, "linkage": [2.0, 6.0], "soft": [1.5, 3.0], "stiff": [0.3, 0.4]}
+    counts = {"holds": 11, "holds in part": 7, "does not hold": 17}
+    return {"claims": {"more_efficient": more}, "n": 40, "counts": counts}
+
+
+def test_each_promise_has_its_opposite(tmp_path):
+    text = screen(tmp_path, claims=claims("holds"))
+    assert "holds on the linkage and both beams" in text and "Of 40 empirical claims 11 hold, 7 hold in part" in text
+    text = screen(tmp_path, claims=claims("holds in part"))
+    assert "holds in part; at equal error Newmark takes 2.0 to 6.0 times as long on the linkage" in text
+    assert "*More efficient than Newmark*: not run yet" in screen(tmp_path, claims=claims("not run"))
+
+    kept = {"ours_keep": True, "irk_grows": False, "ours": [1e-15, 1e-15, 0.0], "t_end": 100.0}
+    for change, says in (
+        ({}, "drift*: holds;"),
+        ({"irk_grows": True}, "holds in part"),
+        ({"ours_keep": False}, "not hold"),
+    ):
+        assert says in screen(tmp_path, violation=kept | change).split("Constraints are kept")[1].splitlines()[0]
+
+    assert "does not hold; in the paper's variables" in screen(tmp_path, energy=energy())
+    assert "and on momenta it does not drift" in screen(tmp_path, energy=energy())
+    assert "over long times*: holds" in screen(tmp_path, energy=energy(sun=long_run("Sun", 1.0)))
+    lost = long_run("Sun", 1.0) | {"calm": False, "verdict": "lost"}
+    assert "with fixed steps is lost" in screen(tmp_path, energy=energy(sun=lost))
+
+    assert "with Jacobians by differences 0.020 s" in screen(tmp_path, beam=beam(0.02))
+    assert "holds against Newton's method by differences" in screen(tmp_path, beam=beam(9.0))
+    assert "does not reach 0.10 mm" in screen(tmp_path, beam=beam(0.02, None))
+
+    steps = {"holds": True, "longer": True, "irk": {"share_time": 0.99}, "long": 0.02, "ratios": [170.0, 270.0]}
+    steps |= {"evaluations_ratio": [10.0, 20.0]}
+    assert "Large steps*: holds; steps longer than 0.02 s cover all but 1.0 % of the time" in screen(
+        tmp_path, step_size=steps
+    )
+    assert "Large steps*: does not hold" in screen(tmp_path, step_size=steps | {"longer": False})
+
+
+def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):
     text = index.first_screen(tmp_path, False)
-    assert "Not compared here yet: `python -m studies.work_precision`" in text
-    assert text.count("not run here") == len(index.STUDIES)
+    for name in ("work_precision", "energy", "violation", "beam", "step_size", "claims", "table3"):
+        assert f"not run yet (`python -m studies.{name}`)" in text
+    assert text.count(": not run yet") + text.count("(not run yet:") == 10 + len(index.STUDIES)
+    assert "Not judged by quick runs" in index.first_screen(tmp_path, True)
+    (tmp_path / "beam.json").write_text("{")
+    with pytest.raises(StudyError, match=r"beam.json cannot be read.*studies.beam again"):
+        index.first_screen(tmp_path, False)
 
 
 def test_the_readme_changes_between_its_marks_only(tmp_path):
     screen(tmp_path, [case()])
     readme = tmp_path / "README.md"
-    readme.write_text("above\n<!-- generated: begin -->\nold\n<!-- generated: end -->\nbelow\n")
+    readme.write_text("above\n<!-- generated: begin -->\nearlier\n<!-- generated: end -->\nbelow\n")
     index.put_in_readme(tmp_path, readme)
     text = readme.read_text()
-    assert text.startswith("above\n") and text.endswith("\nbelow\n") and "old" not in text
-    assert "| crane | 1e-4 | `ours` 0.10 s | `theirs` 0.10 s |" in text
+    assert text.startswith("above\n") and text.endswith("\nbelow\n") and "earlier" not in text
+    assert "| smooth, rigid: crane | 1e-4 | `ours` 0.10 s | `theirs` 0.20 s |" in text
+    assert "for 1e-4 take `ours`" in text and "Not the default" in text
+    assert "Long and conservative problems: not run yet" in text
     with pytest.raises(StudyError, match="there is no work_precision"):
         index.put_in_readme(tmp_path / "nowhere", readme)

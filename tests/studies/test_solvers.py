@@ -25,7 +25,7 @@ def setting(name):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in CATALOGUE if CATALOGUE[name].two_loop or not name.startswith(COMPILING)]
+    "name", [name for name in CATALOGUE if CATALOGUE[name].family == "two-loop" or not name.startswith(COMPILING)]
 )
 def test_every_solver_runs_at_one_setting(name):
     problem = four_bar()
@@ -35,12 +35,10 @@ def test_every_solver_runs_at_one_setting(name):
     assert np.abs(result.q - trajectory(problem.parameters, result.t)[0]).max() < bound
 
 
-def test_a_job_carries_what_its_row_needs():
-    job = CATALOGUE[IRK].job("group", four_bar(), T_END, 1e-7, 2)
-    assert job.solver == IRK and job.repeats == 2
-    assert job.settings == {"err_in": 1e-9, "tol": 1e-5, "err_out": 1e-7}
-    assert CATALOGUE[gear(3, "ramp")].job("", four_bar(), T_END, 0.01).settings == {"order": 3, "h": 0.01}
-    assert CATALOGUE[baumgarte("DOP853", 10.0)].job("", four_bar(), T_END, 1e-6).settings["alpha"] == 10.0
+def test_a_solver_carries_what_its_rows_need():
+    assert CATALOGUE[IRK].fixed == {"err_in": 1e-9, "tol": 1e-5} and CATALOGUE[IRK].setting == "err_out"
+    assert CATALOGUE[gear(3, "ramp")].fixed == {"order": 3} and CATALOGUE[gear(3, "ramp")].setting == "h"
+    assert CATALOGUE[baumgarte("DOP853", 10.0)].fixed == {"alpha": 10.0}
 
 
 def test_all_tolerances_are_the_same_down_to_1e_13():
@@ -51,7 +49,7 @@ def test_all_tolerances_are_the_same_down_to_1e_13():
 def test_names_and_flags_agree():
     assert set(LINE_UP) <= set(CATALOGUE)
     assert all(solver.name == name for name, solver in CATALOGUE.items())
-    assert CATALOGUE["SunRadau5"].two_loop and CATALOGUE["IDA, index1"].own_a
+    assert CATALOGUE["SunRadau5"].family == "two-loop" and CATALOGUE["IDA, index1"].own_accelerations
 
 
 def test_long_runs_of_fixed_steps_are_thinned_and_end_at_the_end():

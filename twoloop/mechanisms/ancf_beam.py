@@ -5,7 +5,7 @@ Coordinates: 6 a node (see `ancf_element`), 6 (n + 1) for n elements, the base f
 
 The element locks: its director does not vary over the thickness, so bending cannot relieve the stress across it, and
 acts with (lambda + 2 mu) in place of E. At Poisson's ratio 0.3 that makes the beam (lambda + 2 mu)/E = 1.346 times as
-stiff in bending as Euler and Bernoulli say, however fine the mesh. It belongs to the benchmark and is not mended here.
+stiff in bending as Euler and Bernoulli say, however fine the mesh. This is part of the benchmark and stays.
 """
 
 import math
