@@ -209,8 +209,8 @@ def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
 def _render(template: str, folder: Path, **more: Any) -> str:
     found = findings(folder)
     entries = classes(found)
-    compared = {"classes": entries, "cases": cases_of(found)}
-    compared |= {"default": found.get("work_precision", {}).get("default")}
+    compared: dict[str, Any] = {"classes": entries, "cases": cases_of(found)}
+    compared["default"] = found.get("work_precision", {}).get("default")
     text = environment().get_template(template).render(s=found, **compared, choice=choice(entries), **more)
     while "\n\n\n" in text:
         text = text.replace("\n\n\n", "\n\n")
