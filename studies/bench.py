@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed
 MOST_CALLS = 500
+ONCE = 1.0  # s of CPU; the time of a run that takes longer hardly varies, and it is not repeated
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
 
 
@@ -192,7 +193,8 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
     """Make the rows of all runs that are not kept yet: one row a repetition.
 
     The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
-    alike. A run that fails, exceeds its time limit, or cannot be made is a row whose status and message say so.
+    alike; one that takes more than ONCE seconds is made once. A run that fails, exceeds its time limit, or cannot be made
+    is a row whose status and message say so.
 
     Parameters
     ----------
@@ -224,21 +226,26 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
     for case in {id(run.case): run.case for run, _ in left}.values():
         _ = case.scale  # makes the reference, which is not to be timed with anything
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with _rows_of(left, measure, processes) as made, Progress(*columns, disable=not sys.stdout.isatty()) as progress:
+    bar = Progress(*columns, disable=not sys.stdout.isatty())
+    with _rows_of(left, kept, measure, processes) as made, bar as progress:
         task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
         for run, k, row in made:
             kept.add(run.key(k), row)
             progress.update(task, advance=1, description=f"{run.case.name}: {run.solver.name}"[:50].ljust(50))
-    return pd.DataFrame([kept[key] for key in order])
+    return pd.DataFrame([kept[key] for key in order if key in kept])
+
+
+def _long(row: Row) -> bool:
+    return (row["cpu_s"] or 0.0) > ONCE
 
 
 @contextmanager
 def _rows_of(
-    left: list[tuple[Run, int]], measure: Measure | None, processes: int
+    left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None, processes: int
 ) -> Iterator[Iterator[tuple[Run, int, Row]]]:
     if processes == 1:
         warm: set[tuple[int, str]] = set()
-        yield ((run, k, _row(run, k, measure, warm)) for run, k in left)
+        yield ((run, k, _row(run, k, measure, warm)) for run, k in left if k == 0 or not _long(kept[run.key(0)]))
         return
     context = multiprocessing.get_context("fork")  # cases and solvers hold functions that cannot be sent
     _shared[:] = [(run, k, measure) for run, k in left]
