@@ -193,8 +193,8 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
     """Make the rows of all runs that are not kept yet: one row a repetition.
 
     The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
-    alike; one that takes more than ONCE seconds is made once. A run that fails, exceeds its time limit, or cannot be made
-    is a row whose status and message say so.
+    alike; one that takes more than ONCE seconds is made once. A run that fails, exceeds its time limit, or cannot be
+    made is a row whose status and message say so.
 
     Parameters
     ----------
