@@ -54,7 +54,7 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     LIMIT_MEMORY,  # ... for this many accepted steps
     MAX_STEPS,  # accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
-    SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is worn
+    SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is renewed
     PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson), see also KEPT
     LEAST_ERROR,  # what an error below it counts as in the trend (Hairer & Wanner II, IV.8)
     MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on

@@ -1,8 +1,9 @@
-"""The outer loop by fixed point where that is enough, by Newton's method where stiffness would make it crawl.
+"""The outer loop by fixed point where that is enough, by Newton's method where stiffness would make its steps tiny.
 
-The evaluations that a second of motion costs are measured over windows of accepted steps. A run starts with sweeps.
-When these converge slowly, Newton's method is tried for a window, and kept if it costs GAIN times fewer evaluations;
-after many windows of it sweeps are tried again. What is not kept is next tried after twice as many windows.
+The evaluations that a second of motion costs are measured over windows of accepted steps. A run starts with the
+fixed-point iteration. When it converges slowly, Newton's method is tried for a window, and kept if it costs GAIN times
+fewer evaluations; after many windows of it the fixed-point iteration is tried again. What is not kept is next tried
+after twice as many windows.
 """
 
 import numpy as np
@@ -15,9 +16,9 @@ from twoloop.kernels.runge_kutta import runge_kutta_step
 
 SETTLE = 10.0  # accepted steps before a measurement begins
 WINDOW = 20.0  # accepted steps that it takes
-SLOW = 5.5  # sweeps for one solution of the stages from which on Newton's method may be worth a trial
+SLOW = 5.5  # iterations for one solution of the stages from which on Newton's method may be worth a trial
 GAIN = 3.0  # Newton's steps have an estimate of lower order and no extrapolation: fewer evaluations alone prove nothing
-PATIENCE = 10.0  # windows before the first trial of sweeps after Newton's method, or of Newton's method once more
+PATIENCE = 10.0  # windows before the first trial of the fixed point, or of Newton's method once more
 LOOPS = 3.0  # solutions of the stages in one attempt: a whole step, two half ones
 
 SWEEPS, NEWTON_ON_TRIAL, NEWTON, SWEEPS_ON_TRIAL = range(4)  # phases

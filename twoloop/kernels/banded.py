@@ -11,7 +11,8 @@ from twoloop.kernels.lapack import DPBTRF, DPBTRS, NO_TRANSPOSE, UPPER, call
 from twoloop.kernels.linalg import lu_factor, lu_solve
 
 # From so many coordinates on a Newton step by banded algebra is the faster one: measured 36 to 75, on chains of
-# bandwidth 1 to 11 and on beams. Evaluations alone, as sweeps make them, gain from about 150 on and lose a third here
+# bandwidth 1 to 11 and on beams. Evaluations alone, as a fixed-point iteration makes them, gain from about 150 on and
+# lose a third here
 BANDED_FROM = 56
 
 

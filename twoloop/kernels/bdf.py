@@ -22,7 +22,7 @@ STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
 MAX_SWEEPS = 60
 SAFETY = 0.9  # of advance(): the next step is SAFETY over the returned error times this one
 BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
-NEIGHBOUR = 1.4  # ... and that of another order once more times this, lest the order flutter
+NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
 HOLD = 1.2  # a step that could grow by less keeps its size
 GROWTH = 2.0  # the most by which a step grows
 SHORT = 0.03  # a step of less than this share of the last, between close output times, stays out of the history
@@ -141,7 +141,7 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 @compiled
 def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at t for the independents: sweeps on their accelerations.
+    """Solve y = prediction + c (y' - rate) at t for the independents: a fixed-point iteration on their accelerations.
 
     c is h over 1 + 1/2 + ... + 1/k. On return the whole new state is consistent.
     """
@@ -168,7 +168,7 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
             change = max(change, difference / max(abs(v1[m]), 1.0))
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        # the first sweep evaluates the prediction, never to be accepted: extrapolation alone is unstable
+        # the first iteration evaluates the prediction, never to be accepted: extrapolation alone is unstable
         if sweep > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]

@@ -63,7 +63,7 @@ class Work(NamedTuple):
     Qd: Any  # (n_c) right-hand side of Cq a = Qd
     Qd_tried: Any  # (2, n_c) the same by differences over a double length, and with the length tried before
     g: Any  # (n_c) scratch
-    lam: Any  # (n_c) multipliers of an evaluation that nobody keeps
+    lam: Any  # (n_c) multipliers of an evaluation that is not kept
     dependent: Any  # (n_c) columns of the dependent coordinates
     independent: Any  # (n_q - n_c) columns of the independent coordinates
     pivots: Any  # (n_c) row exchanges of the LU factors

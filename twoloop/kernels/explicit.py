@@ -73,7 +73,7 @@ def _weighted(weights, slopes, total):
 
 @compiled
 def _move(y, h, weights, slopes, y1):
-    """y1 = y + h times the weighted sum: added at last, lest every stage round y."""
+    """y1 = y + h times the weighted sum: added at last, so that not every stage rounds y."""
     _weighted(weights, slopes, y1)
     for m in range(y.size):
         y1[m] = y[m] + h * y1[m]

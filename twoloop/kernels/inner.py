@@ -152,7 +152,7 @@ def _velocities(f, w, t, q, v):
 
 @inlined
 def rounding_floor(q):
-    """Relative change below which a sweep that stops shrinking has converged: rounding of q moves accelerations."""
+    """Relative change below which a fixed-point iteration that stops shrinking has converged: q is rounded."""
     size = 0.0
     for j in range(q.size):
         size = max(size, abs(q[j]))
@@ -306,7 +306,7 @@ def _accelerations(f, w, t, q, v, a, lam):
 
 @compiled
 def evaluate(f, w, t, q, v, tolerance, a, lam):
-    """One evaluation of the right side: dependents of q and v from their independents, then a and lam."""
+    """One evaluation of the right-hand side: dependents of q and v from their independents, then a and lam."""
     code = _positions(f, w, t, q, tolerance)
     if code == DONE:
         code = _velocities(f, w, t, q, v)

@@ -199,8 +199,9 @@ def _momentum_rates(f, w, t, q, v, tangent, Mv, shifted, rate):
 
 @compiled
 def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, q1, p1, v1):
-    """One step of size h from (q, p) by sweeps; V_stage, R_stage hold predicted velocities and rates of p on entry.
+    """One step of size h from (q, p) by a fixed-point iteration.
 
+    V_stage, R_stage hold predicted velocities and rates of p on entry.
     On return they have converged, and q1, p1, v1 are the end of the step, on the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
@@ -259,7 +260,7 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
             first = max(first, change)
         elif not change <= GROWTH * first:
             return OUTER_DIVERGED
-        elif change >= earlier:  # two sweeps back: errors go from q to p in one sweep and back in the next
+        elif change >= earlier:  # two iterations back: errors go from q to p in one iteration and back in the next
             if change <= rounding_floor(q):
                 converged = True
                 break
@@ -291,7 +292,7 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
 
 @kernel(STEP)
 def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt by sweeps on (q_i, p_i); error and extrapolation as in `runge_kutta_step`."""
+    """One attempt by a fixed-point iteration on (q_i, p_i); error and extrapolation as in `runge_kutta_step`."""
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
     n_dof = w.independent.size

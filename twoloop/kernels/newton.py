@@ -1,13 +1,14 @@
-"""Implicit Runge-Kutta steps whose outer loop is Newton's method: for stiff problems, where sweeps need tiny steps.
+"""Implicit Runge-Kutta steps whose outer loop is Newton's method, for stiff problems.
 
 The unknowns are the stage accelerations a_j of the independent coordinates, as in `sweep_accelerations`:
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-F being the two-loop right side. With J_q, J_v, its derivatives by q_i and v_i at one state (simplified Newton), the
-corrections solve (I - h^2 A A x J_q - h A x J_v) d = r. In the eigenvectors of A this falls apart into one real
+F being the two-loop right-hand side. With J_q, J_v, its derivatives by q_i and v_i at one state (simplified Newton),
+the corrections solve (I - h^2 A A x J_q - h A x J_v) d = r. In the eigenvectors of A this falls apart into one real
 (n_dof, n_dof) system I - (h l)^2 J_q - h l J_v for each real eigenvalue l and one complex for each pair, half the size
-of those of a first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA).
+of those of a first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA). A fixed-point iteration would
+need tiny steps there.
 """
 
 from typing import Any

@@ -225,7 +225,7 @@ def _all_coordinates(w, memory, s, b, x, X):
 
 @compiled
 def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
-    """Solve with the full right side x (n_q); its first n_dof numbers become the independents of the solution."""
+    """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independents of the solution."""
     Cq, _, _ = _constraints(memory, s, x.size, w.C.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn

@@ -1,9 +1,10 @@
 """The linear algebra of newton.py for systems of any structure: (n_dof, n_dof) matrices.
 
-J_q and J_v come by differences of the two-loop right side. Where the system gives the tangents K and D (see
+J_q and J_v come by differences of the two-loop right-hand side. Where the system gives the tangents K and D (see
 newton_tangents.py), (T^T M T) J_q = T^T K T with T = [I; -Cqd^-1 Cqi], and J_v likewise: as in newton_banded.py that
 leaves out how T and M change with the position and Q_d with the velocity, in which there is no stiffness; fixed steps
-in which a body turns by some 0.4 rad on its constraints may then fail where differences of the right side converge.
+in which a body turns by some 0.4 rad on its constraints may then fail where differences of the right-hand side
+converge.
 """
 
 from twoloop.kernels.common import (
@@ -105,7 +106,7 @@ def _from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def derivatives(f, w, options, memory, s, t, q, v, a):
-    """J_q and J_v at (t, q, v), where the value of the two-loop right side, evaluated just before, is a."""
+    """J_q and J_v at (t, q, v), where the value of the two-loop right-hand side, evaluated just before, is a."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1:
         return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size

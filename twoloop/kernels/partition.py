@@ -96,8 +96,9 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     """Take the partition that full pivoting finds in the middle of a step; DONE (= 0) where it is the present one.
 
     Both directions of a step have the same middle, so that the choice, and with it the map of a symmetric tableau,
-    is symmetric in time: where the partition changes, no direction is preferred, as it is by waiting until it is worn.
-    The middle is that of the attempt made under the present partition, and is not looked at again once the step has
+    is symmetric in time: where the partition changes, no direction is preferred, as it is by waiting until it has to be
+    renewed.
+    The middle is that of the attempt made under the current partition, and is not looked at again once the step has
     been redone under the new one: where two choices tie to within the difference of the two attempts, O(h^(p+1)), the
     reverse step may choose the other.
     """

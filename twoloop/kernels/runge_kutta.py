@@ -26,8 +26,8 @@ from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TOL
 
 MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
-GROWTH = 1e3  # the differences may first grow (the sweep is not normal), but not by more than this
-PATIENCE = 8  # sweeps after which a difference that grows again means divergence
+GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
+PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
@@ -54,10 +54,11 @@ def _vector(memory, s, n, which):
 
 @compiled
 def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
-    """One step of size h from (q, v) by sweeps on the stage accelerations; A_stage holds their prediction on entry.
+    """One step of size h from (q, v), a fixed-point iteration on the stage accelerations.
 
+    A_stage holds their prediction on entry.
     Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
-    undamped systems the sweep's rate is the square of the first-order one. On return A_stage has converged and
+    undamped systems the iteration's rate is the square of the first-order one. On return A_stage has converged and
     (q1, v1) is the end of the step, on the constraints; w.notes[DEPARTURE] grows to how far its prediction was off.
     """
     s, A, A2, b, bA, c = tableau_of(options)
@@ -125,9 +126,9 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
 def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
     """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
 
-    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. A sweep goes from stage
-    to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on the
-    constraints.
+    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration goes from
+    stage to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on
+    the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -218,7 +219,7 @@ def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
 
 @kernel(STEP)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt by sweeps on the accelerations; where the error is estimated, a step of h and two of h/2.
+    """One attempt, a fixed-point iteration on the accelerations; to estimate the error, a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
     step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
