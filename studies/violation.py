@@ -17,7 +17,7 @@ from studies.cli import StudyError
 from studies.index import write_index
 from studies.metrics import CHECKED, violations
 from studies.render import number, power, render, table
-from studies.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, baumgarte, gear, paper_irk_at
+from studies.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, OWN_EXPLICIT, baumgarte, gear, paper_irk_at
 from studies.store import Output
 from twoloop import Result
 
@@ -36,10 +36,11 @@ ZERO = 1e-17  # what counts as a violation of zero where a logarithm is taken
 
 PAIRS = (("DOP853, projected", "DOP853, index 1"), ("IDA, stabilised", "IDA, index1"))  # kept, not kept
 PLAIN = ("LSODA, index 1", "DOP853, index 1")
-ALONG = (*itertools.chain(*PAIRS), "LSODA, index 1", baumgarte("DOP853", 10.0), IDA_C, "SunRadau5", "Gauss12")
-QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), "SunRadau5", "Gauss12")
+OWN = ("SunRadau5", "Gauss12", OWN_EXPLICIT)
+ALONG = (*itertools.chain(*PAIRS), "LSODA, index 1", baumgarte("DOP853", 10.0), IDA_C, *OWN)
+QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *OWN)
 ONCE = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
-DRAWN = (*PAIRS[0], "LSODA, index 1", "IDA, index1", "IDA, stabilised", IDA_C, "Gauss12")  # cost over error
+DRAWN = (*PAIRS[0], "LSODA, index 1", "IDA, stabilised", IDA_C, "Gauss12", OWN_EXPLICIT)  # cost over error
 EXUDYN = ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2")
 OVER_TIME = (*PLAIN, baumgarte("DOP853", 10.0), "IDA, stabilised", gear(2), *EXUDYN)
 TARGETS, MIDDLE = (1e-2, 1e-4, 1e-6), 1e-4
