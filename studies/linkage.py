@@ -39,7 +39,8 @@ def draw(axes: plt.Axes, problem: Problem) -> None:
         if k == 0:
             for i in range(3):
                 middle = (0.5 * (x[i] + x[i + 1]), 0.5 * (y[i] + y[i + 1]))
-                axes.annotate(f"bar {i + 1}", middle, (4, 5), textcoords="offset points", fontsize=8)
+                box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # other positions pass behind it
+                axes.annotate(f"bar {i + 1}", middle, (4, 5), textcoords="offset points", fontsize=8, bbox=box)
     axes.plot([0.0, problem.parameters["L"]], [0.0, 0.0], "^", color="black", ms=9, zorder=5)
     axes.annotate("O", (0.0, 0.0), (-12, 6), textcoords="offset points")
     axes.annotate("A", (problem.parameters["L"], 0.0), (6, 6), textcoords="offset points")
