@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from references.four_bar_minimal import MinimalFourBar
 from references.ida import solve_ida
-from studies import cli, figures, tables
+from studies import figures, study, tables
 from studies.bench import Case, Run, Solver, collect
 from studies.cases import four_bar
 from studies.cases.four_bar import Y3
 from studies.cli import StudyError
-from studies.index import write_index
 from studies.render import number, percent, power, render, table
 from studies.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
 from studies.store import Output
@@ -225,24 +224,9 @@ def report(output: Output, rows: pd.DataFrame, series: dict[str, Array], line: s
     return found
 
 
-def _work(words: Sequence[str] | None) -> None:
-    call = cli.parse("step_size", __doc__, words)
-    with Output(call) as output:
-        if call.redraw:
-            rows, line = output.load_rows()
-            series = output.load_series()
-        else:
-            (rows, series), line = make(output), cli.stamp(call.command)
-            output.save_rows(rows, line)
-            output.save_series(series)
-        report(output, rows, series, line)
-        write_index(output)
-    print(f"wrote step_size.md, .csv, .json and figures to {output.path}")
-
-
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
-    cli.main(_work, words)
+    study.run("step_size", __doc__, words, make, report)
 
 
 if __name__ == "__main__":

@@ -10,11 +10,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies import cli, figures, tables
+from studies import figures, study, tables
 from studies.bench import Case, Run, collect
 from studies.cases import four_bar
 from studies.cli import StudyError
-from studies.index import write_index
 from studies.metrics import CHECKED, violations
 from studies.render import number, power, render, table
 from studies.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, OWN_EXPLICIT, baumgarte, gear, paper_irk_at
@@ -311,24 +310,9 @@ def report(output: Output, rows: pd.DataFrame, series: dict[str, Array], line: s
     return found
 
 
-def _work(words: Sequence[str] | None) -> None:
-    call = cli.parse("violation", __doc__, words)
-    with Output(call) as output:
-        if call.redraw:
-            rows, line = output.load_rows()
-            series = output.load_series()
-        else:
-            (rows, series), line = make(output), cli.stamp(call.command)
-            output.save_rows(rows, line)
-            output.save_series(series)
-        report(output, rows, series, line)
-        write_index(output)
-    print(f"wrote violation.md, .csv, .json and figures to {output.path}")
-
-
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
-    cli.main(_work, words)
+    study.run("violation", __doc__, words, make, report)
 
 
 if __name__ == "__main__":
