@@ -314,3 +314,24 @@ def test_digests_of_functions_that_name_themselves_end():
         return again(x - 1.0) if x > 0.0 else 0.0
 
     assert watch(again.py_func) == watch(again.py_func) is not None
+
+
+SYMBOL = """
+import sys
+from twoloop.adapters import through_python
+
+print(next(iter(through_python(sys.argv[1]).overloads.values())).fndesc.mangled_name)
+"""
+
+
+def test_closures_of_one_name_from_two_processes_have_symbols_of_their_own(tmp_path):
+    # numba numbers symbols within a process: each of these two gives its only closure the same number
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    symbols = set()
+    for kind in ("force_by_q", "reaction_by_q"):
+        done = subprocess.run(
+            [sys.executable, "-c", SYMBOL, kind], capture_output=True, text=True, env=environment, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        symbols.add(done.stdout)
+    assert len(symbols) == 2

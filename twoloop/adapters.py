@@ -13,7 +13,7 @@ from numba import njit, objmode
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from twoloop.caches import watch
+from twoloop.caches import named_apart, watch
 from twoloop.callbacks import KINDS, compile_callback
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
         def function(t, q):  # type: ignore[no-untyped-def]
             return matrix
 
-    user = function if isinstance(function, Dispatcher) else njit(function)
+    user = function if isinstance(function, Dispatcher) else njit(named_apart(function, watch(function)))
     message = f"{kind} returned an array of the wrong shape"
 
     def with_two(t, q, p, out):  # type: ignore[no-untyped-def]

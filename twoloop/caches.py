@@ -60,7 +60,8 @@ def compile_kept(
     **options
         Of numba.njit.
     """
-    dispatcher = njit(**options)(function)
+    dispatcher = njit(**options)(named_apart(function, watched))
+    function = dispatcher.py_func
     if watched is not None:
         try:
             dispatcher._cache = _Cache(function, *watched, announcement)
@@ -70,6 +71,25 @@ def compile_kept(
     dispatcher.compile(signature)
     dispatcher.disable_compile()
     return dispatcher
+
+
+def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
+    """A function within a function, or a lambda, under a name that no other has; any other function as it is.
+
+    Numba's symbols are made of the qualified name and of a number that counts within a process. Two closures of one
+    name whose machine code comes from different processes may share a symbol: the one that is loaded first is then
+    called in the place of both.
+    """
+    if watched is None or "<" not in function.__qualname__:
+        return function
+    code = function.__code__
+    copy = types.FunctionType(
+        code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__kwdefaults__, copy.__module__ = function.__kwdefaults__, function.__module__
+    apart = hashlib.sha256(repr((watched, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
+    copy.__qualname__ = f"{function.__qualname__}.{apart[:16]}"
+    return copy
 
 
 class _Cache(FunctionCache):
