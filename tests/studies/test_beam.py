@@ -240,6 +240,7 @@ def test_newton_by_differences_is_the_same_run_but_for_its_jacobians():
     assert abs(own.stats.n_accepted - other.stats.n_accepted) < 0.3 * own.stats.n_accepted
 
 
+@pytest.mark.slow
 def test_exudyn_is_measured_against_itself():
     pytest.importorskip("exudyn")
     case = cases(True)[STIFF]

@@ -395,6 +395,7 @@ def test_sentences_turn_with_the_verdicts(key, before, turned, after, folder, ta
     assert after in text and (before not in text or key in STAYS)
 
 
+@pytest.mark.slow
 def test_experiments_are_what_the_judges_read(monkeypatch):
     """Their names, from a quick run."""
     assert set(experiments.make(True)) == set(EXPERIMENTS)
