@@ -1,6 +1,6 @@
 """Method objects and presets: options, their checks, and what they say about the paper."""
 
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -100,3 +100,15 @@ def test_names_are_different():
 def test_wrong_options_are_named(make, error, words):
     with pytest.raises(error, match=words):
         make()
+
+
+def test_the_papers_criterion_over_all_coordinates_needs_fewer_steps_at_a_loose_tolerance(default_four_bar):
+    """Criterion (32), tolerance 1e-3: over y_i alone the outer loop stops too early, and steps become small."""
+    problem = default_four_bar
+    steps = {}
+    for outer_test in ("all", "independent"):
+        method = replace(paper_irk(1e-9, 1e-3), outer_test=outer_test)
+        result = solve_dae(problem.system, (0.0, 20.0), problem.q0, problem.v0, method, rtol=1e-5, atol=1e-5)
+        assert result.success, result.message
+        steps[outer_test] = len(result.h)
+    assert steps["all"] < 0.8 * steps["independent"]

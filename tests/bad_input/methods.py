@@ -53,6 +53,7 @@ METHODS = [
     *argument("RungeKutta", runge_kutta, "error", [("none", ValueError, "must be 'richardson'", "take one of these")]),
     *argument("RungeKutta", runge_kutta, "variables", [("q", ValueError, "must be 'velocities'", "take one of these")]),
     *argument("RungeKutta", runge_kutta, "partition", [(1, TypeError, "must be 'lasting'", "take one of these")]),
+    *argument("RungeKutta", runge_kutta, "outer_test", [(1, TypeError, "must be 'all'", "take one of these")]),
     *argument("RungeKutta", runge_kutta, "inner_tol", FEW_POSITIVES),
     *argument("RungeKutta", runge_kutta, "outer_tol", [*FEW_POSITIVES, INFINITE]),
     Case(

@@ -22,7 +22,7 @@ from twoloop.kernels.common import (
 from twoloop.kernels.inner import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import restore_predicted
-from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
+from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TEST, OUTER_TOL, interpolate, tableau_of
 
 MAX_SWEEPS = 60
 MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
@@ -122,6 +122,15 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
     return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
+@inlined
+def _largest_change(coordinates, q, v, q_old, v_old):
+    change = 0.0
+    for m in coordinates:
+        change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
+        change = max(change, abs(v[m] - v_old[m]) / max(abs(v[m]), 1.0))
+    return change
+
+
 @compiled
 def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
     """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
@@ -160,7 +169,6 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
                 return code
         copy(q1, q_old)
         copy(v1, v_old)
-        change = 0.0
         for m in w.independent:
             in_q = 0.0
             in_v = 0.0
@@ -169,11 +177,12 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
                 in_v += b[k] * A_stage[k, m]
             q1[m] = q[m] + h * in_q
             v1[m] = v[m] + h * in_v
-            change = max(change, abs(q1[m] - q_old[m]) / max(abs(q1[m]), 1.0))
-            change = max(change, abs(v1[m] - v_old[m]) / max(abs(v1[m]), 1.0))
         code = restore(f, w, t + h, q1, v1, tolerance)
         if code != DONE:
             return code
+        change = _largest_change(w.independent, q1, v1, q_old, v_old)
+        if options[OUTER_TEST] == 1.0:
+            change = max(change, _largest_change(w.dependent, q1, v1, q_old, v_old))
         if change <= options[OUTER_TOL]:  # (32)
             return DONE
         norm = 0.0

@@ -8,7 +8,7 @@ from twoloop.kernels.common import compiled, inlined
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
-STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, N_SCALARS = range(5)
+STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, N_SCALARS = range(6)
 
 
 def options_array(
@@ -18,10 +18,11 @@ def options_array(
     inner_tol: float,
     outer_tol: float,
     extrapolation: float,
+    outer_test: float = 1.0,
 ) -> NDArray[np.float64]:
-    """The parameter block that `tableau_of` reads."""
+    """The parameter block that `tableau_of` reads; `outer_test` 1: (32) over dependent coordinates too."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
-    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation])
+    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test])
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
 
 
