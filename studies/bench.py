@@ -30,7 +30,8 @@ from twoloop.mechanisms import Problem
 Array = NDArray[np.float64]
 
 INSTANTS = 1000  # common instants of a case that names none
-WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed
+WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
+COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
 MOST_CALLS = 500
 ONCE = 1.0  # s of CPU; the time of a run that takes longer hardly varies, and it is not repeated
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
@@ -287,7 +288,7 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
     if what not in warm:  # compiles what is not compiled yet; a failure comes back in the run itself
         warm.add(what)
         span = 10.0 * run.value if solver.setting == "h" else WARM_UP * case.t_end
-        attempt(replace(run, case=replace(case, t_end=min(span, case.t_end))), k)
+        attempt(replace(run, case=replace(case, t_end=min(span, case.t_end), time_limit=COMPILING)), k)
     row |= {"cpu_s": None, "calls": 0}
     result, status, message = attempt(run, k)
     stats = Statistics() if result is None else result.stats

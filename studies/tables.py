@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from studies.bench import NOTHING_RUN
-from studies.render import number
+from studies.render import number, power
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
@@ -109,12 +109,12 @@ def with_quartiles(middle: float, low: float, high: float) -> str:
 
 
 def failures(rows: pd.DataFrame) -> list[list[str]]:
-    """Lines of a table of runs that did not reach the end: solver, setting, status, message."""
+    """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message."""
     lines = []
     for _, row in rows[rows["status"] != "REACHED_END"].iterrows():
-        what = [f"{key} {number(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
+        what = [f"{key} {power(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
         setting = "all" if row["status"] in NOTHING_RUN else ", ".join(what)
-        line = [row["solver"], setting, str(row["status"]).lower().replace("_", " "), str(row["message"])]
-        if line not in lines:
-            lines.append(line)
+        status, message = str(row["status"]).lower().replace("_", " "), str(row["message"]).split(". ")[0]
+        if [row["solver"], setting, status, message] not in lines:
+            lines.append([row["solver"], setting, status, message])
     return lines
