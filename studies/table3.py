@@ -139,8 +139,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["newmark_dearer_everywhere"] = bool(ratios and min(ratios) > 1.0)
     found["cheapest"] = [line for error in TARGETS[::2] if (line := _cheapest(first, error)) is not None]
     failed = rows[rows["status"] != "REACHED_END"]
-    found["failed"] = [f"{solver} ({setting})" for solver, setting, *_ in tables.failures(failed)]
-    found["failed_two_loop"] = bool((failed["family"] == "two-loop").any())
+    found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
     ours = rows[(rows["family"] == "two-loop") & (rows["err_in"].isna() | (rows["err_in"] == ERR_IN))]
     drifting = rows[~rows["keeps_constraints"].astype(bool)]["violation_q"]
     found["violation"] = float(ours["violation_q"].max())
