@@ -25,7 +25,7 @@ from twoloop.mechanisms import Problem
 
 Array = NDArray[np.float64]
 
-CHECKED = 2000  # stored instants, evenly chosen, at which violations are taken
+CHECKED = 500  # stored instants, evenly chosen, at which violations are taken
 MULTIPLIERS = 100  # stored instants at which multipliers are compared
 LOST = 0.25  # of the largest kinetic energy of the motion: a run with a greater energy error has lost the solution
 ASTRAY = 0.1  # of the range of a watched coordinate: a run that strays farther is out of phase

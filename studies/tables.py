@@ -8,6 +8,8 @@ import pandas as pd
 from studies.bench import NOTHING_RUN
 from studies.render import number, power
 
+SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
+
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a run: the repetition of median error, with median and quartiles of the CPU time of all repetitions.
@@ -103,9 +105,10 @@ def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequen
 
 
 def with_quartiles(middle: float, low: float, high: float) -> str:
-    """Seconds, the quartiles in brackets where they differ from the median at the digits shown."""
+    """Seconds, the quartiles in brackets where they are more than `SPREAD` of the median apart."""
     texts = [number(value) for value in (low, middle, high)]
-    return texts[1] if len(set(texts)) == 1 else f"{texts[1]} ({texts[0]}–{texts[2]})"
+    near = high - low <= SPREAD * middle or len(set(texts)) == 1
+    return texts[1] if near else f"{texts[1]} ({texts[0]}–{texts[2]})"
 
 
 def failures(rows: pd.DataFrame) -> list[list[str]]:

@@ -6,45 +6,42 @@ from typing import Any
 
 import pandas as pd
 
-from studies import cases, cli, figures, tables
+from studies import cases, figures, study, tables
 from studies.bench import Case, Run, collect
 from studies.cli import StudyError
 from studies.compare import runs_of
-from studies.index import write_index
 from studies.render import number, power, render, table
-from studies.solvers import COMPARED, IDA_C_ORDER_2, NEWTON_4, TOLERANCES
+from studies.solvers import COMPARED, IDA_C_ORDER_2, IDA_FORMS, IRK_LINE, NEWTON_4, QUARTER, TOLERANCES
 from studies.store import Output
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
-FURTHER = ("Gauss6", "PaperIRK, Atol = Rtol varied", "PaperNewmark, beta = 1/4", "IDA, index1")
-STIFF = (NEWTON_4, IDA_C_ORDER_2)  # beside them on stiff cases, where `studies.beam` has the paper's procedures
-TIGHT = 1e-4  # from here on a run of a stiff case takes seconds, and is made once
+FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
+STIFF = (NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studies.beam` has the paper's procedures
 DEFAULT = "SunRadau5"  # of solve_dae
 EMPTY = ("ours", "others", "ida", "default_over")
 SETTINGS = ("tol", "h", "err_out")
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
-    """The runs of a case; of stiff ones, once where they take seconds, and fewer of those called from Python."""
+    """The runs of a case; of those called from Python on stiff ones, which take seconds, fewer and once."""
     stiff = "stiff" in case.tags
-    made = runs_of(case, COMPARED if quick else (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
+    if quick:  # IDA takes seconds to compile, and others on stiff cases to run
+        made = runs_of(case, [name for name in COMPARED if "IDA" not in name], quick)
+        return [run for run in made if not stiff or run.solver.called_from == "compiled"]
+    made = runs_of(case, (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
     if not stiff:
         return made
-    if quick:  # others take too long
-        return [run for run in made if run.solver.called_from == "compiled"]
     coarse = (case.tolerances or TOLERANCES)[::2]
-    made = [run for run in made if run.solver.called_from == "compiled" or run.value in coarse]
-    return [
-        replace(run, repeats=1) if run.solver.called_from == "Python" or run.value <= TIGHT else run for run in made
-    ]
+    once = [replace(run, repeats=1) if run.solver.called_from == "Python" else run for run in made]
+    return [run for run in once if run.repeats > 1 or run.value in coarse]
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
     """The first line of a ranking as a finding."""
     if ranked.empty:
         return None
-    keys = ("solver", "cpu_s", "cpu_q1", "cpu_q3", "n_evaluations", "called_from", "violation_q", "energy")
+    keys = ("solver", "cpu_s", "n_evaluations", "called_from", "violation_q", "energy")
     return {**{key: ranked.iloc[0][key] for key in keys}, "keeps": bool(ranked.iloc[0]["keeps_constraints"])}
 
 
@@ -121,35 +118,23 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
             raise StudyError(f"the rows have none of {case.name}; make them again by python -m studies.work_precision")
         at = [class_of(runs, error) for error in ERRORS]
         over = [line["default_over"] for line in at if line["default_over"] is not None]
-        reached = runs[runs["error_q"].notna()]
-        astray = out_of_phase(reached)
-        listed.append(
-            {
-                "name": case.name,
-                "tags": list(case.tags),
-                "t_end": case.t_end,
-                "floor": float(runs["floor"].iloc[0]),
-                "at": at,
-                "default_dominated": bool(over) and min(over) > 1.0,
-                "default_over": [min(over), max(over)] if over else [],
-                "default_by": before_default(at, "ours"),
-                "default_by_others": before_default(at, "others"),
-                "astray": astray,
-                "drift": _drift(reached),
-                "figure": f"work_precision_{_slug(case.name)}.png",
-                "note": case.note,
-            }
-        )
-    return {"cases": listed, "dominated": dominated(rows, ERRORS), "limit": DOMINATED, "default": DEFAULT}
+        slug = "_".join("".join(letter if letter.isalnum() else " " for letter in case.name).split())
+        found: dict[str, Any] = {"name": case.name, "tags": list(case.tags), "t_end": case.t_end, "at": at}
+        found |= {"default_dominated": bool(over) and min(over) > 1.0}
+        found |= {"default_over": [min(over), max(over)] if over else []}
+        found |= {"default_by": before_default(at, "ours"), "default_by_others": before_default(at, "others")}
+        found["astray"] = out_of_phase(runs[runs["error_q"].notna()])
+        listed.append(found | {"figure": f"work_precision_{slug}.png", "note": case.note})
+    drifting = rows[~rows["keeps_constraints"].astype(bool)]["violation_q"].max()
+    found = {"cases": listed, "dominated": dominated(rows, ERRORS), "limit": DOMINATED, "default": DEFAULT}
+    return found | {"drift": None if pd.isna(drifting) else float(drifting)}
 
 
-def _drift(runs: pd.DataFrame) -> float | None:
-    drifting = runs[~runs["keeps_constraints"].astype(bool)]
-    return None if drifting.empty else float(drifting["violation_q"].max())
-
-
-def _slug(name: str) -> str:
-    return "_".join("".join(letter if letter.isalnum() else " " for letter in name).split())
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows."""
+    quick = output.call.quick
+    with output.kept() as kept:
+        return collect([run for case in cases.load(quick) for run in runs(case, quick)], kept)
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
@@ -161,35 +146,18 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     work = {}
     for case, found in zip(known, findings["cases"], strict=True):
         runs = rows[rows["case"] == case.name]
+        lines = figures.cheapest_lines(runs, ERRORS)
         header = ["solver", "called from", *(power(error) for error in ERRORS)]
         work[case.name] = table(header, tables.work_precision(runs, ERRORS))
-        lines = figures.cheapest_lines(runs, ERRORS)
         plot = figures.work_precision(runs, lines, f"{case.name}, {number(case.t_end)} s")
         figures.save(plot, output, found["figure"].removesuffix(".png"))
-    more = {"stamp": line, "quick": output.call.quick}
-    output.write("work_precision.md", render("work_precision", findings, work, **more))
+    output.write("work_precision.md", render("work_precision", findings, work, stamp=line, quick=output.call.quick))
     return findings
-
-
-def _work(words: Sequence[str] | None) -> None:
-    call = cli.parse("work_precision", __doc__, words)
-    with Output(call) as output:
-        if call.redraw:
-            rows, line = output.load_rows()
-        else:
-            listed = [run for case in cases.load(call.quick) for run in runs(case, call.quick)]
-            with output.kept() as kept:
-                rows = collect(listed, kept)
-            line = cli.stamp(call.command)
-            output.save_rows(rows, line)
-        report(output, rows, line)
-        write_index(output)
-    print(f"wrote work_precision.md, .csv, .json and figures to {output.path}")
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
-    cli.main(_work, words)
+    study.run_rows("work_precision", __doc__, words, make, report)
 
 
 if __name__ == "__main__":

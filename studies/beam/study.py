@@ -11,18 +11,17 @@ from studies import figures, tables
 from studies import study as common
 from studies.beam.findings import TARGETS, findings_of
 from studies.beam.limits import along_rows, limit_rows
-from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, OTHERS, PAPER, by_tip, cases, measure, runs
+from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, by_tip, cases, measure, runs
 from studies.beam.sensitivity import CHANGES, sensitivity_rows
 from studies.bench import collect
 from studies.render import number, render, table
-from studies.solvers import NEWTON_4, OWN_EXPLICIT, QUARTER
+from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWTON_4, OWN_EXPLICIT, QUARTER
 from studies.store import Output
 
 ERROR = "largest error of the tip's height over the run (m)"
 LISTED = (  # the CSV has all
-    *(PAPER, QUARTER, NEWTON, NEWTON_4, DIFFERENCES, "BDF", OWN_EXPLICIT),
-    *(name for name in OTHERS if name != "IDA, stabilised"),
-    EXUDYN,
+    *(PAPER, QUARTER, NEWTON, NEWTON_4, DIFFERENCES, "BDF", OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2),
+    *("DOP853, projected", "Radau, index 1", "Radau, solve_dae", EXUDYN),
 )
 
 
@@ -44,26 +43,38 @@ def drawn(runs_: pd.DataFrame) -> list[str]:
     return [PAPER, *lines] if PAPER in seen and PAPER not in lines else lines
 
 
+def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
+    """CPU time of each solver for each target, the beams side by side."""
+    costs = [
+        {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
+        for name in names
+    ]
+    nothing = ["", *["not run"] * len(TARGETS)]
+    lines = []
+    for solver in LISTED:
+        called = [cost[solver][0] for cost in costs if solver in cost]
+        cells = [cell for cost in costs for cell in cost.get(solver, nothing)[1:]]
+        lines += [[solver, called[0], *cells]] if called else []
+    errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
+    return table(["solver", "called from", *errors], lines)
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report; the findings."""
     rows = tables.medians(rows)
     rows = rows.assign(error_q=rows["error_q"].where(rows["group"] != "run", rows["error_tip"]))
     findings = findings_of(rows)
     output.save_findings(findings)
-    lines: list[list[str]] = []
+    names = [case["name"] for case in findings["cases"]]
+    ready = {"cost": cost_table(by_tip(rows), names)}
     for case in findings["cases"]:
         runs_ = by_tip(rows)
         runs_ = runs_[runs_["case"] == case["name"]]
-        told = tables.work_precision(runs_, TARGETS, LISTED)
-        lines = [[*one, *other[2:]] for one, other in zip(lines, told, strict=True)] if lines else told
         title = f"{case['name']} beam, {number(case['t_end'])} s"
         plot = figures.work_precision(runs_, drawn(runs_), title, ERROR)
         for axes, target in itertools.product(plot.axes, TARGETS):
             axes.axvline(target, color="0.6", linestyle=":", linewidth=1.0, zorder=0)
         figures.save(plot, output, case["figure"].removesuffix(".png"))
-    errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
-    ready = {"cost": table(["solver", "called from", *errors], lines)}
-    names = [case["name"] for case in findings["cases"]]
     changes = [[change, *(1e3 * case["changes"][change] for case in findings["cases"])] for change in CHANGES]
     ready["changes"] = table(["change", *(f"{name} (mm)" for name in names)], changes)
     output.write("beam.md", render("beam", findings, ready, stamp=line, quick=output.call.quick))
