@@ -194,8 +194,8 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
     """Make the rows of all runs that are not kept yet: one row a repetition.
 
     The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
-    alike; one that takes more than ONCE seconds is made once. A run that fails, exceeds its time limit, or cannot be
-    made is a row whose status and message say so.
+    alike; one that takes more than ONCE seconds, or hits its limit, is made once. A run that fails, exceeds its time
+    limit, or cannot be made is a row whose status and message say so.
 
     Parameters
     ----------
@@ -242,7 +242,8 @@ def _rows_of(
     if processes == 1:
         warm: set[tuple[int, str]] = set()
         for run, k in left:
-            if k == 0 or (kept[run.key(0)]["cpu_s"] or 0.0) <= ONCE:
+            first = kept[run.key(0)] if k > 0 else {}
+            if first.get("status") != "TIME_LIMIT" and (first.get("cpu_s") or 0.0) <= ONCE:
                 yield run, k, _row(run, k, measure, warm)
         return
     _shared[:] = [(run, k, measure) for run, k in left]  # cases and solvers hold functions that cannot be sent

@@ -18,7 +18,7 @@ from studies.store import Output
 from twoloop.mechanisms import Problem
 
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
-QUICK = (1e-3, 1e-5, 1e-7, 1e-9)  # values of tolerances in a quick comparison
+QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
 
 
 def load_problem(where: str) -> Problem:
@@ -71,22 +71,10 @@ def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict
     found |= {"python": case.problem.system.called_in_python, "unresolved": [e for e in errors if e < floor]}
     found["cheapest"] = []
     for error in errors:
-        ranked = tables.ranking(rows, error)
-        ours, others = None, None
-        if len(ranked):
-            own = ranked["family"] == "two-loop"
-            ours, others = _first(ranked[own]), _first(ranked[~own])
+        ours, others = tables.of_both(tables.ranking(rows, error)).values()
         first = None if ours is None or others is None else bool(ours["cpu_s"] < others["cpu_s"])
         found["cheapest"].append({"error": error, "ours": ours, "others": others, "ours_first": first})
     return found | {"failed": bool((rows["status"] != "REACHED_END").any())}
-
-
-def _first(ranked: pd.DataFrame) -> dict[str, Any] | None:
-    if ranked.empty:
-        return None
-    line = ranked.iloc[0]
-    keeps = bool(line["keeps_constraints"])
-    return {**{key: line[key] for key in ("solver", "cpu_s", "called_from")}, "keeps": keeps}
 
 
 def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Sequence[float]) -> None:

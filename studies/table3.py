@@ -121,11 +121,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     if irk is None or newmark is None:
         raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
     found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "floor": float(first["floor"].iloc[0])}
-    found |= {
-        "lost_limit": LOST,
-        "astray_limit": ASTRAY,
-        "paper_ratio": float(PAPER_NEWMARK[3][3] or 0) / PAPER_IRK[3][3],
-    }
+    found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
+    found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
     for name, cell in (("irk", irk), ("newmark", newmark)):
         found |= {f"{name}_s": cell["cpu_s"], f"{name}_error": cell["error_q"]}
         cells = first[first["group"] == cell["group"]]
@@ -137,10 +134,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ratios = _newmark_over_irk(first)
     found["newmark_over_irk"] = [min(ratios), max(ratios)] if ratios else []
     found["newmark_dearer_everywhere"] = bool(ratios and min(ratios) > 1.0)
-    found["cheapest"] = [line for error in TARGETS[::2] if (line := _cheapest(first, error)) is not None]
+    found["cheapest"] = [line for error in TARGETS[::2] if (line := _cheapest(_compared(first), error)) is not None]
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
-    ours = rows[(rows["family"] == "two-loop") & (rows["err_in"].isna() | (rows["err_in"] == ERR_IN))]
+    ours = _at_least_fine(rows[rows["family"] == "two-loop"])
     drifting = rows[~rows["keeps_constraints"].astype(bool)]["violation_q"]
     found["violation"] = float(ours["violation_q"].max())
     found["violation_grows"] = bool(ours["violation_late"].max() > 2.0 * ours["violation_early"].max())
@@ -154,9 +151,8 @@ def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
     if ranked.empty:
         return None
     times = dict(zip(ranked["solver"], ranked["cpu_s"] / ranked["cpu_s"].iloc[0], strict=True))
-    line = {"error": error, "solver": ranked["solver"].iloc[0], "cpu_s": ranked["cpu_s"].iloc[0]}
-    line |= {"ours": bool(ranked["family"].iloc[0] == "two-loop")}
-    return line | {"paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
+    found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
+    return found | (tables.best(ranked) or {})
 
 
 def _newmark_over_irk(first: pd.DataFrame) -> list[float]:
@@ -172,6 +168,10 @@ def _newmark_over_irk(first: pd.DataFrame) -> list[float]:
     return [float(ratio) for ratio in ratios if not np.isnan(ratio)]
 
 
+def _compared(first: pd.DataFrame) -> pd.DataFrame:
+    return first[first["group"].isin(("comparison", *FAMILIES))]
+
+
 def _at_least_fine(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["err_in"].isna() | (rows["err_in"] == ERR_IN)]
 
@@ -182,7 +182,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings = findings_of(rows)
     output.save_findings(findings)
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    compared = first[first["group"].isin(("comparison", *FAMILIES))]
+    compared = _compared(first)
     seconds = f"{number(findings['t_end'])} s"
     plot = figures.work_precision(_at_least_fine(compared), DRAWN, f"{first['problem'].iloc[0]}, {seconds}")
     figures.save(plot, output, "table3")

@@ -1,6 +1,7 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -73,6 +74,24 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         line |= {"cpu_s": cpu, **{what: time_for(runs, target, what) for what in ("cpu_q1", "cpu_q3", "n_evaluations")}}
         lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
     return pd.DataFrame(lines).sort_values("cpu_s", ignore_index=True) if lines else pd.DataFrame()
+
+
+def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
+    """The first line of a ranking as a finding; None where there is none."""
+    if ranked.empty:
+        return None
+    keys = ("solver", "cpu_s", "n_evaluations", "called_from", "violation_q", "energy")
+    found = {key: ranked.iloc[0][key] for key in keys}
+    kept, family = ranked.iloc[0][["keeps_constraints", "family"]]
+    return found | {"keeps": bool(kept), "ours": bool(family == "two-loop")}
+
+
+def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
+    """The cheapest of ours and of others in a ranking."""
+    if ranked.empty:
+        return {"ours": None, "others": None}
+    own = ranked["family"] == "two-loop"
+    return {"ours": best(ranked[own]), "others": best(ranked[~own])}
 
 
 def why_not(rows: pd.DataFrame) -> str:

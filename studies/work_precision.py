@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import pandas as pd
@@ -18,16 +19,16 @@ ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
 STIFF = (NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studies.beam` has the paper's procedures
+QUICK = (*COMPARED[:5], "DOP853, index 1", "DOP853, projected")  # others take seconds to compile or to run
 DEFAULT = "SunRadau5"  # of solve_dae
-EMPTY = ("ours", "others", "ida", "default_over")
 SETTINGS = ("tol", "h", "err_out")
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
     """The runs of a case; of those called from Python on stiff ones, which take seconds, fewer and once."""
     stiff = "stiff" in case.tags
-    if quick:  # IDA takes seconds to compile, and others on stiff cases to run
-        made = runs_of(case, [name for name in COMPARED if "IDA" not in name], quick)
+    if quick:
+        made = runs_of(case, QUICK, quick)
         return [run for run in made if not stiff or run.solver.called_from == "compiled"]
     made = runs_of(case, (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
     if not stiff:
@@ -37,26 +38,18 @@ def runs(case: Case, quick: bool) -> list[Run]:
     return [run for run in once if run.repeats > 1 or run.value in coarse]
 
 
-def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
-    """The first line of a ranking as a finding."""
-    if ranked.empty:
-        return None
-    keys = ("solver", "cpu_s", "n_evaluations", "called_from", "violation_q", "energy")
-    return {**{key: ranked.iloc[0][key] for key in keys}, "keeps": bool(ranked.iloc[0]["keeps_constraints"])}
-
-
 def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     """The cheapest of ours, of others and of IDA on one case at one error, how the default does, and what beats it."""
     ranked = tables.ranking(rows, error)
-    found: dict[str, Any] = {"error": error, **dict.fromkeys(EMPTY), "before_default": {}}
+    found: dict[str, Any] = {"error": error, "ida": None, "default_over": None, "before_default": {}}
+    found |= tables.of_both(ranked)
     if ranked.empty:
         return found
-    own, ida = ranked["family"] == "two-loop", ranked["family"] == "SUNDIALS"
-    found |= {"ours": best(ranked[own]), "others": best(ranked[~own]), "ida": best(ranked[ida])}
+    found["ida"] = tables.best(ranked[ranked["family"] == "SUNDIALS"])
     default = ranked[ranked["solver"] == DEFAULT]["cpu_s"]
     if not default.empty:
+        own, cheaper = ranked["family"] == "two-loop", ranked["cpu_s"] < default.iloc[0]
         found["default_over"] = float(default.iloc[0] / ranked[own]["cpu_s"].iloc[0])
-        cheaper = ranked["cpu_s"] < default.iloc[0]
         kinds = {"ours": own, "others": ~own}
         found["before_default"] = {kind: ranked[cheaper & which]["solver"].tolist() for kind, which in kinds.items()}
     return found
@@ -81,31 +74,31 @@ def out_of_phase(runs: pd.DataFrame) -> list[dict[str, Any]]:
 
 def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any]]:
     """Solvers that some one other beats at every error that they reach on every case: name, by which, least factor."""
-    times: dict[str, dict[tuple[str, float], float]] = {}
-    counts: dict[tuple[str, str, float], float] = {}
-    for (case, solver), runs in rows.groupby(["case", "solver"], sort=False):
-        for error in errors:
-            cost = tables.time_for(runs, error)
-            if cost == cost:
-                times.setdefault(str(solver), {})[str(case), error] = cost
-                counts[str(solver), str(case), error] = tables.time_for(runs, error, "n_evaluations")
+    costs: dict[str, dict[tuple[str, float], pd.Series]] = {}
+    for case, error in product(dict.fromkeys(rows["case"]), errors):
+        for _, line in tables.ranking(rows[rows["case"] == case], error).iterrows():
+            costs.setdefault(line["solver"], {})[case, error] = line
     found = []
-    for solver, own in times.items():
-        factors = {
-            other: min(cost / theirs[place] for place, cost in own.items())
-            for other, theirs in times.items()
+    for solver, own in costs.items():
+        over = {
+            other: {place: line["cpu_s"] / theirs[place]["cpu_s"] for place, line in own.items()}
+            for other, theirs in costs.items()
             if other != solver and own.keys() <= theirs.keys()
         }
-        if factors:
-            by = max(factors, key=factors.__getitem__)
-            if factors[by] >= DOMINATED:
-                called = rows[rows["solver"] == solver]["called_from"].iloc[0]
-                line = {"solver": solver, "by": by, "factor": factors[by], "n": len(own), "called_from": str(called)}
-                over = {place: cost / times[by][place] for place, cost in own.items()}
-                where = min(over, key=over.__getitem__)  # the row in which it does best
-                row = {"case": where[0], "error": where[1], "cpu_s": own[where], "by_s": times[by][where]}
-                row["evaluations"] = counts[(solver, *where)] / counts[(by, *where)]
-                found.append(line | row)
+        by = max(over, key=lambda other: min(over[other].values()), default="")
+        if not by or min(over[by].values()) < DOMINATED:
+            continue
+        where = min(over[by], key=over[by].__getitem__)  # the row in which it does best
+        mine, theirs = own[where], costs[by][where]
+        line = {
+            "solver": solver,
+            "by": by,
+            "factor": over[by][where],
+            "n": len(own),
+            "called_from": mine["called_from"],
+        }
+        line |= {"case": where[0], "error": where[1], "cpu_s": mine["cpu_s"], "by_s": theirs["cpu_s"]}
+        found.append(line | {"evaluations": mine["n_evaluations"] / theirs["n_evaluations"]})
     return found
 
 
@@ -148,7 +141,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
         runs = rows[rows["case"] == case.name]
         lines = figures.cheapest_lines(runs, ERRORS)
         header = ["solver", "called from", *(power(error) for error in ERRORS)]
-        work[case.name] = table(header, tables.work_precision(runs, ERRORS))
+        reached = set(tables.ranking(runs, ERRORS[0]).get("solver", ()))
+        shown = [name for name in dict.fromkeys(runs["solver"]) if name in reached]
+        work[case.name] = table(header, tables.work_precision(runs, ERRORS, shown))
         plot = figures.work_precision(runs, lines, f"{case.name}, {number(case.t_end)} s")
         figures.save(plot, output, found["figure"].removesuffix(".png"))
     output.write("work_precision.md", render("work_precision", findings, work, stamp=line, quick=output.call.quick))

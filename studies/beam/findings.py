@@ -73,30 +73,21 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
 def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     """Who is cheapest at one error on one beam: of all, of ours, of others, among implicit methods; and the paper's."""
     ranked = tables.ranking(runs, error)
-    names = ("best", "ours", "others", "implicit", "ida_over_ours", "paper_s", "differences_s")
-    found: dict[str, Any] = {"error": error, **dict.fromkeys((*names, "paper_over_best", "newmark_over_paper"))}
-    if ranked.empty:
-        return found
-    own, implicit = ranked["family"] == "two-loop", ~ranked["solver"].isin((OWN_EXPLICIT, EXPLICIT))
-    found |= {"best": _first(ranked), "ours": _first(ranked[own]), "others": _first(ranked[~own])}
-    found["implicit"] = _first(ranked[implicit])
-    seconds = dict(zip(ranked["solver"], ranked["cpu_s"], strict=True))
-    found |= {"differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
-    ida = [seconds[name] for name in (IDA_C, IDA_C_ORDER_2) if name in seconds]
-    if ida and found["ours"] is not None:
-        found["ida_over_ours"] = min(ida) / found["ours"]["cpu_s"]
+    seconds = dict(zip(ranked["solver"], ranked["cpu_s"], strict=True)) if len(ranked) else {}
+    implicit = ranked if ranked.empty else ranked[~ranked["solver"].isin((OWN_EXPLICIT, EXPLICIT))]
+    found: dict[str, Any] = {"error": error, "best": tables.best(ranked), "implicit": tables.best(implicit)}
+    found |= {**tables.of_both(ranked), "differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
+    found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
+    ida, newmark = (
+        min((seconds[name] for name in names if name in seconds), default=None)
+        for names in ((IDA_C, IDA_C_ORDER_2), (NEWMARK, QUARTER))
+    )
+    if ida is not None and found["ours"] is not None:
+        found["ida_over_ours"] = ida / found["ours"]["cpu_s"]
     if PAPER in seconds:
-        found["paper_over_best"] = seconds[PAPER] / float(ranked["cpu_s"].iloc[0])
-        newmark = [seconds[name] for name in (NEWMARK, QUARTER) if name in seconds]
-        found["newmark_over_paper"] = min(newmark) / seconds[PAPER] if newmark else None
+        found["paper_over_best"] = seconds[PAPER] / min(seconds.values())
+        found["newmark_over_paper"] = None if newmark is None else newmark / seconds[PAPER]
     return found
-
-
-def _first(ranked: pd.DataFrame) -> dict[str, Any] | None:
-    if ranked.empty:
-        return None
-    line = ranked.iloc[0]
-    return {"solver": line["solver"], "ours": bool(line["family"] == "two-loop"), "cpu_s": float(line["cpu_s"])}
 
 
 def _longest_step(runs: pd.DataFrame, w_max: float) -> dict[str, Any]:
