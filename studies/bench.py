@@ -129,7 +129,8 @@ class Solver:
     called_from : str
         What calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call.
     keeps_constraints : bool
-        Whether positions and velocities stay on the constraints to the solver's tolerance; False: they drift.
+        Whether the positions stay on the constraints to the solver's tolerance; False: they drift, or are off by the
+        solver's errors.
     setting : str
         What the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s).
     run : callable

@@ -5,7 +5,7 @@ that it cannot run, which becomes a row. Foreign packages are imported when they
 installed is a row too.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import product
 from typing import Any
@@ -141,37 +141,35 @@ def paper_newmark_at(err_in: float, beta: float = 0.5) -> Solver:
     return Solver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
 
 
-def _ours(name: str, run: Callable[[Case, float, int], Result], setting: str = "tol") -> Solver:
-    return Solver(name, "two-loop", "compiled", True, setting, run, TOLERANCES if setting == "tol" else ())
-
-
-def _foreign(name: str, family: str, called_from: str, keeps: bool, run: Any, own: bool = True, **fixed: Any) -> Solver:
-    """With a tolerance where it is called from Python, IDA from C too; otherwise in fixed steps."""
-    setting = "tol" if called_from == "Python" or family == "SUNDIALS" else "h"
+def _solver(name: str, family: str, called_from: str, setting: str, run: Any, **more: Any) -> Solver:
     values = TOLERANCES if setting == "tol" else ()
-    return Solver(name, family, called_from, keeps, setting, run, values, fixed, own_accelerations=own)
+    return Solver(name, family, called_from, more.pop("keeps", True), setting, run, values, **more)
 
 
-def _index_1(name: str, keeps: bool, method: str, stabilisation: str, **alpha: float) -> Solver:
-    run = partial(_index1, {"method": method, "stabilisation": stabilisation, **alpha})
-    return _foreign(name, "SciPy", "Python", keeps, run, bool(alpha), **alpha)
+def _index_1(name: str, keeps: bool, method: str, stabilisation: str, **fixed: float) -> Solver:
+    run = partial(_index1, {"method": method, "stabilisation": stabilisation, **fixed})
+    return _solver(name, "SciPy", "Python", "tol", run, keeps=keeps, fixed=fixed, own_accelerations=bool(fixed))
 
 
 def _all() -> Iterator[Solver]:
     yield paper_irk_at(ERR_IN)
-    yield _ours(IRK_LINE, _paper_irk)
+    yield _solver(IRK_LINE, "two-loop", "compiled", "tol", _paper_irk)
     yield paper_newmark_at(ERR_IN)
     yield paper_newmark_at(ERR_IN, 0.25)
     for preset in PRESETS:
-        yield _ours(preset, partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset))
-    yield _ours(NEWTON_4, partial(_preset, RungeKutta(radau_iia(4), "newton")))
-    yield _ours(CANONICAL, _canonical, "h")
+        run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
+        yield _solver(preset, "two-loop", "compiled", "tol", run)
+    newton = RungeKutta(radau_iia(4), "newton")
+    yield _solver(NEWTON_4, "two-loop", "compiled", "tol", partial(_preset, newton))
+    yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
+    own: dict[str, Any] = {"own_accelerations": True}
     for form in IDA_FORMS:
-        yield _foreign(f"IDA, {form}", "SUNDIALS", "Python", form == "stabilised", partial(_ida, form))
+        keeps, run = form == "stabilised", partial(_ida, form)
+        yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
     for name, options in ((IDA_C, {}), (IDA_C_ORDER_2, {"max_order": 2, "error_test": "positions"})):
-        yield _foreign(name, "SUNDIALS", "compiled", True, partial(_ida_c, options))
+        yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
     for name in ("Radau", "Radau9", "BDF"):
-        yield _foreign(f"{name}, solve_dae", "solve_dae", "Python", True, partial(_fully_implicit, name))
+        yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
         yield _index_1(f"{name}, index 1", False, name, "none")
     for name in ("DOP853", "RK45"):
@@ -179,14 +177,15 @@ def _all() -> Iterator[Solver]:
     for name, alpha in product(("LSODA", "DOP853"), ALPHAS):
         yield _index_1(baumgarte(name, alpha), False, name, "baumgarte", alpha=alpha)
     for solver in EXUDYN:
-        keeps = solver != "TrapezoidalIndex2"  # whose positions are off by its local errors
-        yield _foreign(f"Exudyn, {solver}", "Exudyn", "compiled", keeps, partial(_exudyn, solver, {}))
+        keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
+        yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **own)
     for radius in (1.0, 0.6):
-        fixed: dict[str, Any] = {"spectral_radius": radius}
+        fixed = {"spectral_radius": radius}
         run = partial(_exudyn, "GeneralizedAlpha", fixed)
-        yield _foreign(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", True, run, **fixed)
+        yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **own)
     for order, start in product(GEAR_ORDERS, GEAR_STARTS):
-        yield _foreign(gear(order, start), "stand-in", "compiled", True, partial(_gear, order, start), order=order)
+        run, fixed = partial(_gear, order, start), {"order": order}
+        yield _solver(gear(order, start), "stand-in", "compiled", "h", run, fixed=fixed, **own)
 
 
 CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
