@@ -1,6 +1,6 @@
 """The paper's first example, the four-bar linkage, in two geometries; its motion is known apart from all solvers."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -20,6 +20,12 @@ def _known(problem: Problem) -> ReferenceMotion:
     motion = MinimalFourBar.from_parameters(problem.parameters)
     source = "one-coordinate formulation of its own (references/four_bar_minimal.py), DOP853 at 1e-13"
     return ReferenceMotion(motion.states, FLOOR, source)
+
+
+@cache
+def period() -> float:
+    """Period of the first geometry, s."""
+    return MinimalFourBar.from_parameters(four_bar().parameters).period
 
 
 def case(problem: Problem, name: str, t_end: float, timed: float = 0.1) -> Case:
