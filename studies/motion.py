@@ -1,6 +1,7 @@
 """Figs. 2-5 of the paper: the height of bar 3's centre by every solver, over 2 s and 100 s, with its error."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -22,7 +23,7 @@ from studies.study import Series, Study, key
 from studies.tables import setting
 from twoloop import Result
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
 
 VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
 PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it
@@ -31,15 +32,14 @@ STEPS = (COARSE, MIDDLE, 0.005, 0.002, 0.001)
 FINE = 0.002  # s, at which y3 and its error are looked at, between the steps as well
 SHORT, LAST = 2.0, 5.0  # s: Fig. 2 of the paper, and what is drawn of the end of the run
 GRIDS = {"short": np.linspace(0.0, SHORT, 201), "last": np.linspace(-LAST, 0.0, 501), "log": np.geomspace(1e-3, 1, 80)}
+EXUDYN = "Exudyn, GeneralizedAlpha"
 SMALLEST = 1e-11  # m, of the reference
-LISTED = (IRK, NEWMARK, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "LSODA, index 1", "DOP853, projected")
-ALPHA = "Exudyn, GeneralizedAlpha"
+LISTED = (IRK, NEWMARK, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "DOP853, projected", "LSODA, index 1", EXUDYN)
 
 
 def runs(quick: bool) -> list[Run]:
     """Every solver at one sensible setting; then the stand-in for Gstiff at several steps."""
-    # times are not compared here
-    case = four_bar.case(four_bar.cases(quick)[0].problem, "four-bar", 10.0 if quick else 100.0, timed=0.0)
+    case = replace(four_bar.cases(quick)[0], timed=0.0)  # times are not compared here
     line_up = [CATALOGUE[name] for name in LINE_UP]
     if quick:
         line_up = [solver for solver in line_up if solver.family in ("two-loop", "Exudyn")]
@@ -68,8 +68,9 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
         row["growth"] = np.log10(worst[-1] / worst[np.searchsorted(t, 0.1 * t[-1])])
         row["top"] = max(y3.max(), problem.q0[Y3])
         row["top_late"] = y3[t >= t[-1] - 1.5 * four_bar.period()].max()
-    times = {"short": (y3, GRIDS["short"]), "last": (y3, t_end + GRIDS["last"]), "log": (worst, t_end * GRIDS["log"])}
-    for name, (curve, at) in times.items():
+    curves = {"short": (y3, GRIDS["short"]), "last": (y3, t_end + GRIDS["last"])}
+    curves["log"] = (np.maximum(worst, SMALLEST), t_end * GRIDS["log"])  # to be drawn
+    for name, (curve, at) in curves.items():
         row["series"][name] = np.where(at <= t[-1] * (1.0 + 1e-9), np.interp(at, t, curve), np.nan)
     return row
 
@@ -83,8 +84,8 @@ def find(rows: pd.DataFrame, solver: str, step: float | None = None) -> pd.Serie
 
 def _stand_in(rows: pd.DataFrame) -> dict[str, Any]:
     """What is said of the stand-in for ADAMS GSTIFF, by order."""
-    coarse, fine = ({n: find(rows, gear(n), step) for n in GEAR_ORDERS} for step in (COARSE, MIDDLE))
-    both = {n: (coarse[n], fine[n]) for n in GEAR_ORDERS if coarse[n] is not None and fine[n] is not None}
+    both: dict[int, Any] = {n: [find(rows, gear(n), step) for step in (COARSE, MIDDLE)] for n in GEAR_ORDERS}
+    both = {n: found for n, found in both.items() if all(row is not None for row in found)}
 
     def off(k: int, what: str) -> list[int]:
         return [n for n, found in both.items() if not found[k][what] <= VISIBLE]  # a failed run is off, too
@@ -114,8 +115,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "visible": VISIBLE,
         "passes": PASSES,
         "fine": FINE,
-        "kinetic": float(rows["kinetic"].max()),
-        "range": float(rows["range_y3"].max()),
         "procedures": procedures,
         "procedures_hold": all(one["holds"] for one in procedures),
         "agree": all(one["error_y3_short"] <= VISIBLE for one in procedures),
@@ -130,7 +129,7 @@ def line_up_table(rows: pd.DataFrame) -> str:
     """One line a solver at its setting of the line-up."""
     header = ["solver", "called from", "setting", "y3, 2 s (m)", "y3 (m)", "p", "energy (J)", "evaluations"]
     lines = []
-    for row in (find(rows, name) for name in (*LISTED, ALPHA)):
+    for row in (find(rows, name) for name in LISTED):
         if row is not None:
             numbers = [row[name] for name in ("error_y3_short", "error_y3", "growth", "energy", "n_evaluations")]
             lines.append([row["solver"], row["called_from"], setting(row), *numbers])
@@ -162,47 +161,57 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 def _draw(panel: Axes, rows: Iterable[pd.Series | None], series: Series, curve: str, t: Array, **more: Any) -> None:
     for k, row in enumerate(row for row in rows if row is not None and key(row, curve) in series):
-        shown = series[key(row, curve)]
-        shown = np.maximum(shown, SMALLEST) if curve == "log" else shown
-        panel.plot(t, shown, markevery=(3 * k % 10, 10), **(figures.look(row) | more))
+        panel.plot(t, series[key(row, curve)], markevery=(3 * k % 10, 10), **(figures.look(row) | more))
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
-    """Over 2 s, at the end of the run, and the error over time. Curves of motion that are not visibly off are left out."""
-    t_end = float(rows["t_end"].iloc[0])
-    motion = four_bar.case(four_bar.cases(False)[0].problem, "", t_end).reference
+def _motion(panel: Axes, rows: pd.DataFrame, series: Series, curve: str, step: float) -> None:
+    """The true motion, and the curves that are visibly off."""
+    t = GRIDS[curve] + (rows["t_end"].iloc[0] if curve == "last" else 0.0)
+    truth = four_bar.cases(False)[0].reference.states(t)[0][Y3]
+    panel.plot(t, truth, color="black", lw=3.0, alpha=0.3, label="true motion")
+    entries = [find(rows, IRK), find(rows, NEWMARK), *(find(rows, gear(order), step) for order in (1, 2, 3, 5))]
+    error = "error_y3" if curve == "last" else "error_y3_short"
+    off = [row for row in entries if row is not None and not row[error] <= VISIBLE]
+    _draw(panel, off, series, curve, t, marker="")
+    panel.set(xlabel="t (s)")
+    panel.set_title(f"GSTIFF stand-in with h = {step:g} s", fontsize=9)
 
-    def curves(panel: Axes, curve: str, error: str, step: float, t: Array) -> None:
-        panel.plot(t, motion.states(t)[0][Y3], color="black", lw=3.0, alpha=0.3, label="true motion")
-        entries = [find(rows, IRK), find(rows, NEWMARK), *(find(rows, gear(order), step) for order in (1, 2, 3, 5))]
-        off = [row for row in entries if row is not None and not row[error] <= VISIBLE]
-        _draw(panel, off, series, curve, t, marker="")
-        panel.set(xlabel="t (s)")
-        panel.set_title(f"GSTIFF stand-in with h = {step:g} s", fontsize=9)
 
-    short, two = plt.subplots(1, 2, figsize=(9.2, 3.2), sharey=True, layout="constrained")
-    for panel, step in zip(two, (COARSE, MIDDLE), strict=True):
-        curves(panel, "short", "error_y3_short", step, GRIDS["short"])
-    two[0].set_ylabel("y3 (m)")
-    figures.legend(short, two)
-    last, one = plt.subplots(figsize=(9.2, 3.2), layout="constrained")
-    curves(one, "last", "error_y3", MIDDLE, t_end + GRIDS["last"])
-    one.set_ylabel("y3 (m)")
-    figures.legend(last, [one])
+def motion_figure(rows: pd.DataFrame, series: Series, curve: str, steps: tuple[float, ...]) -> Figure:
+    """Height of bar 3's centre over time, a panel a step of the stand-in."""
+    figure, panels = plt.subplots(1, len(steps), figsize=(9.2, 3.2), sharey=True, squeeze=False, layout="constrained")
+    for panel, step in zip(panels[0], steps, strict=True):
+        _motion(panel, rows, series, curve, step)
+    panels[0, 0].set_ylabel("y3 (m)")
+    figures.legend(figure, panels[0])
+    return figure
 
-    error, panels = plt.subplots(1, 2, figsize=(9.2, 4.4), sharex=True, sharey=True, layout="constrained")
-    gears = [find(rows, gear(order), MIDDLE) for order in GEAR_ORDERS]
-    own = [find(rows, name) for name in LISTED if name != "LSODA, index 1"]
-    titles = ("one setting each, see the table", f"GSTIFF stand-in, h = {MIDDLE:g} s")
-    for panel, title, entries in zip(panels, titles, (own, gears), strict=True):
-        _draw(panel, entries, series, "log", t_end * GRIDS["log"])
+
+def error_figure(rows: pd.DataFrame, series: Series) -> Figure:
+    """Largest error of y3 so far over time."""
+    figure, panels = plt.subplots(1, 2, figsize=(9.2, 4.4), sharex=True, sharey=True, layout="constrained")
+    sides = {
+        "one setting each, see the table": [find(rows, name) for name in LISTED[:7]],
+        f"GSTIFF stand-in, h = {MIDDLE:g} s": [find(rows, gear(order), MIDDLE) for order in GEAR_ORDERS],
+    }
+    for panel, (title, entries) in zip(panels, sides.items(), strict=True):
+        _draw(panel, entries, series, "log", rows["t_end"].iloc[0] * GRIDS["log"])
         panel.axhline(VISIBLE, color="black", lw=0.8, ls=":")
         panel.set(xscale="log", yscale="log", xlabel="t (s)")
         panel.set_title(title, fontsize=9)
         panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
     panels[1].text(1.01, VISIBLE, f"{VISIBLE:g} m", transform=panels[1].get_yaxis_transform(), va="center", fontsize=8)
     panels[0].set_ylabel("largest error of y3 so far (m)")
-    return {"motion_short": short, "motion_long": last, "motion_error": error}
+    return figure
+
+
+def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+    """Over 2 s, at the end of the run, and the error over time."""
+    made = {"motion_short": motion_figure(rows, series, "short", (COARSE, MIDDLE))}
+    return made | {
+        "motion_long": motion_figure(rows, series, "last", (MIDDLE,)),
+        "motion_error": error_figure(rows, series),
+    }
 
 
 STUDY = Study("motion", __doc__, runs, measure, findings_of, tables_of, figures_of)

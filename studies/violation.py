@@ -24,21 +24,19 @@ LOOSE, TIGHT = 1e-3, 1e-9  # err_in and err_out of Table 3
 LEVELS = {"q": "max |C| (m)", "v": "max |C_q v + C_t| (m/s)", "a": "max |C_q a − Q_d| (m/s²)"}
 CLOSURE = slice(6, 8)  # places of (35) and (36) among the constraints
 SLOPE, TIMES = 0.25, 2.0  # a violation grows when it goes like t^p with p above SLOPE and ends above TIMES its start
-EQUAL = 1.1  # times cheaper: less does not count as a difference
 KEPT = 1e-12  # m, m/s: a constraint violated no more than this is kept
 WINDOWS = 10  # equal parts of the run, to whose largest violations the growth is fitted
 CURVE = 50  # equal parts of the run, whose largest violations are drawn
 ZERO = 1e-17  # what counts as a violation of zero where a logarithm is taken
 
 PAIRS = (("DOP853, projected", "DOP853, index 1"), ("IDA, stabilised", "IDA, index1"))  # kept, not kept
-PLAIN = ("LSODA, index 1", "DOP853, index 1")
 OWN = ("SunRadau5", "Gauss12", OWN_EXPLICIT)
 ALONG = (*PAIRS[0], *PAIRS[1], "LSODA, index 1", IDA_C, *OWN)
 STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
 QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *OWN)
 DRAWN = (*PAIRS[0], "LSODA, index 1", "IDA, stabilised", IDA_C, "Gauss12", OWN_EXPLICIT)  # cost over error
 EXUDYN = ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2")
-OVER_TIME = (*PLAIN, baumgarte("DOP853", 10.0), "IDA, stabilised", gear(2), *EXUDYN)
+OVER_TIME = ("LSODA, index 1", "DOP853, index 1", baumgarte("DOP853", 10.0), "IDA, stabilised", gear(2), *EXUDYN)
 LISTED = (*OVER_TIME, "IDA, index1", IDA_C, "DOP853, projected", gear(5))
 TARGETS = (1e-2, 1e-4, 1e-6)
 
@@ -73,9 +71,9 @@ def growth(t: Array, size: Array) -> float:
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
     """Columns of this study, and the curves of the figure in the entry "series"."""
-    row: dict[str, Any] = {"own_accelerations": run.solver.own_accelerations}
     if result.t.size < WINDOWS or run.group == "tolerances":  # of those the common columns are enough
-        return row
+        return {}
+    row: dict[str, Any] = {}
     system = run.case.problem.system
     t, levels = violations(system, result)
     for level, size in levels.items():
@@ -103,31 +101,15 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
     """Evaluations and CPU time of the first solver over those of the second at equal error; None if never reached."""
     one, two = (rows[rows["solver"] == name] for name in (first, second))
     # where all runs of a solver are better than a target, its cost at the target is not known
-    least = min(one["error_q"].max(), two["error_q"].max())
-    ratios = []
-    for target in (10.0**-k for k in range(1, 9)):
-        costs = ("n_evaluations", "cpu_s")
-        of = [tables.time_for(one, target, what) / tables.time_for(two, target, what) for what in costs]
-        if least >= target and not np.isnan(of).any():
-            ratios.append((target, *of))
-    if not ratios:
-        return None
-    targets, evaluations, cpu = zip(*ratios, strict=True)
-    found = {"first": first, "second": second, "errors": [max(targets), min(targets)]}
-    found |= {"evaluations": [min(evaluations), max(evaluations)], "cpu": [min(cpu), max(cpu)]}
-    return found | {"dearer": min(cpu) > 1.0, "cheaper": max(cpu) < 1.0}
-
-
-def cheapest(along: pd.DataFrame, target: float) -> dict[str, Any]:
-    """The cheapest solver that keeps the constraints and the cheapest that does not, for an error."""
-    ranked = tables.ranking(along, target)
-    found: dict[str, Any] = {"error": target}
-    for name, keeps in (("kept", True), ("drifting", False)):
-        part = ranked[ranked["keeps_constraints"].astype(bool) == keeps] if len(ranked) else ranked
-        keys = ("solver", "cpu_s", "cpu_q1", "cpu_q3", "called_from", "violation_q")
-        found[name] = {k: part.iloc[0][k] for k in keys} if len(part) else None
-    both = found["kept"] and found["drifting"]
-    return found | {"ratio": found["kept"]["cpu_s"] / found["drifting"]["cpu_s"] if both else None}
+    targets = [target for target in TARGETS if target <= min(one["error_q"].max(), two["error_q"].max())]
+    found: dict[str, Any] = {"first": first, "second": second}
+    for what in ("n_evaluations", "cpu_s"):
+        ratios = [tables.time_for(one, target, what) / tables.time_for(two, target, what) for target in targets]
+        ratios = [ratio for ratio in ratios if not np.isnan(ratio)]
+        if not ratios:
+            return None
+        found[what] = [min(ratios), max(ratios)]
+    return found | {"dearer": found["cpu_s"][0] > 1.0, "cheaper": found["cpu_s"][1] < 1.0}
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -138,12 +120,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     if irk.empty or not {LOOSE, TIGHT} <= set(loose.index):
         raise StudyError("the rows lack runs of PaperIRK; make them again by python -m studies.violation")
     irk, known = irk.iloc[0], line_up[line_up["growth_q"].notna()]
-    growing = [row["solver"] for _, row in known.iterrows() if any(grows(row, level) for level in LEVELS)]
-    plain = known[known["solver"].isin(PLAIN)]
+    growing = [row["solver"] for _, row in known.iterrows() if kind(row, "q") == "grows"]
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
-    eq6, own = (line_up[line_up["own_accelerations"].astype(bool) == which]["violation_a"] for which in (False, True))
-    at = [cheapest(along, target) for target in TARGETS]
-    ratios = [each["ratio"] for each in at if each["ratio"] is not None]
+    ranked = [ranking for target in TARGETS if len(ranking := tables.ranking(along, target))]
     return {
         "t_end": float(rows["t_end"].iloc[0]),
         "problem": rows["problem"].iloc[0],
@@ -154,27 +133,21 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "v35": irk["violation_35"],
         "v36": irk["violation_36"],
         "irk_grows": grows(irk, "q"),
-        "irk_exponent": round(irk["growth_q"], 2) + 0.0,  # no minus zero
         "n_ours": len(ours),
         "ours": [ours[f"violation_{level}"].max() for level in LEVELS],
         "ours_keep": bool((ours[["violation_q", "violation_v"]].max(axis=1) <= KEPT).all()),
         "ours_growing": [name for name in growing if name in set(ours["solver"])],
+        "others_growing": [name for name in growing if name not in set(ours["solver"])],
+        "growing_to": known[known["solver"].isin(growing)]["violation_q"].max(),
         "inner_loose": float(loose[TIGHT]),
         "both_loose": float(loose[LOOSE]),
         "inner_alone_kept": bool(loose[TIGHT] <= KEPT),
         "both_kept": bool(loose[LOOSE] <= KEPT),
-        "plain": list(plain["solver"]),
-        "plain_growing": [row["solver"] for _, row in plain.iterrows() if grows(row, "q")],
-        "plain_violation": plain["violation_q"].max(),
         "baumgarte": [of_alpha.min(), of_alpha.max()],
         "baumgarte_n": len(of_alpha),
         "baumgarte_kept": int((of_alpha <= KEPT).sum()),
-        "eq6_a": eq6.max(),
-        "own_a": [own.min(), own.max()],
-        "own_worse": bool(own.min() > eq6.max()),
-        "cheapest": at,
-        "keeping_faster": bool(ratios) and max(ratios) * EQUAL < 1.0,
-        "drifting_faster": bool(ratios) and max(ratios) > EQUAL,
+        "n_ranked": len(ranked),
+        "n_kept_first": sum(bool(ranking["keeps_constraints"].iloc[0]) for ranking in ranked),
         "pairs": [found for names in PAIRS if (found := pair(along, *names))],
     }
 
@@ -190,21 +163,12 @@ def line_up_table(rows: pd.DataFrame) -> str:
     return table(header, lines)
 
 
-def cost_table(found: dict[str, Any]) -> str:
-    """The cheapest solver that keeps the constraints, and the cheapest that lets them go, for some errors."""
-    lines = []
-    for at in found["cheapest"]:
-        line = [power(at["error"])]
-        for best in (at["kept"], at["drifting"]):
-            seconds = best and tables.with_quartiles(best["cpu_s"], best["cpu_q1"], best["cpu_q3"])
-            line += [f"`{best['solver']}` ({best['called_from']})", seconds] if best else ["not reached", ""]
-        lines.append([*line, number(at["drifting"] and at["drifting"]["violation_q"])])
-    return table(["error", "cheapest that keeps them", "CPU (s)", "that drifts", "CPU (s)", "its max abs C (m)"], lines)
-
-
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
-    return {"line_up": line_up_table(rows), "cost": cost_table(found)}
+    along = rows[rows["group"] == "tolerances"]
+    header = ["solver", "called from", *(f"CPU (s), {power(target)}" for target in TARGETS)]
+    cost = tables.work_precision(along, TARGETS, (*DRAWN, *STABILISED[1::3]))
+    return {"line_up": line_up_table(rows), "cost": table(header, cost)}
 
 
 def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
