@@ -87,8 +87,13 @@ def case_of(geometry: str, t_end: float) -> Case:
     return Case(geometry, problem, t_end, lambda: known, n, time_limit=TIME_LIMIT, timed=0.0, tags=("long",))
 
 
-def instants(case: Case, h: float) -> Array:
-    """Multiples of a fixed step h near the case's instants, and its end: landing on them changes no step."""
+def instants(case: Case, h: float) -> Array | None:
+    """Multiples of a fixed step h near the case's instants, and its end: landing on them changes no step.
+
+    None for short motions: at every step.
+    """
+    if case.t_end <= QUICK:
+        return None
     interval = h * max(1, round(case.t_end / case.n_instants / h))
     n = int(case.t_end / interval * (1.0 - 1e-12))
     return np.append(interval * np.arange(n + 1, dtype=np.float64), case.t_end)
