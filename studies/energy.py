@@ -1,6 +1,5 @@
 """Energy over long times: which methods let it drift, what a run without drift costs, and why."""
 
-from collections.abc import Iterable
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 
 from studies import energy_runs, figures
 from studies.cli import StudyError
-from studies.energy_drift import CALM, DRIFTS, IRREGULAR, NO_DRIFT, SLOWLY, bound, verdict
+from studies.energy_drift import CALM, DRIFTS, SLOWLY, bound, verdict
 from studies.energy_runs import (
     BASIC,
     EVEN,
@@ -26,12 +25,11 @@ from studies.energy_runs import (
     VARIANTS,
     Variant,
 )
-from studies.render import number, table
+from studies.render import number
 from studies.solvers import IDA_C, IRK, OWN_EXPLICIT
 from studies.study import Series, Study, key
 from studies.tables import setting
 
-NUMBERS = ("cpu_s", "energy", "kinetic", "slope", "slope_error", "swing", "t_reached", "violation_q", "n_evaluations")
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
@@ -39,7 +37,6 @@ KEEPING = f"{GAUSS}, symmetric partition"
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
     """The rows with the verdict on each run, and with the method's name."""
-    rows = rows.astype(dict.fromkeys(NUMBERS, float))  # a run that could not be made has None
     return rows.assign(verdict=rows.apply(verdict, axis=1), name=rows.apply(name_of, axis=1))
 
 
@@ -109,6 +106,17 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
+def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
+    """Fixed steps: the runs of each method in each variant on both geometries, None where there is none."""
+    places = [(ONE, BASIC), (ONE, MOMENTA), *((SWITCHING, variant) for variant in VARIANTS)]
+    found = []
+    for solver in dict.fromkeys(fixed["solver"]):
+        runs = [of(fixed[fixed["case"] == geometry], solver, variant) for geometry, variant in places]
+        h = fixed[fixed["solver"] == solver]["h"].iloc[0]
+        found.append({"solver": solver, "h": h, "runs": [None if run.empty else told(run.iloc[0]) for run in runs]})
+    return found
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report and the first screen say."""
     rows = judged(rows)
@@ -127,6 +135,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "canonical": canonical,
         "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
         "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
+        "variants": variants_of(rows[rows["group"] == "fixed"]),
         "n": {name: len(each) for name, each in calm.items()},
         "n_calm": {name: int(each.sum()) for name, each in calm.items()},
         "n_controlled": len(controlled),
@@ -135,59 +144,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
         "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
     }
-
-
-def _drift(run: dict[str, Any]) -> str:
-    """The drift of a run where it is told from none, else what cannot be excluded; what went wrong, if anything did."""
-    if run["drifts"]:
-        return number(run["drift"])
-    resolved = run["calm"] or run["verdict"] == IRREGULAR
-    why = "" if run["verdict"] == NO_DRIFT else f" ({run['verdict']})"
-    return f"< {number(run['bound'])}{why}" if resolved else str(run["verdict"])
-
-
-def choice_table(found: dict[str, Any]) -> str:
-    """What small energy errors cost without and with a drift, ours and others."""
-    lines = []
-    for at in found["at"]:
-        runs = [at[kind][which] for kind in ("no_drift", "drift") for which in ("ours", "others")]
-        cells = ["none" if run is None else f"`{run['label']}`: {number(run['cpu_s'])}" for run in runs]
-        lines.append([f"≤ {number(at['energy'])}", *cells])
-    header = ["energy error (J)", "no drift, ours: CPU (s)", "no drift, other", "drift, ours", "drift, other"]
-    return table(header, lines)
-
-
-def runs_table(listed: Iterable[dict[str, Any]]) -> str:
-    """Runs with what they cost and what their energy does."""
-    header = ["solver", "called from", "drift (J)", "error (J)", "max abs C (m)", "evaluations", "CPU (s)"]
-    lines = []
-    for run in listed:
-        numbers = [number(run[name]) for name in ("energy", "violation_q", "n_evaluations", "cpu_s")]
-        lines.append([f"`{run['label']}`", run["called_from"], _drift(run), *numbers])
-    return table(header, lines)
-
-
-def variants_table(rows: pd.DataFrame) -> str:
-    """Fixed steps: the drift of each method in each variant, on both geometries."""
-    header = ["drift (J)", "h (s)", f"{ONE}: velocities", "momenta", f"{SWITCHING}: velocities"]
-    header += ["velocities, symmetric", "momenta", "momenta, symmetric"]
-    places = [(ONE, BASIC), (ONE, MOMENTA), *((SWITCHING, variant) for variant in VARIANTS)]
-    fixed = rows[rows["group"] == "fixed"]
-    lines = []
-    for solver in dict.fromkeys(fixed["solver"]):
-        line = [solver, number(fixed[fixed["solver"] == solver]["h"].iloc[0])]
-        for motion, variant in places:
-            run = of(fixed[fixed["case"] == motion], solver, variant)
-            line.append("not run" if run.empty else _drift(told(run.iloc[0])))
-        lines.append(line)
-    return table(header, lines)
-
-
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """The tables of the report."""
-    long = found["long"]
-    made = {"choice": choice_table(long), "alternatives": runs_table(long["alternatives"])}
-    return made | {"variants": variants_table(judged(rows))}
 
 
 def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
@@ -230,7 +186,7 @@ def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
     return figure
 
 
-STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, tables_of, figures_of, processes=2)
+STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of, processes=2)
 main = STUDY.main
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from studies.cases import four_bar
 from studies.cases.four_bar import Y3
 from studies.cli import StudyError
 from studies.metrics import deviation
-from studies.render import number, table
+from studies.render import number
 from studies.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IDA_C, IRK, LINE_UP, NEWMARK, OWN_EXPLICIT, gear
 from studies.study import Series, Study, key
 from studies.tables import setting
@@ -100,6 +100,18 @@ def _stand_in(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
+def _cells(rows: pd.DataFrame, order: int) -> list[str]:
+    """Errors of the stand-in of an order by step, over 2 s and over the run; what is visible is bold."""
+    cells = []
+    for what, step in [("error_y3_short", step) for step in STEPS[:2]] + [("error_y3", step) for step in STEPS]:
+        row = find(rows, gear(order), step)
+        if row is None or pd.isna(row[what]):
+            cells.append("not run" if row is None else str(row["status"]).lower().replace("_", " "))
+        else:
+            cells.append(f"**{number(row[what])}**" if row[what] > VISIBLE else number(row[what]))
+    return cells
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says, from the medians."""
     procedures = []
@@ -108,6 +120,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             raise StudyError("the rows lack the paper's procedures; make them again by python -m studies.motion")
         found = {name: run[name] for name in ("solver", "error_y3_short", "error_y3", "top", "top_late")}
         procedures.append(found | {"holds": bool(run["top"] < PASSES and run["top_late"] > -PASSES)})
+    told = ("solver", "called_from", "error_y3_short", "error_y3", "growth", "energy", "n_evaluations")
+    listed = [find(rows, name) for name in LISTED]
     grown = rows[(rows["group"] == "line-up") & (rows["family"] == "two-loop")].set_index("solver")["growth"].dropna()
     return {
         "t_end": float(rows["t_end"].iloc[0]),
@@ -120,43 +134,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "agree": all(one["error_y3_short"] <= VISIBLE for one in procedures),
         "agree_long": all(one["error_y3"] <= VISIBLE for one in procedures),
         "gear": _stand_in(rows),
+        "stand_in": [[str(order), *_cells(rows, order)] for order in GEAR_ORDERS],
+        "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None],
         "canonical_growth": grown.get(CANONICAL),
         "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()],
     }
-
-
-def line_up_table(rows: pd.DataFrame) -> str:
-    """One line a solver at its setting of the line-up."""
-    header = ["solver", "called from", "setting", "y3, 2 s (m)", "y3 (m)", "p", "energy (J)", "evaluations"]
-    lines = []
-    for row in (find(rows, name) for name in LISTED):
-        if row is not None:
-            numbers = [row[name] for name in ("error_y3_short", "error_y3", "growth", "energy", "n_evaluations")]
-            lines.append([row["solver"], row["called_from"], setting(row), *numbers])
-    return table(header, lines)
-
-
-def stand_in_table(rows: pd.DataFrame) -> str:
-    """The stand-in by order and step, what is visible in bold."""
-    columns = [("error_y3_short", step) for step in STEPS[:2]] + [("error_y3", step) for step in STEPS]
-    lines = []
-    for order in GEAR_ORDERS:
-        found = [(find(rows, gear(order), step), what) for what, step in columns]
-        if any(row is not None for row, _ in found):
-            lines.append([str(order), *("not run" if row is None else _cell(row, what) for row, what in found)])
-    header = [f"2 s, h = {step:g} s" for step in STEPS[:2]] + [f"long, {step:g} s" for step in STEPS]
-    return table(["order", *header], lines)
-
-
-def _cell(row: pd.Series, what: str) -> str:
-    if pd.isna(row[what]):
-        return str(row["status"]).lower().replace("_", " ")
-    return f"**{number(row[what])}**" if row[what] > VISIBLE else number(row[what])
-
-
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """The tables of the report."""
-    return {"line_up": line_up_table(rows), "stand_in": stand_in_table(rows)}
 
 
 def _draw(panel: Axes, rows: Iterable[pd.Series | None], series: Series, curve: str, t: Array, **more: Any) -> None:
@@ -214,7 +196,7 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     }
 
 
-STUDY = Study("motion", __doc__, runs, measure, findings_of, tables_of, figures_of)
+STUDY = Study("motion", __doc__, runs, measure, findings_of, figures_of)
 main = STUDY.main
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from studies.bench import Case, Run, Solver
 from studies.cases import four_bar
 from studies.cases.four_bar import Y3
 from studies.cli import StudyError
-from studies.render import number, percent, table
 from studies.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
 from studies.study import Series, Study, key
 from studies.tables import setting
@@ -57,8 +56,8 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
     if h.size == 0:
         return row
     starts = np.concatenate([[0.0], np.cumsum(h)[:-1]])
-    row |= {"h_median": np.median(h), "h_low": np.quantile(h, 0.05), "h_high": np.quantile(h, 0.95), "h_max": h.max()}
-    row |= {"share_steps": np.mean(h > LONG), "share_time": h[h > LONG].sum() / h.sum()}
+    row |= {"h_median": np.median(h), "h_low": np.quantile(h, 0.05), "h_high": np.quantile(h, 0.95)}
+    row["share_time"] = h[h > LONG].sum() / h.sum()
     zoom = starts < PERIODS * four_bar.period()
     curves = {"whole": _curve(starts, h), "zoom": _curve(starts[zoom], h[zoom])}
     if result.rejected_error is not None and result.partitioned is not None:
@@ -93,6 +92,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     counts = ("n_steps", "n_rejected_error", "n_rejected_convergence")
     ratios = [float(irk["h_median"] / run["h_median"]) for run in (newmark, quarter)]
     known = rows[rows["retried_switch"].notna()]
+    told = ("solver", "error_q", "n_steps", *names, "retried_switch", "n_evaluations")
+    listed = rows[rows["h_median"].notna()]
     switches = int(irk["n_partitions"] - 1)
     return {
         "t_end": float(rows["t_end"].iloc[0]),
@@ -109,22 +110,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "retries_more": bool(irk["retried"] > newmark["retried"]),
         "switches": switches,
         "switches_per_period": switches / float(irk["t_end"] / four_bar.period()),
+        "runs": [{name: row[name] for name in told} | {"setting": setting(row)} for _, row in listed.iterrows()],
         "n_known": len(known),
         "n_worse_at_switch": int((known["retried_switch"] > known["retried"]).sum()),
     }
-
-
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """One line a run."""
-    header = ["solver", "setting", "error", "steps", "median h (s)", "5 % below (s)", "5 % above (s)"]
-    header += [f"time in steps > {LONG:g} s", "steps retried", "retried at a switch", "evaluations"]
-    lines = []
-    for _, row in rows[rows["h_median"].notna()].iterrows():
-        sizes = [number(row[name]) for name in ("error_q", "n_steps", "h_median", "h_low", "h_high")]
-        shares = [percent(row[name]) if pd.notna(row[name]) else "not told" for name in ("retried", "retried_switch")]
-        cells = [row["solver"], setting(row), *sizes, percent(row["share_time"]), *shares]
-        lines.append([*cells, number(row["n_evaluations"])])
-    return {"all": table(header, lines)}
 
 
 def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
@@ -157,7 +146,7 @@ def _mark(panel: Axes, places: Series) -> None:
         panel.axvline(moment, color="black", alpha=0.25, lw=1.0, label="new independent coordinates")
 
 
-STUDY = Study("step_size", __doc__, runs, measure, findings_of, tables_of, figures_of)
+STUDY = Study("step_size", __doc__, runs, measure, findings_of, figures_of)
 main = STUDY.main
 
 if __name__ == "__main__":

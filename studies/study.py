@@ -54,8 +54,6 @@ class Study:
         measure(run, result) -> further columns; in the entry "series" curves by name, for figures.
     findings : callable
         findings(rows) -> what the report and the first screen say. `rows`, here and below: medians.
-    tables : callable
-        tables(rows, findings) -> ready markdown by name; the runs that failed are added as "failed".
     figures : callable
         figures(rows, series) -> figures by the name of their file.
     processes : int
@@ -67,7 +65,6 @@ class Study:
     runs: Callable[[bool], Iterable[Run]]
     measure: Callable[[Run, Result], dict[str, Any]]
     findings: Callable[[pd.DataFrame], dict[str, Any]]
-    tables: Callable[[pd.DataFrame, dict[str, Any]], dict[str, str]]
     figures: Callable[[pd.DataFrame, Series], dict[str, Figure]]
     processes: int = 1
 
@@ -91,11 +88,11 @@ class Study:
 
     def report(self, output: Output, rows: pd.DataFrame, series: Series, line: str) -> None:
         """Write findings, figures and report."""
-        rows = tables.medians(rows)
+        rows = tables.medians(rows).infer_objects()
         found = self.findings(rows)
         output.save_findings(found)
         for name, figure in self.figures(rows, series).items():
             figures.save(figure, output, name)
         failed = [cells[:3] for cells in tables.failures(rows)]  # the messages stand in the rows
-        ready = self.tables(rows, found) | {"failed": table(["solver", "setting", "status"], failed) if failed else ""}
+        ready = {"failed": table(["solver", "setting", "status"], failed) if failed else ""}
         output.write(f"{self.name}.md", render(self.name, found, ready, stamp=line, quick=output.call.quick))

@@ -13,7 +13,7 @@ from studies.bench import Run
 from studies.cases import four_bar
 from studies.cli import StudyError
 from studies.metrics import CHECKED, violations
-from studies.render import number, power, table
+from studies.render import number
 from studies.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, OWN_EXPLICIT, baumgarte, gear, paper_irk_at
 from studies.study import Series, Study, key
 from twoloop import Result
@@ -112,6 +112,12 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
     return found | {"dearer": found["cpu_s"][0] > 1.0, "cheaper": found["cpu_s"][1] < 1.0}
 
 
+def _told(row: pd.Series) -> dict[str, Any]:
+    """A run as a line of the table."""
+    found = {name: row[name] for name in ("solver", "called_from", "error_q", "violation_q", "violation_v")}
+    return found | {"setting": tables.setting(row), "kinds": [kind(row, level) for level in "qv"]}
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says, from the medians."""
     line_up, loops, along = (rows[rows["group"] == group] for group in ("line-up", "loops", "tolerances"))
@@ -121,6 +127,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         raise StudyError("the rows lack runs of PaperIRK; make them again by python -m studies.violation")
     irk, known = irk.iloc[0], line_up[line_up["growth_q"].notna()]
     growing = [row["solver"] for _, row in known.iterrows() if kind(row, "q") == "grows"]
+    listed = line_up[line_up["violation_q"].notna()].set_index("solver", drop=False)
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
     ranked = [ranking for target in TARGETS if len(ranking := tables.ranking(along, target))]
     return {
@@ -148,27 +155,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "baumgarte_kept": int((of_alpha <= KEPT).sum()),
         "n_ranked": len(ranked),
         "n_kept_first": sum(bool(ranking["keeps_constraints"].iloc[0]) for ranking in ranked),
+        "listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index],
+        "targets": TARGETS,
+        "cost": tables.work_precision(along, TARGETS, (*DRAWN, *STABILISED[1::3])),
         "pairs": [found for names in PAIRS if (found := pair(along, *names))],
     }
-
-
-def line_up_table(rows: pd.DataFrame) -> str:
-    """Violations of other solvers at one setting, a line each."""
-    header = ["solver", "called from", "setting", "error", "max abs C (m)", "max abs C_q v + C_t (m/s)"]
-    line_up = rows[(rows["group"] == "line-up") & rows["violation_q"].notna()].set_index("solver", drop=False)
-    lines = []
-    for _, row in line_up.loc[[name for name in LISTED if name in line_up.index]].iterrows():
-        sizes = [f"{number(row[f'violation_{level}'])} {kind(row, level)}" for level in "qv"]
-        lines.append([row["solver"], row["called_from"], tables.setting(row), number(row["error_q"]), *sizes])
-    return table(header, lines)
-
-
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """The tables of the report."""
-    along = rows[rows["group"] == "tolerances"]
-    header = ["solver", "called from", *(f"CPU (s), {power(target)}" for target in TARGETS)]
-    cost = tables.work_precision(along, TARGETS, (*DRAWN, *STABILISED[1::3]))
-    return {"line_up": line_up_table(rows), "cost": table(header, cost)}
 
 
 def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
@@ -192,7 +183,7 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     return {"violation": over_time, "violation_cost": figures.work_precision(along, DRAWN, title)}
 
 
-STUDY = Study("violation", __doc__, runs, measure, findings_of, tables_of, figures_of)
+STUDY = Study("violation", __doc__, runs, measure, findings_of, figures_of)
 main = STUDY.main
 
 if __name__ == "__main__":
