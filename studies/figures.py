@@ -76,18 +76,20 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "BDF, index 1": (YELLOW, "d"),
     "Exudyn, GeneralizedAlpha": (RED, "8"),
     "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
-    "Sun Radau IIB(3)": (PINK, "v"),
-    "Gauss(3)": (SKY, "D"),
-    "Gauss(3), symmetric partition": (SKY, "D"),
-    "Radau IIA(3)": (ORANGE, "^"),
-    "Newmark, β = 1/2": (GREY, "X"),
+}
+SAME = {  # a tableau looks like the preset that is made of it
+    "Sun Radau IIB(3)": "SunRadau5",
+    "Gauss(3)": "Gauss6",
+    "Gauss(3), symmetric partition": "Gauss6",
+    "Radau IIA(3)": "RadauIIA5",
+    "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
 }
 _REST = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY)
 
 
 def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, object]:
     """Colour, marker and line of a solver, the same in all figures; an open marker where the constraints drift."""
-    color, marker = STYLES.get(solver, (_REST[sum(solver.encode()) % len(_REST)], "o"))
+    color, marker = STYLES.get(SAME.get(solver, solver), (_REST[sum(solver.encode()) % len(_REST)], "o"))
     made: dict[str, object] = {"color": color, "marker": marker, "linestyle": "-" if family == "two-loop" else "--"}
     return made if keeps_constraints else made | {"markerfacecolor": "white"}
 
