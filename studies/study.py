@@ -79,9 +79,11 @@ class Study:
             with output.kept() as kept:
                 rows = collect(self.runs(output.call.quick), kept, self.measure, self.processes)
             line, series = cli.stamp(output.call.command), {}
-            for _, row in rows[rows["series"].notna()].iterrows():
-                series |= {key(row, name): np.array(curve, dtype=float) for name, curve in row["series"].items()}
-            rows = rows.drop(columns="series")
+            for _, row in rows.iterrows():
+                curves = row.get("series")  # none of a run without a result
+                for name, curve in curves.items() if isinstance(curves, dict) else ():
+                    series[key(row, name)] = np.array(curve, dtype=float)
+            rows = rows.drop(columns="series", errors="ignore")
             output.save_rows(rows, line)
             output.save_series(series)
         self.report(output, rows, series, line)

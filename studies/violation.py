@@ -126,7 +126,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     if irk.empty or not {LOOSE, TIGHT} <= set(loose.index):
         raise StudyError("the rows lack runs of PaperIRK; make them again by python -m studies.violation")
     irk, known = irk.iloc[0], line_up[line_up["growth_q"].notna()]
-    growing = [row["solver"] for _, row in known.iterrows() if kind(row, "q") == "grows"]
+    own = known["family"] == "two-loop"
+    others = [row for _, row in known[~own].iterrows() if kind(row, "q") == "grows"]
     listed = line_up[line_up["violation_q"].notna()].set_index("solver", drop=False)
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
     ranked = [ranking for target in TARGETS if len(ranking := tables.ranking(along, target))]
@@ -143,9 +144,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "n_ours": len(ours),
         "ours": [ours[f"violation_{level}"].max() for level in LEVELS],
         "ours_keep": bool((ours[["violation_q", "violation_v"]].max(axis=1) <= KEPT).all()),
-        "ours_growing": [name for name in growing if name in set(ours["solver"])],
-        "others_growing": [name for name in growing if name not in set(ours["solver"])],
-        "growing_to": known[known["solver"].isin(growing)]["violation_q"].max(),
+        "ours_growing": [row["solver"] for _, row in known[own].iterrows() if grows(row, "q")],
+        "others_growing": [row["solver"] for row in others],
+        "growing_to": max((row["violation_q"] for row in others), default=0.0),
         "inner_loose": float(loose[TIGHT]),
         "both_loose": float(loose[LOOSE]),
         "inner_alone_kept": bool(loose[TIGHT] <= KEPT),
