@@ -130,6 +130,11 @@ def with_quartiles(middle: float, low: float, high: float) -> str:
     return texts[1] if near else f"{texts[1]} ({texts[0]}–{texts[2]})"
 
 
+def setting(row: pd.Series) -> str:
+    """Name and value of the setting that varies."""
+    return next(f"{name} {number(row[name])}" for name in ("h", "err_out", "tol") if pd.notna(row.get(name)))
+
+
 def failures(rows: pd.DataFrame) -> list[list[str]]:
     """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message."""
     lines = []
