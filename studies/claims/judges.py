@@ -310,7 +310,7 @@ def values_alone(rows: Rows) -> Judgement:
 
 
 def any_method(rows: Rows) -> Judgement:
-    line_up = rows.pick("motion", solver=IMPLICIT, group="line-up")
-    others = rows.pick("energy", variables="velocities", partition="lasting")
+    line_up = rows.pick("motion", solver=IMPLICIT, group="line-up")[["solver", "status"]]
+    others = rows.pick("energy", variables="velocities", partition="lasting")[["solver", "status"]]
     reached = pd.concat([line_up, others]).groupby("solver")["status"].agg(lambda each: "REACHED_END" in set(each))
     return decide(reached, reached=int(reached.sum()), methods=len(reached))
