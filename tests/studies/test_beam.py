@@ -129,7 +129,7 @@ def test_what_matters_more_is_said_for_each_beam(tmp_path):
 
 def test_the_step_limit_is_reconciled_by_numbers_or_not(tmp_path):
     text = text_of(tmp_path, rows())
-    assert "So the limits on the linearised beam are none of a run's steps" in text
+    assert "So the limits of the linearised beam do not hold for the steps of a run" in text
     assert "from 0.90, 0.45 and 0.11 on, if (32) stops at changes of 1e-1, 1e-2 and 1e-8" in text
     assert "the latest stages shorten the limit" in text
     made = rows()
