@@ -54,11 +54,11 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
     """Columns of this study, and the curves of the figures in the entry "series"."""
     row: dict[str, Any] = dict.fromkeys(("error_y3", "error_y3_short", "top", "top_late", "growth"))
     row |= {"kinetic": run.case.scale.kinetic, "range_y3": run.case.scale.ranges[Y3], "series": {}}
+    if result.t.size < 2 or result.t[-1] < FINE:
+        return row
     problem, motion, t_end = run.case.problem, run.case.reference, run.case.t_end
     t = np.arange(1, round(t_end / FINE) + 1) * FINE
     t = t[t <= result.t[-1] * (1.0 + 1e-9)]
-    if t.size == 0:
-        return row
     off = deviation(result, motion, t)[0][Y3]
     y3 = motion.states(t)[0][Y3] + off  # no height is invented by interpolating the motion itself
     worst = np.maximum.accumulate(np.abs(off))
@@ -134,7 +134,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "agree": all(one["error_y3_short"] <= VISIBLE for one in procedures),
         "agree_long": all(one["error_y3"] <= VISIBLE for one in procedures),
         "gear": _stand_in(rows),
-        "stand_in": [[str(order), *_cells(rows, order)] for order in GEAR_ORDERS],
+        "stand_in": [[str(n), *_cells(rows, n)] for n in GEAR_ORDERS if find(rows, gear(n), COARSE) is not None],
         "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None],
         "canonical_growth": grown.get(CANONICAL),
         "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()],
