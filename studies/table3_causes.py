@@ -97,7 +97,7 @@ def partition_cost(rows: pd.DataFrame) -> tuple[float, float]:
     evaluation = kept["cpu_s"] / kept["n_evaluations"]
     # the two runs do not iterate equally often
     extra = every["cpu_s"] - evaluation * every["n_evaluations"]
-    return max(float(extra / every["n_steps"]), 0.0), float(evaluation)
+    return float(extra / every["n_steps"]), float(evaluation)
 
 
 def _paper_irk(err_in: float, test: Reading, case: Case, err_out: float, repeat: int) -> Result:

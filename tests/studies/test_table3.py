@@ -99,6 +99,12 @@ def test_one_machine_constant_is_told_from_more(tmp_path):
     assert fit(cells(rows(step=2.0).query("problem == @PROBLEMS[0]")))["attempt"] == pytest.approx(2.0, rel=0.1)
 
 
+def test_a_partition_too_cheap_to_be_measured_is_said_to_be_so(tmp_path):
+    made = rows(step=2.0)
+    made.loc[made["solver"] == "fixed step, symmetric", "cpu_s"] = 0.09
+    assert "costs less than the noise of the times measured" in text_of(tmp_path, made)
+
+
 def test_sentences_turn_with_the_rows(tmp_path):
     text = text_of(tmp_path, rows())
     assert "As in the paper, Newmark loses the solution with err_out = 1e-3 and only there." in text
