@@ -9,9 +9,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +30,8 @@ from twoloop.mechanisms import Problem
 Array = NDArray[np.float64]
 
 INSTANTS = 1000  # common instants of a case that names none
-WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed
+WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
+COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
 MOST_CALLS = 500
 ONCE = 1.0  # s of CPU; the time of a run that takes longer hardly varies, and it is not repeated
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
@@ -128,7 +129,8 @@ class Solver:
     called_from : str
         What calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call.
     keeps_constraints : bool
-        Whether positions and velocities stay on the constraints to the solver's tolerance; False: they drift.
+        Whether the positions stay on the constraints to the solver's tolerance; False: they drift, or are off by the
+        solver's errors.
     setting : str
         What the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s).
     run : callable
@@ -193,8 +195,8 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
     """Make the rows of all runs that are not kept yet: one row a repetition.
 
     The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
-    alike; one that takes more than ONCE seconds is made once. A run that fails, exceeds its time limit, or cannot be
-    made is a row whose status and message say so.
+    alike; one that takes more than ONCE seconds, or hits its limit, is made once. A run that fails, exceeds its time
+    limit, or cannot be made is a row whose status and message say so.
 
     Parameters
     ----------
@@ -227,7 +229,7 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
         _ = case.scale  # makes the reference, which is not to be timed with anything
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, disable=not sys.stdout.isatty())
-    with _rows_of(left, kept, measure, processes) as made, bar as progress:
+    with closing(_rows_of(left, kept, measure, processes)) as made, bar as progress:
         task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
         for run, k, row in made:
             kept.add(run.key(k), row)
@@ -235,26 +237,24 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
     return pd.DataFrame([kept[key] for key in order if key in kept])
 
 
-def _long(row: Row) -> bool:
-    return (row["cpu_s"] or 0.0) > ONCE
-
-
-@contextmanager
 def _rows_of(
     left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None, processes: int
-) -> Iterator[Iterator[tuple[Run, int, Row]]]:
+) -> Generator[tuple[Run, int, Row], None, None]:
     if processes == 1:
         warm: set[tuple[int, str]] = set()
-        yield ((run, k, _row(run, k, measure, warm)) for run, k in left if k == 0 or not _long(kept[run.key(0)]))
+        for run, k in left:
+            first = kept[run.key(0)] if k > 0 else {}
+            if first.get("status") != "TIME_LIMIT" and (first.get("cpu_s") or 0.0) <= ONCE:
+                yield run, k, _row(run, k, measure, warm)
         return
-    context = multiprocessing.get_context("fork")  # cases and solvers hold functions that cannot be sent
-    _shared[:] = [(run, k, measure) for run, k in left]
-    with ProcessPoolExecutor(processes, context, _end_with_parent) as pool:
+    _shared[:] = [(run, k, measure) for run, k in left]  # cases and solvers hold functions that cannot be sent
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("fork"), _end_with_parent)
+    try:
         futures = {pool.submit(_shared_row, i): left[i] for i in range(len(left))}
-        try:
-            yield ((*futures[future], future.result()) for future in as_completed(futures))
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        for future in as_completed(futures):
+            yield *futures[future], future.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 _shared: list[tuple[Run, int, Measure | None]] = []  # as the workers inherit it
@@ -287,12 +287,18 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
     if what not in warm:  # compiles what is not compiled yet; a failure comes back in the run itself
         warm.add(what)
         span = 10.0 * run.value if solver.setting == "h" else WARM_UP * case.t_end
-        attempt(replace(run, case=replace(case, t_end=min(span, case.t_end))), k)
-    row |= {"cpu_s": None, "calls": 0}
+        attempt(replace(run, case=replace(case, t_end=min(span, case.t_end), time_limit=COMPILING)), k)
     result, status, message = attempt(run, k)
     stats = Statistics() if result is None else result.stats
+    spent = [] if result is None else [stats.cpu_time]
+    while spent and sum(spent) < case.timed and len(spent) < MOST_CALLS:  # too short for the clock
+        again = attempt(run, k)[0]
+        if again is None:
+            break
+        spent.append(again.stats.cpu_time)
+    row |= {"cpu_s": (sum(spent) / len(spent) or None) if spent else None, "calls": len(spent)}
+    row |= {"status": status, "message": message}
     rejected = [n for n in (stats.n_rejected_error, stats.n_rejected_convergence) if n is not None]
-    row |= {"status": status, "message": message, **({} if result is None else _timed(run, k, stats.cpu_time))}
     row |= {"n_steps": stats.n_accepted, "n_rejected": sum(rejected) if rejected else None}
     for name in ("n_evaluations", "n_outer", "n_inner", "n_partitions", "n_factorizations", "n_jacobians"):
         row[name] = getattr(stats, name)
@@ -302,18 +308,6 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
     invariants = dict(case.invariants)
     row |= metrics.measure(case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants)
     return row if measure is None else row | measure(run, result)
-
-
-def _timed(run: Run, k: int, first: float) -> Row:
-    """CPU time of a call in s, the mean of `calls` of them where one is too short for the clock."""
-    spent = [first]
-    while sum(spent) < run.case.timed and len(spent) < MOST_CALLS:
-        again = attempt(run, k)[0]
-        if again is None:
-            break
-        spent.append(again.stats.cpu_time)
-    mean = sum(spent) / len(spent)
-    return {"cpu_s": mean or None, "calls": len(spent)}
 
 
 def called_from(run: Run) -> str:

@@ -4,13 +4,13 @@ import importlib.util
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from studies import cli, figures, tables
 from studies.bench import Case, Run, collect
-from studies.cli import Call, StudyError
+from studies.cli import StudyError
 from studies.reference_motion import check_published
 from studies.render import number, power, render, table
 from studies.solvers import CATALOGUE, COMPARED
@@ -18,7 +18,7 @@ from studies.store import Output
 from twoloop.mechanisms import Problem
 
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
-QUICK = (1e-3, 1e-5, 1e-7, 1e-9)  # values of tolerances in a quick comparison
+QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
 
 
 def load_problem(where: str) -> Problem:
@@ -64,74 +64,42 @@ def runs_of(case: Case, solvers: Sequence[str], quick: bool) -> list[Run]:
     return runs
 
 
-def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, object]:
+def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, Any]:
     """What the report says, from the medians."""
-    cheapest = []
-    for error in errors:
-        ranked = tables.ranking(rows, error)
-        ours = ranked[ranked["family"] == "two-loop"] if len(ranked) else ranked
-        others = ranked[ranked["family"] != "two-loop"] if len(ranked) else ranked
-        best, foreign = (None if part.empty else part.iloc[0] for part in (ours, others))
-        cheapest.append(
-            {
-                "error": error,
-                "ours": None if best is None else best["solver"],
-                "ours_s": None if best is None else best["cpu_s"],
-                "others": None if foreign is None else foreign["solver"],
-                "others_s": None if foreign is None else foreign["cpu_s"],
-                "others_keep": None if foreign is None else bool(foreign["keeps_constraints"]),
-                "others_called_from": None if foreign is None else foreign["called_from"],
-                "ours_first": None if best is None or foreign is None else bool(best["cpu_s"] < foreign["cpu_s"]),
-            }
-        )
     floor = float(rows["floor"].iloc[0])
-    return {
-        "name": case.name,
-        "t_end": case.t_end,
-        "floor": floor,
-        "digits": int(np.floor(-np.log10(floor))),
-        "n_instants": case.n_instants,
-        "cheapest": cheapest,
-        "python": case.problem.system.called_in_python,
-        "n_failed": int((rows["status"] != "REACHED_END").sum()),
-        "unresolved": [error for error in errors if error < floor],
-    }
+    found: dict[str, Any] = {"name": case.name, "t_end": case.t_end, "floor": floor, "n_instants": case.n_instants}
+    found |= {"python": case.problem.system.called_in_python, "unresolved": [e for e in errors if e < floor]}
+    found["cheapest"] = []
+    for error in errors:
+        ours, others = tables.of_both(tables.ranking(rows, error)).values()
+        first = None if ours is None or others is None else bool(ours["cpu_s"] < others["cpu_s"])
+        found["cheapest"].append({"error": error, "ours": ours, "others": others, "ours_first": first})
+    return found | {"failed": bool((rows["status"] != "REACHED_END").any())}
 
 
-def report(call: Call, output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Sequence[float]) -> None:
+def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Sequence[float]) -> None:
     """Write findings, figure and report."""
     rows = tables.medians(rows)
     findings = findings_of(rows, case, errors)
-    if call.redraw:  # without making the reference again
+    if output.call.redraw:  # without making the reference again
         findings |= {key: output.load_findings().get(key) for key in ("source", "published")}
     else:
         published = check_published(case.problem, case.reference, case.t_end)
         findings |= {"source": case.reference.source, "published": published}
     output.save_findings(findings)
     lines = figures.cheapest_lines(rows, errors)
-    findings["drawn"] = lines
-    seconds = f"{number(case.t_end)} s"
     if lines:
-        figures.save(figures.work_precision(rows, lines, f"{case.name}, {seconds}"), output, call.study)
-    header = ["solver", "called from", *(power(error) for error in errors)]
-    best = tables.ranking(rows, errors[len(errors) // 2])
-    failed = tables.failures(rows)
-    ready = {
-        "work": table(header, tables.work_precision(rows, errors)),
-        "kept": table(
-            ["solver", "CPU (s)", "evaluations", "max abs C", "max abs C_q v + C_t", "energy error (J)"],
-            [
-                [row[key] for key in ("solver", "cpu_s", "n_evaluations", "violation_q", "violation_v", "energy")]
-                for _, row in best.iterrows()
-            ],
-        ),
-        "failed": table(["solver", "setting", "status", "message"], failed) if failed else "",
-    }
+        plot = figures.work_precision(rows, lines, f"{case.name}, {number(case.t_end)} s")
+        figures.save(plot, output, "compare")
     middle = errors[len(errors) // 2]
-    output.write(
-        f"{call.study}.md",
-        render("compare", findings, ready, stamp=line, quick=call.quick, middle=middle, note=case.note),
-    )
+    header = ["solver", "called from", *(power(error) for error in errors)]
+    kept = {"solver": "solver", "cpu_s": "CPU (s)", "n_evaluations": "evaluations", "violation_q": "max abs C"}
+    kept |= {"violation_v": "max abs C_q v + C_t", "energy": "energy error (J)"}
+    quality = [[run[key] for key in kept] for _, run in tables.ranking(rows, middle).iterrows()]
+    ready = {"work": table(header, tables.work_precision(rows, errors)), "kept": table([*kept.values()], quality)}
+    ready["failed"] = table(["solver", "setting", "status", "message"], tables.failures(rows))
+    more = {"stamp": line, "quick": output.call.quick, "middle": middle, "note": case.note, "drawn": bool(lines)}
+    output.write("compare.md", render("compare", findings, ready, **more))
 
 
 def _work(words: Sequence[str] | None) -> None:
@@ -166,7 +134,7 @@ def _work(words: Sequence[str] | None) -> None:
                 raise StudyError(f"no solver reached the end; the first said: {rows['message'].iloc[0]}")
             line = cli.stamp(call.command)
             output.save_rows(rows, line)
-        report(call, output, case, rows, line, errors)
+        report(output, case, rows, line, errors)
     print(f"wrote compare.md, .csv, .json, .png and .svg to {output.path}")
 
 

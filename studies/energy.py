@@ -1,348 +1,193 @@
 """Energy over long times: which methods let it drift, what a run without drift costs, and why."""
 
-from collections.abc import Iterable, Sequence
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
-from studies import cli, figures, tables
-from studies.bench import collect
+from studies import energy_runs, figures
 from studies.cli import StudyError
-from studies.energy_drift import (
-    BDF_LOOP,
-    CALM,
-    CRANK,
-    DRIFTS,
+from studies.energy_drift import CALM, DRIFTS, SLOWLY, bound, verdict
+from studies.energy_runs import (
+    BASIC,
+    EVEN,
     GAUSS,
-    IRREGULAR,
-    LOBATTO,
-    MIDPOINT,
-    MOMENTA_LASTING,
-    MOMENTA_SYMMETRIC,
-    NEWMARK_HALF,
-    NEWMARK_QUARTER,
-    NO_DRIFT,
+    MOMENTA,
+    NEWMARK,
     ONE,
-    PAPER_IRK,
-    PAPER_NEWMARK_HALF,
+    PROJECTED,
     RADAU,
-    SLOWLY,
     SUN,
     SWITCHING,
-    VELOCITIES_LASTING,
-    VELOCITIES_SYMMETRIC,
-    Variant,
-    bound,
-    name_of,
-    verdict,
-)
-from studies.energy_figures import Series, cost_figure, time_figure
-from studies.energy_runs import (
-    ALPHA,
-    EARLY,
-    GEOMETRIES,
-    LADDER,
-    LADDERED,
-    LSODA,
-    PROJECTED,
     TRAPEZOIDAL,
-    H,
-    measure,
-    runs,
+    VARIANTS,
+    Variant,
 )
-from studies.index import write_index
-from studies.render import number, power, render, table
-from studies.solvers import IDA_C, OWN_EXPLICIT
-from studies.store import Output
+from studies.render import number
+from studies.solvers import IDA_C, IRK, OWN_EXPLICIT
+from studies.study import Series, Study, key
+from studies.tables import setting
 
-__all__ = ["GEOMETRIES", "findings_of", "judged", "main", "report"]
-
-NUMBERS = ("cpu_s", "energy", "kinetic", "slope", "slope_error", "swing", "t_reached", "violation_q", "n_evaluations")
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
-NEAR = 0.3  # of an order about the expected one
-EXPECTED = {(ONE, SUN): 7.0, (ONE, RADAU): 5.0, (SWITCHING, SUN): 5.0}
-VARIANTS = (VELOCITIES_LASTING, VELOCITIES_SYMMETRIC, MOMENTA_LASTING, MOMENTA_SYMMETRIC)
-SYMMETRIC = (GAUSS, LOBATTO, MIDPOINT)  # tableaux
-ALTERNATIVES = (
-    *(IDA_C, LSODA, PROJECTED, ALPHA, TRAPEZOIDAL, OWN_EXPLICIT, "Gauss12"),
-    *(PAPER_IRK, PAPER_NEWMARK_HALF, SUN, BDF_LOOP),
-)
+KEEPING = f"{GAUSS}, symmetric partition"
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with the verdict on each run; `geometry` is the name under which the claims look for a case."""
-    rows = rows.astype(dict.fromkeys(NUMBERS, float))  # a run that could not be made has None
-    return rows.assign(geometry=rows["case"], verdict=[verdict(row) for _, row in rows.iterrows()])
+    """The rows with the verdict on each run, and with the method's name."""
+    return rows.assign(verdict=rows.apply(verdict, axis=1), name=rows.apply(name_of, axis=1))
 
 
-def pick(rows: pd.DataFrame, geometry: str, solver: str, variant: Variant, setting: str = "h") -> pd.Series:
-    """The long run of a method with fixed steps (setting "h") or step-size control ("tol")."""
-    chosen = rows[(rows["case"] == geometry) & (rows["solver"] == solver) & rows["group"].isin(("fixed", "controlled"))]
-    chosen = chosen[(chosen["variables"] == variant[0]) & (chosen["partition"] == variant[1])]
-    chosen = chosen[chosen[setting].notna()]
+def name_of(row: pd.Series) -> str:
+    """Method with what is not the default."""
+    extra = ["momenta"] * (row["variables"] == "momenta") + ["symmetric partition"] * (row["partition"] == "symmetric")
+    return ", ".join([row["solver"], *extra])
+
+
+def of(rows: pd.DataFrame, solver: str, variant: Variant = BASIC) -> pd.DataFrame:
+    """The runs of a method on certain variables, with a certain choice of the partition."""
+    same = (rows["variables"] == variant[0]) & (rows["partition"] == variant[1])
+    return rows[(rows["solver"] == solver) & same]
+
+
+def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC, group: str = "fixed") -> pd.Series:
+    """The long run of a method with fixed steps (group "fixed") or step-size control ("controlled")."""
+    chosen = of(rows[(rows["case"] == motion) & (rows["group"] == group)], solver, variant)
     if chosen.empty:
-        raise StudyError(f"the rows have no run of {solver} on {geometry}; make them again by python -m studies.energy")
+        raise StudyError(f"the rows have no run of {solver} on {motion}; make them again by python -m studies.energy")
     return chosen.iloc[0]
-
-
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 def told(row: pd.Series) -> dict[str, Any]:
     """A run as a finding."""
-    found = {key: row[key] for key in ("solver", "family", "called_from", "cpu_s", "n_evaluations", "violation_q")}
-    found |= {key: row[key] for key in ("verdict", "swing", "kinetic", "error_early", "slope_error", "status")}
-    found |= {"variables": _text(row["variables"]), "partition": _text(row["partition"]), "name": name_of(row)}
-    found |= {"setting": "h" if pd.notna(row["h"]) else "tol", "value": row["h"] if pd.notna(row["h"]) else row["tol"]}
+    found = {name: row[name] for name in ("solver", "name", "called_from", "cpu_s", "n_evaluations", "violation_q")}
+    found |= {name: row[name] for name in ("verdict", "kinetic", "status")}
+    found["label"] = f"{row['name']}, {setting(row)}"
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
     found |= {"calm": row["verdict"] in CALM, "drifts": row["verdict"] in (DRIFTS, SLOWLY)}
     return found | {"keeps": bool(row["keeps_constraints"])}
 
 
-def cheapest(rows: pd.DataFrame) -> dict[str, Any]:
-    """The cheapest run of ours and of others."""
-    own = rows["family"] == "two-loop"
-    return {name: _least(rows[which]) for name, which in (("ours", own), ("others", ~own))}
-
-
-def _least(rows: pd.DataFrame) -> dict[str, Any] | None:
-    return None if rows.empty else told(rows.loc[rows["cpu_s"].astype(float).idxmin()])
-
-
-def _cheaper(run: dict[str, Any] | None, other: dict[str, Any] | None) -> bool:
-    """Whether the first costs less than the second, by more than the times scatter; anything is better than nothing."""
-    return run is not None and (other is None or bool(run["cpu_s"] < (1.0 - EQUAL) * other["cpu_s"]))
+def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
+    """The cheapest of some runs."""
+    return None if rows.empty else told(rows.loc[rows["cpu_s"].idxmin()])
 
 
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """The class "long and conservative": what no drift costs, what a small error costs, what the alternatives do."""
+    """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
     reached = rows[(rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
-    calm = reached["verdict"].isin(CALM)
+    calm, own = reached["verdict"].isin(CALM), reached["family"] == "two-loop"
     kinetic = float(reached["kinetic"].iloc[0])
     at = []
-    for share in SHARES:
+    for share in (np.inf, *SHARES):
         good = reached["energy"].abs() <= share * kinetic
-        level = {"no_drift": cheapest(reached[good & calm]), "drift": cheapest(reached[good & ~calm])}
-        free, other = (_least(reached[good & which]) for which in (calm, ~calm))
-        pays, dear = _cheaper(free, other), _cheaper(other, free)
-        equal = free is not None and other is not None and not pays and not dear
-        at.append({"share": share, "energy": share * kinetic, **level, "pays": pays, "equal": equal})
-    free = cheapest(reached[calm])
-    own = free["ours"]
-    as_good = _least(reached[~calm & (reached["energy"].abs() <= own["energy"])]) if own else None
-    plain = rows["variables"].isna() | ((rows["variables"] == "velocities") & (rows["partition"] == "lasting"))
-    listed = rows[plain & rows["group"].isin(("other", "controlled"))]
+        level: dict[str, Any] = {"share": share, "energy": share * kinetic}
+        for name, which in (("no_drift", good & calm), ("drift", good & ~calm)):
+            level[name] = {"ours": cheapest(reached[which & own]), "others": cheapest(reached[which & ~own])}
+        free, other = cheapest(reached[good & calm]), cheapest(reached[good & ~calm])
+        over = np.inf if other is None else 0.0 if free is None else other["cpu_s"] / free["cpu_s"]
+        level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
+        at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
+    listed = rows[rows["group"].isin(("other", "controlled"))]
+    places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
     return {
         "case": SWITCHING,
         "problem": rows["problem"].iloc[0],
         "t_end": float(rows["t_end"].iloc[0]),
         "kinetic": kinetic,
-        "no_drift": free,
-        "as_good": as_good,  # the cheapest that drifts and keeps the energy as well as our cheapest without drift
-        "as_good_cheaper": _cheaper(as_good, own),
-        "at": at,
-        "n_no_drift_pays": sum(level["pays"] for level in at),
-        "n_equal": sum(level["equal"] for level in at),
+        "no_drift": at[0]["no_drift"],
+        "at": at[1:],
+        "n_pays": sum(level["pays"] for level in at[1:]),
+        "n_equal": sum(level["equal"] for level in at[1:]),
         "equal": EQUAL,
-        "alternatives": [told(row) for name in ALTERNATIVES for _, row in listed[listed["solver"] == name].iterrows()],
+        "alternatives": [told(rows.loc[place]) for place in places],  # of each the run of least error
     }
 
 
-def orders_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """How the drift falls with the step, beside the order that theory expects."""
+def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
+    """Fixed steps: the runs of each method in each variant on both geometries, None where there is none."""
+    places = [(ONE, BASIC), (ONE, MOMENTA), *((SWITCHING, variant) for variant in VARIANTS)]
     found = []
-    for geometry, solver, variant in LADDERED:
-        group = rows[(rows["group"] == "order") & (rows["case"] == geometry) & (rows["solver"] == solver)]
-        group = group[(group["variables"] == variant[0]) & (group["partition"] == variant[1]) & group["slope"].notna()]
-        steps, slopes = group["h"].to_numpy(float), np.abs(group["slope"].to_numpy(float))
-        resolved = len(steps) == len(LADDER) and bool((slopes > 0.0).all())
-        order = float(np.polyfit(np.log(steps), np.log(slopes), 1)[0]) if resolved else None
-        expected = EXPECTED[geometry, solver]
-        line = {"name": name_of(group.iloc[0]) if len(group) else solver, "geometry": geometry, "order": order}
-        line |= {"steps": steps.tolist(), "slopes": (1000.0 * group["slope"]).tolist(), "expected": expected}
-        found.append(line | {"as_expected": order is not None and abs(order - expected) < NEAR})
+    for solver in dict.fromkeys(fixed["solver"]):
+        runs = [of(fixed[fixed["case"] == geometry], solver, variant) for geometry, variant in places]
+        h = fixed[fixed["solver"] == solver]["h"].iloc[0]
+        found.append({"solver": solver, "h": h, "runs": [None if run.empty else told(run.iloc[0]) for run in runs]})
     return found
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report and the first screen say."""
-    sun, gauss, radau = (told(pick(rows, ONE, name, VELOCITIES_LASTING)) for name in (SUN, GAUSS, RADAU))
-    canonical = told(pick(rows, ONE, SUN, MOMENTA_LASTING))
+    rows = judged(rows)
     fixed = rows[(rows["group"] == "fixed") & (rows["case"] == SWITCHING)]
-    lasting = fixed[fixed["partition"] == "lasting"]
-    even = fixed[(fixed["partition"] == "symmetric") & fixed["solver"].isin(SYMMETRIC)]
-    uneven = fixed[(fixed["partition"] == "symmetric") & (fixed["solver"] == SUN)]
-    controlled = rows[(rows["group"] == "controlled") & rows["case"].isin((ONE, SWITCHING))]
-    newmark = {
-        key: [told(pick(rows, geometry, name, VELOCITIES_LASTING)) for name in (NEWMARK_QUARTER, NEWMARK_HALF)]
-        for key, geometry in (("one", ONE), ("switching", SWITCHING))
-    }
-    paper = {
-        key: told(pick(rows, geometry, PAPER_IRK, VELOCITIES_LASTING, "tol"))
-        for key, geometry in (("one", ONE), ("switching", SWITCHING))
-    }
-    turning = [told(row) for _, row in rows[rows["case"] == CRANK].iterrows() if row["status"] == "REACHED_END"]
-    turn = {
-        key: told(pick(rows, CRANK, GAUSS, variant))
-        for key, variant in (
-            ("velocities", VELOCITIES_LASTING),
-            ("momenta", MOMENTA_LASTING),
-            ("symmetric", MOMENTA_SYMMETRIC),
-        )
-    }
-    failed = rows[rows["status"] != "REACHED_END"]
+    even = fixed["partition"] == "symmetric"
+    kinds = {"lasting": ~even, "even": even & (fixed["solver"] != SUN), "uneven": even & (fixed["solver"] == SUN)}
+    calm = {name: fixed[which]["verdict"].isin(CALM) for name, which in kinds.items()}
+    controlled = rows[(rows["group"] == "controlled")]["verdict"].isin((DRIFTS, SLOWLY))
+    sun, gauss, canonical = (told(pick(rows, ONE, *which)) for which in ((SUN,), (GAUSS,), (SUN, MOMENTA)))
+    both = {"one": ONE, "switching": SWITCHING}
     return {
-        "long": long_of(rows[(rows["case"] == SWITCHING) & (rows["group"] != "order")]),
+        "long": long_of(rows[rows["case"] == SWITCHING]),
         "sun": sun,
         "gauss": gauss,
-        "radau": radau,
+        "radau": told(pick(rows, ONE, RADAU)),
         "canonical": canonical,
         "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
         "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
-        "n_lasting": len(lasting),
-        "n_lasting_calm": int(lasting["verdict"].isin(CALM).sum()),
-        "n_even": len(even),
-        "n_even_calm": int(even["verdict"].isin(CALM).sum()),
-        "n_uneven": len(uneven),
-        "n_uneven_calm": int(uneven["verdict"].isin(CALM).sum()),
+        "variants": variants_of(rows[rows["group"] == "fixed"]),
+        "n": {name: len(each) for name, each in calm.items()},
+        "n_calm": {name: int(each.sum()) for name, each in calm.items()},
         "n_controlled": len(controlled),
-        "n_controlled_drift": int(controlled["verdict"].isin((DRIFTS, SLOWLY)).sum()),
-        "newmark": newmark,
-        "newmark_calm_one": all(run["verdict"] == NO_DRIFT for run in newmark["one"]),
-        "newmark_calm_switching": all(run["verdict"] == NO_DRIFT for run in newmark["switching"]),
-        "paper": paper,
-        "orders": orders_of(rows),
-        "crank": turning,
-        "crank_gauss": turn,
-        "crank_t_end": float(rows[rows["case"] == CRANK]["t_end"].iloc[0]),
-        "h": H,
-        "early": EARLY,
-        "problems": {geometry: rows[rows["case"] == geometry]["problem"].iloc[0] for geometry in (ONE, SWITCHING)},
-        "n_failed": len(failed),
+        "n_controlled_drift": int(controlled.sum()),
+        "newmark": {name: told(pick(rows, motion, NEWMARK)) for name, motion in both.items()},
+        "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
+        "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
     }
 
 
-def _energy(run: dict[str, Any]) -> str:
-    """The drift of a run where it is told from none, else what cannot be excluded; what went wrong, if anything did."""
-    if run["drifts"]:
-        return number(run["drift"])
-    resolved = run["calm"] or run["verdict"] == IRREGULAR
-    return f"< {number(run['bound'])} ({run['verdict']})" if resolved else str(run["verdict"])
+def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+    """Both figures of the report."""
+    return {"energy_cost": cost_figure(judged(rows)), "energy_long": time_figure(judged(rows), series)}
 
 
-def choice_table(found: dict[str, Any]) -> str:
-    """What small energy errors cost without and with a drift, ours and others."""
-    lines = []
-    for at in ({"share": None, **found}, *found["at"]):
-        line = ["any" if at["share"] is None else f"≤ {number(at['energy'])} J"]
-        for kind in ("no_drift", "drift"):
-            for which in ("ours", "others"):
-                run = at[kind][which] if kind in at else None
-                line += ["none" if kind in at else "–", ""] if run is None else [_setting(run), number(run["cpu_s"])]
-        lines.append(line)
-    header = ["largest energy error", "no drift: ours", "CPU (s)", "no drift: other", "CPU (s)"]
-    return table([*header, "not free of it: ours", "CPU (s)", "not free of it: other", "CPU (s)"], lines)
+def cost_figure(rows: pd.DataFrame) -> Figure:
+    """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
+    long = rows[(rows["case"] == SWITCHING) & (rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
+    long = long.assign(error_q=long["energy"].abs(), floor=0.0, solver=long["name"])
+    drawn = (OWN_EXPLICIT, "Gauss12", IDA_C, PROJECTED, TRAPEZOIDAL, KEEPING, IRK)
+    long = long[long["solver"].isin(drawn) & ((long["solver"] != KEEPING) | long["h"].notna())]
+    title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
+    figure = figures.work_precision(long, drawn, title, "largest energy error over the run (J)")
+    calm = long[long["verdict"].isin(CALM)]
+    for axes, what in zip(figure.axes, ("cpu_s", "n_evaluations"), strict=True):
+        ring: dict[str, Any] = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 0.8}
+        axes.plot(calm["error_q"], calm[what], "o", color="black", **ring)
+    return figure
 
 
-def _setting(run: dict[str, Any]) -> str:
-    value = f"h = {number(run['value'])} s" if run["setting"] == "h" else power(run["value"])
-    return f"`{run['name']}`, {value}"
+def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
+    """Mean energy error over time with fixed steps, on both geometries."""
+    dashes = {BASIC: "-", MOMENTA: ":", EVEN: "--"}
+    chosen = [(SUN, BASIC), (SUN, MOMENTA), (GAUSS, BASIC), (GAUSS, EVEN), (RADAU, BASIC), (NEWMARK, BASIC)]
+    figure, panels = plt.subplots(1, 2, figsize=(10.5, 3.8), sharey=True, layout="constrained")
+    for axes, motion in zip(panels, (ONE, SWITCHING), strict=True):
+        fixed = rows[(rows["group"] == "fixed") & (rows["case"] == motion)]
+        for solver, variant in chosen:
+            for _, row in of(fixed, solver, variant).iterrows():
+                if key(row, "t") in series:
+                    look = figures.look(row) | {"linestyle": dashes[variant], "marker": ""}
+                    look["label"] = f"{row['name']}, h = {row['h']:g} s"
+                    axes.plot(series[key(row, "t")], np.abs(series[key(row, "mean")]), **look)
+        axes.set(xscale="log", yscale="log", xlabel="time (s)")
+        axes.set_title(f"{motion}: {rows[rows['case'] == motion]['problem'].iloc[0]}", fontsize=9)
+    panels[0].set_ylabel("|mean energy error of a window| (J)")
+    figures.legend(figure, panels)
+    return figure
 
 
-def runs_table(listed: Iterable[dict[str, Any]]) -> str:
-    """Runs with what they cost and what their energy does."""
-    header = ["solver", "called from", "drift (J)", "largest error (J)", "violation", "evaluations", "CPU (s)"]
-    lines = []
-    for run in listed:
-        line = [_setting(run), run["called_from"], _energy(run)]
-        lines.append(
-            [*line, *(number(run[key]) for key in ("energy", "violation_q", "n_evaluations", "cpu_s"))],
-        )
-    return table(header, lines)
-
-
-def variants_table(rows: pd.DataFrame) -> str:
-    """Fixed steps: the drift of each method in each variant, on both geometries."""
-    header = ["method", "h (s)", f"{ONE}: velocities", "momenta", f"{SWITCHING}: velocities"]
-    header += ["velocities, symmetric", "momenta", "momenta, symmetric"]
-    places = [(ONE, VELOCITIES_LASTING), (ONE, MOMENTA_LASTING), *((SWITCHING, variant) for variant in VARIANTS)]
-    fixed = rows[(rows["group"] == "fixed") & (rows["case"] != CRANK)]
-    lines = []
-    for solver in dict.fromkeys(fixed["solver"]):
-        own = fixed[fixed["solver"] == solver]
-        line = [solver, number(own["h"].iloc[0])]
-        for geometry, variant in places:
-            cell = own[(own["case"] == geometry) & (own["variables"] == variant[0]) & (own["partition"] == variant[1])]
-            line.append("not run" if cell.empty else _energy(told(cell.iloc[0])))
-        lines.append(line)
-    return table(header, lines)
-
-
-def orders_table(found: Sequence[dict[str, Any]]) -> str:
-    """Drift in J per 1000 s for each step, and the order."""
-    header = ["method", "geometry", *(f"h = {number(h)} s" for h in LADDER), "order", "expected"]
-    lines = []
-    for line in found:
-        slopes = dict(zip(line["steps"], line["slopes"], strict=True))
-        cells = [number(slopes.get(h)) for h in LADDER]
-        lines.append([line["name"], line["geometry"], *cells, number(line["order"]), number(line["expected"])])
-    return table(header, lines)
-
-
-def series_of(rows: pd.DataFrame) -> tuple[pd.DataFrame, Series]:
-    """The rows without the windows of their runs, and these as series, named by the place of the row."""
-    series: Series = {}
-    for key, row in rows.iterrows():
-        if isinstance(row["window_t"], list):
-            series |= {f"t{key}": np.array(row["window_t"]), f"mean{key}": np.array(row["window_mean"])}
-    return rows.drop(columns=["window_t", "window_mean"]), series
-
-
-def report(output: Output, rows: pd.DataFrame, series: Series, line: str) -> dict[str, Any]:
-    """Write findings, figures and report; the findings."""
-    rows = judged(tables.medians(rows))
-    findings = findings_of(rows)
-    output.save_findings(findings)
-    failed = tables.failures(rows)
-    ready = {
-        "choice": choice_table(findings["long"]),
-        "alternatives": runs_table(findings["long"]["alternatives"]),
-        "variants": variants_table(rows),
-        "orders": orders_table(findings["orders"]),
-        "crank": runs_table(findings["crank"]),
-        "failed": table(["solver", "setting", "status", "message"], failed) if failed else "",
-    }
-    figures.save(cost_figure(rows), output, "energy_cost")
-    figures.save(time_figure(rows, series), output, "energy_long")
-    names = {"one": ONE, "switching": SWITCHING}
-    output.write("energy.md", render("energy", findings, ready, stamp=line, quick=output.call.quick, names=names))
-    return findings
-
-
-def _work(words: Sequence[str] | None) -> None:
-    call = cli.parse("energy", __doc__, words)
-    with Output(call) as output:
-        if call.redraw:
-            (rows, line), series = output.load_rows(), output.load_series()
-        else:
-            with output.kept() as kept:
-                rows = collect(runs(call.quick), kept, measure, processes=2)
-            line = cli.stamp(call.command)
-            rows, series = series_of(judged(rows))
-            output.save_rows(rows, line)
-            output.save_series(series)
-        report(output, rows, series, line)
-        write_index(output)
-    print(f"wrote energy.md, .csv, .json, series and figures to {output.path}")
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    cli.main(_work, words)
-
+STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of, processes=2)
+main = STUDY.main
 
 if __name__ == "__main__":
     main()

@@ -1,27 +1,12 @@
-"""What the energy of a run does: windows, slope, verdict; and the names of what the energy study compares."""
+"""What the energy of a run does: windows, slope, verdict."""
 
 import math
-from typing import Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-SUN, GAUSS, LOBATTO, RADAU = "Sun Radau IIB(3)", "Gauss(3)", "Lobatto IIIE(4)", "Radau IIA(3)"
-GAUSS_12, MIDPOINT = "Gauss(6)", "implicit midpoint"
-NEWMARK_QUARTER, NEWMARK_HALF = "Newmark, β = 1/4", "Newmark, β = 1/2"
-PAPER_IRK, BDF_LOOP = "PaperIRK", "BDF"
-PAPER_NEWMARK_HALF = "PaperNewmark, β = 1/2"
-ONE, SWITCHING, CRANK = "one partition", "switching", "turning crank"
-Variables = Literal["velocities", "momenta"]
-Partition = Literal["lasting", "symmetric"]
-Variant = tuple[Variables, Partition]
-VELOCITIES_LASTING: Variant = ("velocities", "lasting")
-VELOCITIES_SYMMETRIC: Variant = ("velocities", "symmetric")
-MOMENTA_LASTING: Variant = ("momenta", "lasting")
-MOMENTA_SYMMETRIC: Variant = ("momenta", "symmetric")
 
 EPS = float(np.finfo(float).eps)
 RESOLVED = 3.0  # standard errors from which a slope counts as one
@@ -81,9 +66,3 @@ def verdict(row: pd.Series) -> str:
 def bound(row: pd.Series) -> float:
     """The greatest change of the energy over a run, J, that the scatter of its windows does not exclude."""
     return float((abs(row["slope"]) + RESOLVED * row["slope_error"]) * row["t_end"])
-
-
-def name_of(row: pd.Series) -> str:
-    """Method with what is not the default."""
-    extra = ["momenta"] * (row["variables"] == "momenta") + ["symmetric partition"] * (row["partition"] == "symmetric")
-    return ", ".join([row["solver"], *extra])

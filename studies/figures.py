@@ -1,7 +1,8 @@
 """One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from io import BytesIO
+from typing import Any
 
 import matplotlib as mpl
 
@@ -76,14 +77,35 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Exudyn, GeneralizedAlpha": (RED, "8"),
     "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
 }
+SAME = {  # a tableau looks like the preset that is made of it
+    "Sun Radau IIB(3)": "SunRadau5",
+    "Gauss(3)": "Gauss6",
+    "Gauss(3), symmetric partition": "Gauss6",
+    "Radau IIA(3)": "RadauIIA5",
+    "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
+}
 _REST = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY)
 
 
 def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, object]:
     """Colour, marker and line of a solver, the same in all figures; an open marker where the constraints drift."""
-    color, marker = STYLES.get(solver, (_REST[sum(solver.encode()) % len(_REST)], "o"))
+    color, marker = STYLES.get(SAME.get(solver, solver), (_REST[sum(solver.encode()) % len(_REST)], "o"))
     made: dict[str, object] = {"color": color, "marker": marker, "linestyle": "-" if family == "two-loop" else "--"}
     return made if keeps_constraints else made | {"markerfacecolor": "white"}
+
+
+def look(row: pd.Series) -> dict[str, Any]:
+    """Colour, marker and line of the row's solver, labelled with its name."""
+    return style(row["solver"], row["family"], bool(row["keeps_constraints"])) | {"label": row["solver"]}
+
+
+def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None) -> None:
+    """One legend for all panels, right of them, each label once."""
+    entries: dict[str, Any] = {}
+    for panel in axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(entries.values(), entries.keys(), loc="outside right upper", title=title)
 
 
 def save(figure: Figure, output: Output, name: str) -> None:
@@ -129,22 +151,15 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
         runs = runs[runs["error_q"] > runs["floor"]]
         if runs.empty:
             continue
-        look = style(solver, runs["family"].iloc[0], bool(runs["keeps_constraints"].iloc[0]))
-        label = f"{solver} [{'P' if runs['called_from'].iloc[0] == 'Python' else 'c'}]"
+        called = "P" if runs["called_from"].iloc[0] == "Python" else "c"
+        one = look(runs.iloc[0]) | {"label": f"{solver} [{called}]"}
         times = runs["cpu_s"].astype(float)
         spread = [times - runs["cpu_q1"].astype(float), runs["cpu_q3"].astype(float) - times]
-        left.errorbar(runs["error_q"].astype(float), times, yerr=spread, label=label, elinewidth=0.8, **look)
+        left.errorbar(runs["error_q"].astype(float), times, yerr=spread, elinewidth=0.8, **one)
         counted = runs[runs["n_evaluations"].notna()]
-        right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **look)
+        right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **one)
     for axes, what in ((left, "CPU time (s)"), (right, "evaluations")):
-        _log_axes(axes, error, what)
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside right upper", title="filled: keeps constraints\n[c] compiled, [P] Python"
-    )
+        axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
+    legend(figure, [left], "filled: keeps constraints\n[c] compiled, [P] Python")
     figure.suptitle(title, fontsize=10)
     return figure
-
-
-def _log_axes(axes: Axes, x: str, y: str) -> None:
-    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)

@@ -6,9 +6,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from references.four_bar_minimal import MinimalFourBar
-from studies import cli, figures
+from studies import figures, study
 from studies.cases.four_bar import SECOND
-from studies.index import write_index
 from studies.store import Output
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
@@ -48,20 +47,17 @@ def draw(axes: plt.Axes, problem: Problem) -> None:
     axes.legend(loc="lower left", fontsize=8)
 
 
-def _work(words: Sequence[str] | None) -> None:
-    with Output(cli.parse("linkage", __doc__, words)) as output:
-        figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-        for one, problem in zip(axes, (four_bar(), four_bar(**SECOND)), strict=True):  # type: ignore[arg-type]
-            draw(one, problem)
-        figure.suptitle("Released from rest (dark, thick); equal intervals of time, later is lighter", fontsize=9)
-        figures.save(figure, output, "linkage")
-        write_index(output)
-    print(f"wrote linkage.png and .svg to {output.path}")
+def _work(output: Output) -> None:
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for one, problem in zip(axes, (four_bar(), four_bar(**SECOND)), strict=True):  # type: ignore[arg-type]
+        draw(one, problem)
+    figure.suptitle("Released from rest (dark, thick); equal intervals of time, later is lighter", fontsize=9)
+    figures.save(figure, output, "linkage")
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Draw `linkage.png` and `linkage.svg`."""
-    cli.main(_work, words)
+    study.run("linkage", __doc__, words, _work)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The motion against which errors are measured: a known one, or one made of two unlike methods at tight tolerance."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -37,11 +36,6 @@ class ReferenceMotion:
     floor: float
     source: str
 
-    @property
-    def digits(self) -> int:
-        """Decimal places to which its positions hold."""
-        return math.floor(-math.log10(self.floor))
-
 
 def make_reference(problem: Problem, t_end: float) -> ReferenceMotion:
     """Integrate by two unlike methods; their largest difference over the run, positions, is the floor.
@@ -72,11 +66,8 @@ def make_reference(problem: Problem, t_end: float) -> ReferenceMotion:
             said.append(first.message)
             continue
         motion = Quintic(first.t, first.q, first.v, first.a)
-        coarse = Quintic(first.t[::2], first.q[:, ::2], first.v[:, ::2], first.a[:, ::2])
-        skipped = first.t[1::2][: first.t[::2].size - 1]
-        between = np.abs(coarse(skipped)[0] - motion(skipped)[0]).max() / 2**6  # a quintic's error falls with h^6
         differ = np.abs(motion(other.t)[0] - other.q).max()
-        floor = max(float(differ), float(between), 1e-15)
+        floor = max(float(differ), motion.uncertainty(), 1e-15)
         return ReferenceMotion(motion, floor, f"{name}, tolerances {tolerance:.0e}, which differ by {differ:.1e}")
     raise StudyError(f"no reference for {problem.name!r}: {' / '.join(said)}")
 
@@ -105,6 +96,12 @@ class Quintic:
 
     def __init__(self, t: Array, q: Array, v: Array, a: Array):
         self._t, self._q, self._v, self._a = t, q, v, a
+
+    def uncertainty(self) -> float:
+        """Estimated largest error of q between the instants: from every second one, of which it falls with h^6."""
+        coarse = Quintic(self._t[::2], self._q[:, ::2], self._v[:, ::2], self._a[:, ::2])
+        skipped = self._t[1::2][: self._t[::2].size - 1]
+        return float(np.abs(coarse(skipped)[0] - self(skipped)[0]).max()) / 2**6
 
     def __call__(self, times: Array) -> tuple[Array, Array]:
         """q, v (n_q, n_t) at times within the instants."""

@@ -5,9 +5,9 @@ that it cannot run, which becomes a row. Foreign packages are imported when they
 installed is a row too.
 """
 
-import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ import numpy as np
 from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
-from twoloop.mechanisms import Problem
 from twoloop.plan import Method
 from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
@@ -46,19 +45,8 @@ COMPARED = (
 )
 
 
-def two_loop(method: str | Method, problem: Problem, t_end: float, tolerance: float, k: int) -> Result:
-    """Run a method of twoloop with rtol = atol = tolerance."""
-    span = (0.0, t_end)
-    return solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=tolerance, atol=tolerance)
-
-
 def _start(case: Case) -> tuple[Any, Any, Any, Any]:
     return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
-
-
-def _time_limit(solve: Callable[..., Result], case: Case) -> dict[str, Any]:
-    known = "time_limit" in inspect.signature(solve).parameters
-    return {"time_limit": case.time_limit} if known else {}
 
 
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int) -> Result:
@@ -88,9 +76,8 @@ def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
     from references.ida import solve_ida
 
     # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
-    rtol = tolerance * (1.0 + NUDGE * repeat)
-    limit = _time_limit(solve_ida, case)
-    return solve_ida(*_start(case), form, rtol, tolerance, t_eval=_with_start(case), **limit)
+    rtol, times = tolerance * (1.0 + NUDGE * repeat), np.append(0.0, case.instants)
+    return solve_ida(*_start(case), form, rtol, tolerance, t_eval=times, time_limit=case.time_limit)
 
 
 def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
@@ -98,38 +85,30 @@ def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int
 
     if case.problem.system.called_in_python:
         raise NotApplicable("IDA from C needs compiled functions; this mechanism is plain Python (see IDA, stabilised)")
-    rtol = tolerance * (1.0 + NUDGE * repeat)
-    more = {**options, **_time_limit(solve_ida_c, case)}
-    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=_with_start(case), **more)
+    rtol, times = tolerance * (1.0 + NUDGE * repeat), np.append(0.0, case.instants)
+    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=times, time_limit=case.time_limit, **options)
 
 
 def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
     from references.fully_implicit import solve_fully_implicit  # type: ignore[import-untyped, import-not-found, unused-ignore]
 
-    limit = {"time_limit": case.time_limit}
-    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, **limit)  # type: ignore[arg-type]
+    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, time_limit=case.time_limit)
 
 
-def _with_start(case: Case) -> Any:
-    return np.append(0.0, case.instants)
-
-
-def _index1(method: str, stabilisation: str, alpha: float | None, case: Case, tolerance: float, repeat: int) -> Result:
-    options: dict[str, Any] = {"stabilisation": stabilisation, "alpha": alpha, **_time_limit(solve_index1, case)}
-    return solve_index1(*_start(case), method, tolerance, tolerance, **options)
+def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
+    return solve_index1(*_start(case), rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
     if "L3" not in case.problem.parameters:  # of the four-bar linkage
         raise NotApplicable(
-            f"Exudyn needs a model of its own for every mechanism; it has none of {case.problem.name!r}"
+            f"Exudyn needs a model of its own for every mechanism; there is none of {case.problem.name!r}"
         )
     from references.exudyn_four_bar import solve_exudyn
 
     n_steps = round(case.t_end / step)
-    every = max(1, n_steps // STORED)
-    limit = _time_limit(solve_exudyn, case)
-    return solve_exudyn(case.problem, case.t_end, n_steps, solver, **options, **limit, store_every=every)  # type: ignore[arg-type]
+    more = {"store_every": max(1, n_steps // STORED), "time_limit": case.time_limit, **options}
+    return solve_exudyn(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
 
 
 def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Result:
@@ -137,8 +116,7 @@ def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Resul
 
     n_steps = round(case.t_end / step)
     kept = np.append(np.arange(0, n_steps, max(1, n_steps // STORED)) * step, case.t_end)
-    limit = _time_limit(solve_gear, case)
-    return solve_gear(*_start(case), step, order, start=start, t_eval=kept, **limit)
+    return solve_gear(*_start(case), step, order, start=start, t_eval=kept, time_limit=case.time_limit)
 
 
 def baumgarte(method: str, alpha: float) -> str:
@@ -163,51 +141,51 @@ def paper_newmark_at(err_in: float, beta: float = 0.5) -> Solver:
     return Solver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
 
 
+def _solver(name: str, family: str, called_from: str, setting: str, run: Any, **more: Any) -> Solver:
+    values = TOLERANCES if setting == "tol" else ()
+    return Solver(name, family, called_from, more.pop("keeps", True), setting, run, values, **more)
+
+
+def _index_1(name: str, keeps: bool, method: str, stabilisation: str, **fixed: float) -> Solver:
+    run = partial(_index1, {"method": method, "stabilisation": stabilisation, **fixed})
+    return _solver(name, "SciPy", "Python", "tol", run, keeps=keeps, fixed=fixed, own_accelerations=bool(fixed))
+
+
 def _all() -> Iterator[Solver]:
     yield paper_irk_at(ERR_IN)
-    yield Solver(IRK_LINE, "two-loop", "compiled", True, "tol", _paper_irk, TOLERANCES)
+    yield _solver(IRK_LINE, "two-loop", "compiled", "tol", _paper_irk)
     yield paper_newmark_at(ERR_IN)
     yield paper_newmark_at(ERR_IN, 0.25)
     for preset in PRESETS:
-        method = "DOP853" if preset == OWN_EXPLICIT else preset
-        yield Solver(preset, "two-loop", "compiled", True, "tol", partial(_preset, method), TOLERANCES)
-    newton = partial(_preset, RungeKutta(radau_iia(4), "newton"))
-    yield Solver(NEWTON_4, "two-loop", "compiled", True, "tol", newton, TOLERANCES)
-    yield Solver(CANONICAL, "two-loop", "compiled", True, "h", _canonical)
+        run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
+        yield _solver(preset, "two-loop", "compiled", "tol", run)
+    newton = RungeKutta(radau_iia(4), "newton")
+    yield _solver(NEWTON_4, "two-loop", "compiled", "tol", partial(_preset, newton))
+    yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
+    own: dict[str, Any] = {"own_accelerations": True}
     for form in IDA_FORMS:
         keeps, run = form == "stabilised", partial(_ida, form)
-        yield Solver(f"IDA, {form}", "SUNDIALS", "Python", keeps, "tol", run, TOLERANCES, own_accelerations=True)
-    loose = {"max_order": 2, "error_test": "positions"}
-    for name, options in ((IDA_C, dict[str, Any]()), (IDA_C_ORDER_2, loose)):
-        run = partial(_ida_c, options)
-        yield Solver(name, "SUNDIALS", "compiled", True, "tol", run, TOLERANCES, own_accelerations=True)
+        yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
+    for name, options in ((IDA_C, {}), (IDA_C_ORDER_2, {"max_order": 2, "error_test": "positions"})):
+        yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
     for name in ("Radau", "Radau9", "BDF"):
-        run = partial(_fully_implicit, name)
-        yield Solver(f"{name}, solve_dae", "solve_dae", "Python", True, "tol", run, TOLERANCES, own_accelerations=True)
+        yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
-        yield Solver(
-            f"{name}, index 1", "SciPy", "Python", False, "tol", partial(_index1, name, "none", None), TOLERANCES
-        )
+        yield _index_1(f"{name}, index 1", False, name, "none")
     for name in ("DOP853", "RK45"):
-        run = partial(_index1, name, "projection", None)
-        yield Solver(f"{name}, projected", "SciPy", "Python", True, "tol", run, TOLERANCES)
-    for name in ("LSODA", "DOP853"):
-        for alpha in ALPHAS:
-            run, fixed = partial(_index1, name, "baumgarte", alpha), {"alpha": alpha}
-            line = baumgarte(name, alpha)
-            yield Solver(line, "SciPy", "Python", False, "tol", run, TOLERANCES, fixed, own_accelerations=True)
+        yield _index_1(f"{name}, projected", True, name, "projection")
+    for name, alpha in product(("LSODA", "DOP853"), ALPHAS):
+        yield _index_1(baumgarte(name, alpha), False, name, "baumgarte", alpha=alpha)
     for solver in EXUDYN:
-        run = partial(_exudyn, solver, {})
-        yield Solver(f"Exudyn, {solver}", "Exudyn", "compiled", True, "h", run, own_accelerations=True)
+        keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
+        yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **own)
     for radius in (1.0, 0.6):
-        run, fixed = partial(_exudyn, "GeneralizedAlpha", {"spectral_radius": radius}), {"spectral_radius": radius}
-        line = f"Exudyn, GeneralizedAlpha {radius:g}"
-        yield Solver(line, "Exudyn", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
-    for order in GEAR_ORDERS:
-        for start in GEAR_STARTS:
-            run, fixed = partial(_gear, order, start), {"order": order}
-            line = gear(order, start)
-            yield Solver(line, "stand-in", "compiled", True, "h", run, fixed=fixed, own_accelerations=True)
+        fixed = {"spectral_radius": radius}
+        run = partial(_exudyn, "GeneralizedAlpha", fixed)
+        yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **own)
+    for order, start in product(GEAR_ORDERS, GEAR_STARTS):
+        run, fixed = partial(_gear, order, start), {"order": order}
+        yield _solver(gear(order, start), "stand-in", "compiled", "h", run, fixed=fixed, **own)
 
 
 CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}

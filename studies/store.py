@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Mapping
 from importlib.metadata import version
 from io import BytesIO, StringIO
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -132,12 +133,9 @@ class Output:
         """Read what `save_findings` wrote."""
         path = self.file(f"{self.call.study}.json")
         try:
-            found = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
+            return dict(json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError) as error:
             raise StudyError(f"{path} cannot be read: {error}") from None
-        if not isinstance(found, dict):
-            raise StudyError(f"{path} does not hold findings")
-        return found
 
     def save_series(self, series: Mapping[str, NDArray[Any]]) -> None:
         """Write named arrays, of which figures are drawn, to NAME_series.npz."""
@@ -194,12 +192,14 @@ class KeptRows:
         if self.path.exists():
             # a last line without its end is a row whose writing was cut off
             lines = self.path.read_text(errors="replace").split("\n")[:-1]
-            why = self._read(lines)
-            if why:
-                self._rows, lines = {}, []
-                print(f"{self.path.name}: {why}; set aside as {self._set_aside().name}")
-            elif self._rows:
-                self.n_resumed = len(self._rows)
+            try:
+                self._rows = self._read(lines)
+            except ValueError as error:
+                lines, aside = [], next(path for k in count(1) if not (path := self._aside(k)).exists())
+                self.path.rename(aside)
+                print(f"{self.path.name}: {error}; set aside as {aside.name}")
+            self.n_resumed = len(self._rows)
+            if self._rows:
                 print(f"Continuing from {self.n_resumed} finished runs in {self.path}")
         new = self.path.with_name(f".{self.path.name}.new")
         new.unlink(missing_ok=True)
@@ -207,29 +207,23 @@ class KeptRows:
         os.replace(new, self.path)
         return self
 
-    def _read(self, lines: list[str]) -> str:
-        """Take the rows of these lines; why they cannot be used, or nothing."""
-        if not lines:
-            return "" if self.path.stat().st_size == 0 else "it has no first line"
-        if lines[0] != self._header:
-            return "its rows were made by other sources or with other settings"
+    def _aside(self, k: int) -> Path:
+        return self.path.with_suffix(f".aside-{k}")
+
+    def _read(self, lines: list[str]) -> dict[str, Row]:
+        if lines[:1] != [self._header] and self.path.stat().st_size > 0:
+            raise ValueError("its rows were made by other sources or with other settings")
+        rows = {}
         for number, line in enumerate(lines[1:], 2):
             try:
                 kept = json.loads(line)
-                key, row = kept["key"], kept["row"]
+                key, row = kept["key"], dict(kept["row"])
             except (ValueError, KeyError, TypeError):
-                return f"line {number} is not a row"
-            if not (isinstance(key, str) and isinstance(row, dict)):
-                return f"line {number} is not a row"
-            self._rows[key] = row
-        return ""
-
-    def _set_aside(self) -> Path:
-        count = 1
-        while (target := self.path.with_suffix(f".aside-{count}")).exists():
-            count += 1
-        self.path.rename(target)
-        return target
+                key, row = None, {}
+            if not isinstance(key, str):
+                raise ValueError(f"line {number} is not a row")
+            rows[key] = row
+        return rows
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

@@ -1,29 +1,23 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside other solvers."""
 
-import statistics
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
-from rich.table import Table
 
-from studies import cli, figures, tables
+from studies import figures, study, tables
 from studies.bench import Case, Run, Solver, collect
 from studies.cases import four_bar
-from studies.cli import Call, StudyError
-from studies.index import write_index
+from studies.cli import StudyError
 from studies.metrics import ASTRAY, LOST
 from studies.render import number, power, render, table
 from studies.solvers import (
     CATALOGUE,
+    ERR_IN,
     IDA_C,
     IDA_FORMS,
-    IRK,
     IRK_LINE,
     NEWMARK,
     OWN_EXPLICIT,
@@ -32,16 +26,19 @@ from studies.solvers import (
     paper_newmark_at,
 )
 from studies.store import Output
-from studies.table3_causes import FAMILIES, TOLERANCES, causes, machine, printed
+from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, causes, machine, printed, reading_runs
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.tableaux import gauss
 
-SECOND = four_bar.SECOND
-TARGETS = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8)
-PRESETS = ("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT)
-EXUDYN = ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2")
-SCIPY = ("LSODA, index 1", "DOP853, index 1", "DOP853, projected")
+TARGETS = (1e-2, 1e-4, 1e-6)
+PAPER = (NEWMARK, QUARTER, IRK_LINE)
+OTHERS = (
+    *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, IDA_C, "IDA, stabilised"),
+    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+    *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
+)
 DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", "Gauss12", OWN_EXPLICIT, IDA_C, "DOP853, projected")
+LISTED = (*DRAWN, QUARTER, "LSODA, index 1", "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
@@ -52,240 +49,157 @@ def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
 
 
 def runs(first: Case, second: Case, quick: bool) -> list[Run]:
-    """The cells of the table on both geometries, what a partition costs, and the other solvers."""
-    made = []
+    """The cells of the table, what a partition costs, both readings of (32), and the other solvers.
+
+    On the second geometry only the paper's procedures: `studies.work_precision` has the others there.
+    """
+    made = reading_runs(first)
     for case, once in ((first, quick), (second, True)):
-        for group, at in (("Table 3: IRK", paper_irk_at), ("Table 3: Newmark", paper_newmark_at)):
+        for group, at in zip(FAMILIES, (paper_irk_at, paper_newmark_at), strict=True):
             cells = [(e_in, e_out) for e_in in TOLERANCES for e_out in TOLERANCES if case is first or e_in == e_out]
             made += [Run(case, at(e_in), e_out, group, 1 if once else 3) for e_in, e_out in cells]
     for partition in ("lasting", "symmetric"):
         solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
-        made.append(Run(first, solver, STEP, "partition", 3))
-    names = [NEWMARK, QUARTER, IRK_LINE, *PRESETS, IDA_C, "IDA, stabilised", *SCIPY, *EXUDYN]
-    names += [] if quick else [f"IDA, {form}" for form in IDA_FORMS if form != "stabilised"]
-    for case in (first,) if quick else (first, second):
-        for name in names:
+        made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
+    names = (*PAPER, *OTHERS, *([] if quick else [f"IDA, {form}" for form in IDA_FORMS if form != "stabilised"]))
+    for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
+        for name in names_:
             solver = CATALOGUE[name]
             values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-6, 1e-8, 1e-10)
-            for value in values[1:3] if quick else values:
-                long = value < 1e-3 if solver.setting == "h" else value < 1e-9 and solver.setting == "err_out"
-                made.append(Run(case, solver, value, "comparison", 1 if quick or long else 3))
+            made += [Run(case, solver, x, "comparison", 1 if quick else 3) for x in (values[1:3] if quick else values)]
     return made
 
 
-def _extra(run: Run, result: Result) -> dict[str, float]:
-    """Height of bar 3's centre, by which the paper judges energy."""
-    return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, with the height of bar 3's centre, by which the paper judges energy."""
 
+    def highest(run: Run, result: Result) -> dict[str, float]:
+        return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
 
-def _start_up() -> float:
-    """Wall time of a fresh process with a warm cache, from its start to the end of a first millisecond of motion."""
-    code = (
-        "from twoloop import solve_dae; from twoloop.mechanisms import four_bar; p = four_bar(); "
-        "solve_dae(p.system, (0.0, 1e-3), p.q0, p.v0)"
-    )
-    began = time.perf_counter()
-    subprocess.run([sys.executable, "-c", code], check=True)
-    return time.perf_counter() - began
-
-
-def make(output: Output, quick: bool) -> pd.DataFrame:
-    """Make all rows."""
-    first, second = four_bar.cases(quick)
+    first, second = four_bar.cases(output.call.quick)
     with output.kept() as kept:
-        rows = collect(runs(first, second, quick), kept, _extra)
-    kinetic = {case.problem.name: case.scale.kinetic for case in (first, second)}
-    rows["kinetic"] = rows["problem"].map(kinetic)
-    for angle in ("θ1", "θ2", "θ3"):
-        count = {case.problem.name: four_bar.in_line(case.problem)[angle] for case in (first, second)}
-        rows[f"in_line_{angle}"] = rows["problem"].map(count)
-    rows["start_up_s"] = statistics.median(_start_up() for _ in range(1 if quick else 3))
-    return rows
+        return collect(runs(first, second, output.call.quick), kept, highest)
 
 
-def mark(row: pd.Series) -> str:
-    """★ for a lost solution, † for one out of phase."""
-    return " ★" if row["lost"] else " †" if row["astray"] else ""
-
-
-def grid(rows: pd.DataFrame, group: str, show) -> list[list[str]]:  # type: ignore[no-untyped-def]
-    """Lines of a table, err_in by err_out, of what `show(cell, printed time)` makes of a cell."""
-    paper = printed(group)
+def grid(rows: pd.DataFrame, group: str) -> str:
+    """A table of times, err_in by err_out, beside the printed ones."""
     lines = []
-    for i, e_in in enumerate(TOLERANCES):
-        line = [power(e_in)]
-        for j, e_out in enumerate(TOLERANCES):
-            cell = machine(rows, group, e_in, e_out)
-            line.append("not run" if cell is None else show(cell, paper[i][j]))
-        lines.append(line)
-    return lines
+    for e_in, paper in zip(TOLERANCES, printed(group), strict=True):
+        cells = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
+        shown = ["not run" if cell is None else _time(cell, time) for cell, time in zip(cells, paper, strict=True)]
+        lines.append([power(e_in), *shown])
+    return table(["err_in \\ err_out", *(power(e) for e in TOLERANCES)], lines)
 
 
 def _time(cell: pd.Series, paper: float | None) -> str:
-    spread = tables.with_quartiles(cell["cpu_s"], cell["cpu_q1"], cell["cpu_q3"])
+    mark = " ★" if cell["lost"] else " †" if cell["astray"] else ""
+    spread = tables.with_quartiles(cell["cpu_s"], cell["cpu_q1"], cell["cpu_q3"]) + mark
     if cell["t_end"] != PAPER_END:  # a quick run: nothing printed is for so short a motion
-        return spread + mark(cell)
-    times = "" if paper is None else f" ×{number(paper / cell['cpu_s'])}"
-    return f"{spread}{mark(cell)} / {'★' if paper is None else f'{paper:.2f}'}{times}"
+        return spread
+    if paper is None:
+        return f"{spread} / ★"
+    return f"{spread} / {paper:.2f} ×{number(paper / cell['cpu_s'])}"
 
 
-def counts(rows: pd.DataFrame) -> list[list[str]]:
-    """Evaluations, steps and error of both procedures with err_in = 1e-9, on which they hardly depend."""
+def counts(rows: pd.DataFrame) -> str:
+    """A table of evaluations, steps and error of both procedures with err_in = 1e-9, on which they hardly depend."""
     lines = []
     for group, name in (("Table 3: IRK", "Runge–Kutta"), ("Table 3: Newmark", "Newmark")):
         line = [name]
         for err_out in TOLERANCES:
-            cell = machine(rows, group, TOLERANCES[-1], err_out)
+            cell = machine(rows, group, ERR_IN, err_out)
             keys = ("n_evaluations", "n_steps", "error_q")
             line.append("not run" if cell is None else " / ".join(number(float(cell[key])) for key in keys))
         lines.append(line)
-    return lines
+    return table(["err_out", *(power(e) for e in TOLERANCES)], lines)
 
 
-def findings_of(rows: pd.DataFrame) -> dict[str, object]:
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says, from the medians."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    irk, newmark = (machine(first, group, 1e-9, 1e-9) for group in FAMILIES)
-    coarse = machine(first, "Table 3: IRK", 1e-9, 1e-3)
-    if irk is None or newmark is None or coarse is None:
+    irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
+    if irk is None or newmark is None:
         raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
-    found: dict[str, object] = {
-        "t_end": float(first["t_end"].iloc[0]),
-        "irk_s": irk["cpu_s"],
-        "newmark_s": newmark["cpu_s"],
-        "ratio_s": newmark["cpu_s"] / irk["cpu_s"],
-        "ratio_evaluations": newmark["n_evaluations"] / irk["n_evaluations"],
-        "paper_ratio": 50.93 / 3.60,
-        "irk_error": irk["error_q"],
-        "newmark_error": newmark["error_q"],
-        "coarse_steps": coarse["n_steps"],
-        "fine_steps": irk["n_steps"],
-        "coarse_more_steps": bool(coarse["n_steps"] > 1.5 * irk["n_steps"]),
-        "coarse_astray": bool(coarse["astray"]),
-        "coarse_error": coarse["error_q"],
-        "lost_limit": LOST,
-        "astray_limit": ASTRAY,
-        "start_up_s": float(first["start_up_s"].iloc[0]),
-        "floor": float(first["floor"].iloc[0]),
-    }
-    for name, group in (("irk", "Table 3: IRK"), ("newmark", "Table 3: Newmark")):
-        cells = first[first["group"] == group]
+    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "floor": float(first["floor"].iloc[0])}
+    found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
+    found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
+    for name, cell in (("irk", irk), ("newmark", newmark)):
+        found |= {f"{name}_s": cell["cpu_s"], f"{name}_error": cell["error_q"]}
+        cells = first[first["group"] == cell["group"]]
         for what in ("lost", "astray"):
             bad = cells[cells[what].astype(bool)]["err_out"].unique()
             found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
-    found["equal_error"] = equal_error(first)
-    ratios = [line[key] for line in found["equal_error"] for key in ("half", "quarter") if line[key] is not None]  # type: ignore[attr-defined]
-    found["newmark_dearer_everywhere"] = bool(ratios and min(ratios) > 1.0)
+    found["ratio_s"] = newmark["cpu_s"] / irk["cpu_s"]
+    found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
+    ratios = _newmark_over_irk(first)
     found["newmark_over_irk"] = [min(ratios), max(ratios)] if ratios else []
-    best = {f"{target:.0e}": tables.ranking(first, target) for target in (1e-2, 1e-4, 1e-6)}
-    found["cheapest"] = [
-        {
-            "error": float(error),
-            "solver": ranked.iloc[0]["solver"],
-            "cpu_s": ranked.iloc[0]["cpu_s"],
-            "ours": bool(ranked.iloc[0]["family"] == "two-loop"),
-            "paper_times": _over(ranked, IRK_LINE),
-            "ida_times": _over(ranked, IDA_C),
-        }
-        for error, ranked in best.items()
-        if len(ranked)
-    ]
+    found["newmark_dearer_everywhere"] = bool(ratios and min(ratios) > 1.0)
+    found["cheapest"] = [line for error in TARGETS[::2] if (line := _cheapest(_compared(first), error)) is not None]
     failed = rows[rows["status"] != "REACHED_END"]
-    found["n_failed"] = len(failed)
-    found["n_failed_two_loop"] = int((failed["family"] == "two-loop").sum())
-    found["n_runs"] = len(rows)
-    ours = rows[(rows["family"] == "two-loop") & (rows["err_in"].isna() | (rows["err_in"] == 1e-9))]
+    found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
+    ours = _at_least_fine(rows[rows["family"] == "two-loop"])
+    drifting = rows[~rows["keeps_constraints"].astype(bool)]["violation_q"]
     found["violation"] = float(ours["violation_q"].max())
     found["violation_grows"] = bool(ours["violation_late"].max() > 2.0 * ours["violation_early"].max())
-    drifting = rows[~rows["keeps_constraints"].astype(bool)]
-    found["violation_drift"] = float(drifting["violation_q"].max()) if len(drifting) else None
+    found["violation_drift"] = float(drifting.max()) if len(drifting) else None
     return found | causes(first)
 
 
-def _over(ranked: pd.DataFrame, solver: str) -> float | None:
-    """Time of a solver over that of the cheapest; None where it does not reach the error."""
-    line = ranked[ranked["solver"] == solver]
-    return None if line.empty else float(line["cpu_s"].iloc[0] / ranked["cpu_s"].iloc[0])
+def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
+    """The cheapest solver at an error, and how many times as long the paper's procedure and IDA from C take."""
+    ranked = tables.ranking(first, error)
+    if ranked.empty:
+        return None
+    times = dict(zip(ranked["solver"], ranked["cpu_s"] / ranked["cpu_s"].iloc[0], strict=True))
+    found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
+    return found | (tables.best(ranked) or {})
 
 
-def equal_error(first: pd.DataFrame) -> list[dict[str, float | None]]:
-    """CPU time of Newmark over that of Runge-Kutta at equal error over the run, err_in = 1e-9.
-
-    None where one of them has no run on either side of the error.
-    """
-    fine = first[first["err_in"].isna() | (first["err_in"] == TOLERANCES[-1])]
-    lines = []
+def _newmark_over_irk(first: pd.DataFrame) -> list[float]:
+    """CPU time of Newmark, both beta, over that of Runge-Kutta, at errors over the run that both reach or pass."""
+    fine = _at_least_fine(first)
+    ratios = []
     for target in (0.3, 0.1, 0.03, 0.01, 0.003):
         half, quarter, irk = (
-            tables.time_for(runs, target) if target <= runs["error_q"].max() else float("nan")
-            for runs in (fine[fine["solver"] == solver] for solver in (NEWMARK, QUARTER, IRK_LINE))
+            tables.time_for(runs_, target) if target <= runs_["error_q"].max() else np.nan
+            for runs_ in (fine[fine["solver"] == solver] for solver in PAPER)
         )
-        ratios = {"half": half / irk, "quarter": quarter / irk}
-        lines.append({"error": target, **{name: None if np.isnan(x) else x for name, x in ratios.items()}})
-    return lines
+        ratios += [newmark / irk for newmark in (half, quarter)]
+    return [float(ratio) for ratio in ratios if not np.isnan(ratio)]
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, object]:
-    """Write findings, figures and report; the findings."""
+def _compared(first: pd.DataFrame) -> pd.DataFrame:
+    return first[first["group"].isin(("comparison", *FAMILIES))]
+
+
+def _at_least_fine(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["err_in"].isna() | (rows["err_in"] == ERR_IN)]
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
+    """Write findings, figure and report; the findings."""
     rows = tables.medians(rows)
     findings = findings_of(rows)
     output.save_findings(findings)
-    problems = list(dict.fromkeys(rows["problem"]))
-    header = ["err_in \\ err_out", *(power(e) for e in TOLERANCES)]
-    compared = {problem: rows[(rows["problem"] == problem) & (rows["group"] != "partition")] for problem in problems}
-    ready = {}
-    for group, name in (("Table 3: IRK", "irk"), ("Table 3: Newmark", "newmark")):
-        first = compared[problems[0]]
-        ready[f"{name}_time"] = table(header, grid(first, group, _time))
-    ready["counts"] = table(["err_out", *header[1:]], counts(compared[problems[0]]))
-    work = ["solver", "called from", *(power(target) for target in TARGETS)]
-    for problem, name in zip(problems, ("first", "second"), strict=True):
-        listed = [solver for solver in dict.fromkeys(compared[problem]["solver"]) if solver != IRK]
-        ready[name] = table(work, tables.work_precision(compared[problem], TARGETS, listed))
-        drawn = [solver for solver in DRAWN if solver in set(compared[problem]["solver"])]
-        seconds = f"{number(findings['t_end'])} s"
-        shown = compared[problem]
-        shown = shown[shown["err_in"].isna() | (shown["err_in"] == TOLERANCES[-1])]
-        suffix = "" if name == "first" else "_second"
-        figures.save(figures.work_precision(shown, drawn, f"{problem}, {seconds}"), output, f"table3{suffix}")
-    failed = tables.failures(rows)
-    ready["failed"] = table(["solver", "setting", "status", "message"], failed) if failed else ""
-    more = {"stamp": line, "quick": output.call.quick, "first": problems[0], "second": problems[1]}
-    output.write("table3.md", render("table3", findings, ready, **more))
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    compared = _compared(first)
+    seconds = f"{number(findings['t_end'])} s"
+    plot = figures.work_precision(_at_least_fine(compared), DRAWN, f"{first['problem'].iloc[0]}, {seconds}")
+    figures.save(plot, output, "table3")
+    header = ["solver", "called from", *(power(target) for target in TARGETS)]
+    ready = {"work": table(header, tables.work_precision(compared, TARGETS, LISTED))}
+    for name, group in (("irk", "Table 3: IRK"), ("newmark", "Table 3: Newmark")):
+        ready[name] = grid(first, group)
+        print(f"\n{group}, CPU time in s over {seconds} / the paper's, × its ratio to ours\n{ready[name]}")
+    ready["counts"] = counts(first)
+    problems = dict(zip(("first", "second"), dict.fromkeys(rows["problem"]), strict=True))
+    output.write("table3.md", render("table3", findings, ready, stamp=line, quick=output.call.quick, **problems))
     return findings
-
-
-def show(rows: pd.DataFrame) -> None:
-    """Print the table to the terminal."""
-    first = tables.medians(rows[rows["problem"] == rows["problem"].iloc[0]])
-    paper = " / the paper's, × its ratio to ours" if first["t_end"].iloc[0] == PAPER_END else ""
-    console = Console()
-    for group in FAMILIES:
-        shown = Table(title=f"{group}: CPU time (s) over {first['t_end'].iloc[0]:g} s{paper}")
-        for name in ("err_in \\ err_out", *(power(e) for e in TOLERANCES)):
-            shown.add_column(name, justify="right")
-        for line in grid(first, group, _time):
-            shown.add_row(*line)
-        console.print(shown)
-
-
-def _work(words: Sequence[str] | None) -> None:
-    call: Call = cli.parse("table3", __doc__, words)
-    with Output(call) as output:
-        if call.redraw:
-            rows, line = output.load_rows()
-        else:
-            rows, line = make(output, call.quick), cli.stamp(call.command)
-            output.save_rows(rows, line)
-        report(output, rows, line)
-        write_index(output)
-    show(rows)
-    print(f"wrote table3.md, .csv, .json and figures to {output.path}")
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
-    cli.main(_work, words)
+    study.run_rows("table3", __doc__, words, make, report)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from studies.bench import NOTHING_RUN
-from studies.render import number
+from studies.render import number, power
+
+SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
@@ -73,6 +76,24 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     return pd.DataFrame(lines).sort_values("cpu_s", ignore_index=True) if lines else pd.DataFrame()
 
 
+def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
+    """The first line of a ranking as a finding; None where there is none."""
+    if ranked.empty:
+        return None
+    keys = ("solver", "cpu_s", "n_evaluations", "called_from", "violation_q", "energy")
+    found = {key: ranked.iloc[0][key] for key in keys}
+    kept, family = ranked.iloc[0][["keeps_constraints", "family"]]
+    return found | {"keeps": bool(kept), "ours": bool(family == "two-loop")}
+
+
+def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
+    """The cheapest of ours and of others in a ranking."""
+    if ranked.empty:
+        return {"ours": None, "others": None}
+    own = ranked["family"] == "two-loop"
+    return {"ours": best(ranked[own]), "others": best(ranked[~own])}
+
+
 def why_not(rows: pd.DataFrame) -> str:
     """What a table shows for a solver that did not reach an error: its smallest error, or why there is none."""
     reached = rows[rows["error_q"].notna()]
@@ -103,18 +124,32 @@ def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequen
 
 
 def with_quartiles(middle: float, low: float, high: float) -> str:
-    """Seconds, the quartiles in brackets where they differ from the median at the digits shown."""
+    """Seconds, the quartiles in brackets where they are more than `SPREAD` of the median apart."""
     texts = [number(value) for value in (low, middle, high)]
-    return texts[1] if len(set(texts)) == 1 else f"{texts[1]} ({texts[0]}–{texts[2]})"
+    near = high - low <= SPREAD * middle or len(set(texts)) == 1
+    return texts[1] if near else f"{texts[1]} ({texts[0]}–{texts[2]})"
+
+
+def setting(row: pd.Series) -> str:
+    """Name and value of the setting that varies."""
+    return next(f"{name} {number(row[name])}" for name in ("h", "err_out", "tol") if pd.notna(row.get(name)))
 
 
 def failures(rows: pd.DataFrame) -> list[list[str]]:
-    """Lines of a table of runs that did not reach the end: solver, setting, status, message."""
+    """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message."""
     lines = []
     for _, row in rows[rows["status"] != "REACHED_END"].iterrows():
-        what = [f"{key} {number(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
+        what = [f"{key} {power(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
         setting = "all" if row["status"] in NOTHING_RUN else ", ".join(what)
-        line = [row["solver"], setting, str(row["status"]).lower().replace("_", " "), str(row["message"])]
-        if line not in lines:
-            lines.append(line)
+        status, message = str(row["status"]).lower().replace("_", " "), str(row["message"]).split(". ")[0]
+        if [row["solver"], setting, status, message] not in lines:
+            lines.append([row["solver"], setting, status, message])
     return lines
+
+
+def unfinished(rows: pd.DataFrame) -> list[str]:
+    """ "solver (setting, setting)" of the runs that did not reach the end, for a sentence; the CSV has the messages."""
+    settings: dict[str, list[str]] = {}
+    for solver, setting, *_ in failures(rows):
+        settings.setdefault(solver, []).append(setting)
+    return [f"{solver} ({', '.join(dict.fromkeys(each))})" for solver, each in settings.items()]

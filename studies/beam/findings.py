@@ -6,31 +6,17 @@ import numpy as np
 import pandas as pd
 
 from studies import tables
-from studies.beam.growth import MESH, PARAMETERS, PARTING, START, TOLERANCE
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI
-from studies.beam.runs import (
-    DIFFERENCES,
-    EXPLICIT,
-    EXUDYN,
-    NEWTON,
-    NEWTON_4,
-    NEWTON_5,
-    NEWTON_GAUSS,
-    PAPER,
-    PAPER_TOL,
-    by_tip,
-)
+from studies.beam.runs import DIFFERENCES, EXPLICIT, EXUDYN, PAPER, by_tip
+from studies.beam.sensitivity import MESH, PARAMETERS, START
 from studies.cases.beam import SOFT, STIFF
 from studies.cli import StudyError
 from studies.render import number
-from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
+from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
 
 TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
 PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
 PAPER_STEPS = {SOFT: 1e-3, STIFF: 1e-5}  # s, its step sizes by order of magnitude
-EXPLICIT_SOLVERS = (OWN_EXPLICIT, EXPLICIT)
-NEWTONS = (NEWTON, NEWTON_4, NEWTON_5, NEWTON_GAUSS)
-STIFF_E = 2e8  # N/m^2
 STEPS_OVER = 10.0  # h w_max from which a step does not follow the fastest vibration: more than one and a half periods
 
 
@@ -38,23 +24,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """All findings; `rows` are medians."""
     runs = by_tip(rows)
     w_max = {case: float(part["straight"].iloc[0]) for case, part in _of(rows, "along").groupby("case")}
-    found: dict[str, Any] = {
-        "targets": list(TARGETS),
-        "parting": PARTING,
-        "t_end": float(runs["t_end"].iloc[0]),
-        "cases": [_case(rows, runs[runs["case"] == case], case, w_max[case]) for case in (SOFT, STIFF)],
-    }
-    soft, stiff = (case["paper"] for case in found["cases"])
-    growth = {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "cpu_s")}
-    found |= growth | {
-        "growth_paper": PAPER_SECONDS[STIFF] / PAPER_SECONDS[SOFT],
-        "growth_w_max": w_max[STIFF] / w_max[SOFT],
-    }
-    found["growth_as_frequency"] = bool(0.5 < growth["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
+    cases = [_case(rows, runs[runs["case"] == case], case, w_max[case]) for case in (SOFT, STIFF)]
+    found: dict[str, Any] = {"targets": list(TARGETS), "t_end": float(runs["t_end"].iloc[0]), "cases": cases}
+    soft, stiff = (case["paper"] for case in cases)
+    found |= {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "cpu_s", "printed_s")}
+    found["growth_w_max"] = w_max[STIFF] / w_max[SOFT]
+    found["growth_as_frequency"] = bool(0.5 < found["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
     own = runs[(runs["solver"] == EXUDYN) & runs["error_tip"].notna()]
     found["exudyn"] = [number(1e3 * float(floor)) for floor in own.groupby("case", sort=False)["floor"].first()]
-    found["n_failed"], found["n_runs"] = int((runs["status"] != "REACHED_END").sum()), len(runs)
-    return found | _limits(rows) | _growth(rows)
+    return found | _limits(rows)
 
 
 def _of(rows: pd.DataFrame, group: str, **equal: Any) -> pd.DataFrame:
@@ -68,50 +46,47 @@ def _of(rows: pd.DataFrame, group: str, **equal: Any) -> pd.DataFrame:
 
 def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> dict[str, Any]:
     paper = _of(runs, "run", solver=PAPER, tol=PAPER_TOL).iloc[0]
-    attempts = float(paper["n_steps"] + paper["n_rejected"])
-    ours: dict[str, Any] = {
-        key: float(paper[key]) for key in ("n_steps", "n_evaluations", "cpu_s", "h_median", "h_max")
-    }
-    ours |= {"error": paper["error_tip"], "status": paper["status"], "floor": float(paper["floor"])}
-    ours |= {"x_median": float(paper["h_median"]) * w_max, "x_max": float(paper["h_max"]) * w_max}
-    ours |= {"given_up": float(paper["n_rejected_convergence"]) / attempts, "printed_s": PAPER_SECONDS[name]}
-    ours["steps_as_printed"] = bool(10**-0.5 < ours["h_median"] / PAPER_STEPS[name] < 10**0.5)
+    ours: dict[str, Any] = {key: float(paper[key]) for key in ("n_steps", "n_evaluations", "cpu_s", "h_median")}
+    ours |= {"error": paper["error_tip"], "floor": float(paper["floor"]), "printed_s": PAPER_SECONDS[name]}
+    ours["given_up"] = float(paper["n_rejected_convergence"] / (paper["n_steps"] + paper["n_rejected"]))
     ours["printed_h"] = PAPER_STEPS[name]
+    ours["steps_as_printed"] = bool(10**-0.5 < ours["h_median"] / PAPER_STEPS[name] < 10**0.5)
     found: dict[str, Any] = {"name": name, "w_max": w_max, "t_end": float(paper["t_end"]), "paper": ours}
     found["figure"] = f"beam_{name.replace(' ', '_')}.png"
-    found["at"] = [at(runs[runs["solver"] != EXUDYN], error) for error in TARGETS]
+    found["failed"] = tables.unfinished(runs)
+    ranked = runs[runs["solver"] != EXUDYN]
+    found["at"] = [at(ranked, error) for error in TARGETS]
     largest = runs[runs["error_tip"].notna()].groupby("solver")[["error_tip", "floor"]].max()
-    found["unresolved"] = sorted(str(name) for name in largest.index[largest["error_tip"] <= largest["floor"]])
-    found |= _longest_step(runs[runs["solver"] != EXUDYN], w_max)
+    found["unresolved"] = sorted(str(solver) for solver in largest.index[largest["error_tip"] <= largest["floor"]])
+    found |= _longest_step(ranked, w_max)
     best = [None if line["best"] is None else line["best"]["solver"] for line in found["at"]]
     found["one_best"] = best[0] is not None and len(set(best)) == 1
     known = [line for line in found["at"] if line["newmark_over_paper"] is not None]
     found["newmark_cheaper"] = [line["error"] for line in known if line["newmark_over_paper"] < 1.0]
     found["newmark_dearer"] = [line["error"] for line in known if line["newmark_over_paper"] >= 1.0]
-    return found | _sensitivity(rows, name)
+    changes = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
+    parameter, mesh, start = float(changes[list(PARAMETERS)].max()), float(changes[MESH]), float(changes[START])
+    found |= {"changes": changes.to_dict(), "mesh_change": mesh, "mesh_more": mesh > parameter}
+    return found | {"start_more": start > parameter, "below_mesh": [error for error in TARGETS if error < mesh]}
 
 
 def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
-    """Who is cheapest at one error on one beam: of all, of ours, of others, of IDA, among implicit methods."""
+    """Who is cheapest at one error on one beam: of all, of ours, of others, among implicit methods; and the paper's."""
     ranked = tables.ranking(runs, error)
-    kinds = ("best", "ours", "others", "implicit", "newton", "ida")
-    numbers = ("paper_s", "paper_over_best", "newmark_over_paper", "ida_default_s", "ida_best_s", "differences_s")
-    found: dict[str, Any] = {"error": error, **dict.fromkeys((*kinds, *numbers, "ida_over_ours"))}
-    if ranked.empty:
-        return found
-    own, implicit = ranked["family"] == "two-loop", ~ranked["solver"].isin(EXPLICIT_SOLVERS)
-    found |= {"best": _first(ranked), "ours": _first(ranked[own]), "others": _first(ranked[~own])}
-    found |= {"implicit": _first(ranked[implicit]), "newton": _first(ranked[ranked["solver"].isin(NEWTONS)])}
-    found["ida"] = _first(ranked[ranked["solver"].isin((IDA_C, IDA_C_ORDER_2))])
-    seconds = dict(zip(ranked["solver"], ranked["cpu_s"], strict=True))
-    found |= {"ida_default_s": seconds.get(IDA_C), "ida_best_s": seconds.get(IDA_C_ORDER_2)}
-    found |= {"differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
-    if found["ida"] is not None and found["ours"] is not None:
-        found["ida_over_ours"] = found["ida"]["cpu_s"] / found["ours"]["cpu_s"]
+    seconds = dict(zip(ranked["solver"], ranked["cpu_s"], strict=True)) if len(ranked) else {}
+    implicit = ranked if ranked.empty else ranked[~ranked["solver"].isin((OWN_EXPLICIT, EXPLICIT))]
+    found: dict[str, Any] = {"error": error, "best": tables.best(ranked), "implicit": tables.best(implicit)}
+    found |= {**tables.of_both(ranked), "differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
+    found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
+    ida, newmark = (
+        min((seconds[name] for name in names if name in seconds), default=None)
+        for names in ((IDA_C, IDA_C_ORDER_2), (NEWMARK, QUARTER))
+    )
+    if ida is not None and found["ours"] is not None:
+        found["ida_over_ours"] = ida / found["ours"]["cpu_s"]
     if PAPER in seconds:
-        found["paper_over_best"] = seconds[PAPER] / float(ranked["cpu_s"].iloc[0])
-        newmark = [seconds[name] for name in (NEWMARK, QUARTER) if name in seconds]
-        found["newmark_over_paper"] = min(newmark) / seconds[PAPER] if newmark else None
+        found["paper_over_best"] = seconds[PAPER] / min(seconds.values())
+        found["newmark_over_paper"] = None if newmark is None else newmark / seconds[PAPER]
     return found
 
 
@@ -125,79 +100,30 @@ def _longest_step(runs: pd.DataFrame, w_max: float) -> dict[str, Any]:
     return {"longest": {"solver": run["solver"], "x": x}, "steps_over": x > STEPS_OVER}
 
 
-def _first(ranked: pd.DataFrame) -> dict[str, Any] | None:
-    if ranked.empty:
-        return None
-    line = ranked.iloc[0]
-    family = "ours" if line["family"] == "two-loop" else str(line["family"])
-    explicit = bool(line["solver"] in EXPLICIT_SOLVERS)
-    keys = ("cpu_s", "n_evaluations")
-    return {"solver": line["solver"], "family": family, "explicit": explicit, **{key: float(line[key]) for key in keys}}
-
-
-def _sensitivity(rows: pd.DataFrame, name: str) -> dict[str, Any]:
-    found = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
-    parameter = float(found[list(PARAMETERS)].max())
-    return {
-        "changes": found.to_dict(),
-        "parameter_change": parameter,
-        "mesh_change": float(found[MESH]),
-        "start_change": float(found[START]),
-        "tolerance_change": float(found[TOLERANCE]),
-        "mesh_more": bool(found[MESH] > parameter),
-        "start_more": bool(found[START] > parameter),
-        "below_mesh": [error for error in TARGETS if error < found[MESH]],
-    }
-
-
 def _limits(rows: pd.DataFrame) -> dict[str, Any]:
     """The limits of fixed-point iteration, and what accepted steps have to do with them."""
-    limits = _of(rows, "limit").set_index("solver")
-    found: dict[str, Any] = {
-        "jacobi": float(limits["theory"][JACOBI]),
-        "gauss_seidel": float(limits["theory"][GAUSS_SEIDEL]),
-    }
-    found |= {"free": float(limits["free"][GAUSS_SEIDEL]), "linearised": float(limits["measured"][GAUSS_SEIDEL])}
-    found["gauss_seidel_shorter"] = found["gauss_seidel"] < found["jacobi"]
-    tests = _of(rows, "growth test")
-    reached = tests["measured"].to_numpy(float)
-    found |= {"test_tols": [float(tests["tol"].max()), float(tests["tol"].min())]}
-    found |= {"test_limits": [float(reached.max()), float(reached.min())]}
-    found["test_no_limit"] = bool(reached.min() < 0.5 * reached.max())
+    theory = _of(rows, "limit").set_index("solver")["theory"].astype(float)
+    tests = _of(rows, "growth test").set_index("tol")["measured"].astype(float).sort_index(ascending=False)
+    found: dict[str, Any] = {"jacobi": theory[JACOBI], "gauss_seidel": theory[GAUSS_SEIDEL]}
+    found["gauss_seidel_shorter"] = bool(theory[GAUSS_SEIDEL] < theory[JACOBI])
+    found |= {"test_tols": tests.index.tolist(), "test_limits": tests.tolist()}
+    found["test_no_limit"] = bool(tests.min() < 0.5 * tests.max())
     found["along"] = []
     for case in (SOFT, STIFF):
         part = _of(rows, "along", case=case)
         limit = part["measured"].to_numpy(float)
-        ratio = part["w_max"].to_numpy(float) / part["straight"].to_numpy(float)
         paper = _of(rows, "run", case=case, solver=PAPER, tol=PAPER_TOL).iloc[0]
-        accepted = float(paper["h_median"] * part["straight"].iloc[0])
         low, middle, high = (float(x) for x in np.percentile(limit[1:], (25, 50, 75)))
-        line = {"case": case, "start": float(limit[0]), "low": low, "median": middle, "high": high, "n": len(limit) - 1}
-        line |= {"w_low": float(ratio.min()), "w_high": float(ratio.max()), "accepted": accepted}
-        line["explains"] = bool(accepted <= middle and found["linearised"] < middle)
+        line: dict[str, Any] = {
+            "case": case,
+            "start": float(limit[0]),
+            "low": low,
+            "median": middle,
+            "high": high,
+            "n": len(limit) - 1,
+        }
+        line["accepted"] = float(paper["h_median"] * part["straight"].iloc[0])
+        line["explains"] = bool(max(line["accepted"], tests.median()) <= middle)
         found["along"].append(line)
     found["reconciled"] = found["test_no_limit"] and all(line["explains"] for line in found["along"])
-    return found
-
-
-def _growth(rows: pd.DataFrame) -> dict[str, Any]:
-    """From few elements to many, and from a soft beam to a stiff one."""
-    elements = _of(rows, "elements").assign(each=lambda part: part["cpu_s"] / part["n_steps"])
-    found: dict[str, Any] = {"elements": [int(elements["n_elements"].min()), int(elements["n_elements"].max())]}
-    for kind in ("banded", "dense"):
-        each = elements[elements["solver"] == kind].sort_values("n_elements")["each"].to_numpy(float)
-        found[f"{kind}_growth"] = float(each[-1] / each[0])
-    most = elements[elements["n_elements"] == found["elements"][1]].set_index("solver")["each"]
-    found["dense_over_banded"] = float(most["dense"] / most["banded"])
-    modulus = _of(rows, "modulus")
-    stiffest = float(modulus["modulus"].max())
-    newton = modulus[modulus["solver"] == NEWTON]
-    counts = [
-        tables.time_for(newton[newton["modulus"] == E], TARGETS[-1], "n_evaluations") for E in (STIFF_E, stiffest)
-    ]
-    paper = modulus[modulus["solver"] == PAPER].set_index("modulus")
-    each = paper["n_evaluations"] / paper["t_end"]
-    found |= {"modulus": [STIFF_E, stiffest], "newton_stiffness_growth": counts[1] / counts[0]}
-    found["paper_stiffness_growth"] = float(each[stiffest] / each[STIFF_E])
-    found["newton_flat"] = bool(found["newton_stiffness_growth"] < 2.0)
     return found

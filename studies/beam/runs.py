@@ -11,59 +11,60 @@ import pandas as pd
 from studies.bench import Array, Case, Run, Solver
 from studies.cases import beam
 from studies.cases.beam import SOFT, STIFF
-from studies.metrics import ASTRAY
-from studies.solvers import CATALOGUE, IDA_C, IDA_C_ORDER_2, IRK, NEWMARK, OWN_EXPLICIT, QUARTER
+from studies.metrics import ASTRAY, deviation
+from studies.solvers import (
+    CATALOGUE,
+    IDA_C,
+    IDA_C_ORDER_2,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    NEWTON_4,
+    OWN_EXPLICIT,
+    PAPER_TOL,
+    QUARTER,
+)
 from twoloop import ConstrainedSystem, Result, RungeKutta, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.ancf_beam import tip_height
-from twoloop.plan import Method
-from twoloop.tableaux import gauss, radau_iia
+from twoloop.tableaux import radau_iia
 
 PAPER = IRK
-NEWTON, NEWTON_4, NEWTON_5 = "RadauIIA5", "RadauIIA7, Newton", "RadauIIA9, Newton"
-DIFFERENCES, NEWTON_GAUSS = "RadauIIA7, Newton, by differences", "Gauss6, Newton"
-FIXED_POINT = ("Gauss6", "BDF", "Newmark")
+NEWTON, NEWTON_5, DIFFERENCES = "RadauIIA5", "RadauIIA9, Newton", "RadauIIA7, Newton, by differences"
 EXPLICIT = "DOP853, projected"  # SciPy's
 EXUDYN = "Exudyn, GeneralizedAlpha, its own cable"
-IDA = "IDA, stabilised"
-PAPER_TOL = 1e-5  # Atol = Rtol of the paper, in Sect. 4.1
+OURS = ("SunRadau5", "Gauss6", "BDF", OWN_EXPLICIT)
+INDEX_1, PEERS = ("Radau, index 1", "BDF, index 1"), ("Radau, solve_dae", "BDF, solve_dae")
+OTHERS = (IDA_C, IDA_C_ORDER_2, "IDA, stabilised", EXPLICIT, *INDEX_1, *PEERS)
 
-TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-TIGHTEST = 1e-6  # of two-loop methods and SciPy's, whose errors then are far below all that is asked
-LOOSE = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4)  # of runs with Newton's method, repeated three times
-PAPER_TOLERANCES = (1e-1, 1e-3, PAPER_TOL, 1e-7)  # its error is that of rounding from the loosest on
-ERR_OUT = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 3e-10)  # of PaperNewmark
-NEWMARK_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # its steps shrink with the cube root
-SLOW_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)  # of SciPy's implicit solvers
-PEER_TOLERANCES = (1e-2, 1e-4)  # of the package solve_dae, all Python
-PEERS = ("Radau, solve_dae", "Radau9, solve_dae", "BDF, solve_dae")
+TIGHTEST = 1e-6  # of all but IDA, whose errors then are far below all that is asked
+OWN_VALUES = {  # of those that do not take the tolerances of the case
+    PAPER: (1e-1, PAPER_TOL),  # its error is that of rounding from the loosest on
+    **dict.fromkeys((NEWMARK, QUARTER), (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)),
+    **dict.fromkeys(INDEX_1, (1e-1, 1e-2, 1e-3)),  # a tenth of a second a run and more
+    **dict.fromkeys(PEERS, (1e-2, 1e-4)),  # all Python
+}
 EXUDYN_STEPS = (1000, 2000, 5000, 10_000, 20_000, 50_000)
 EXUDYN_FINE = (100_000, 200_000)  # of the motion against which Exudyn is judged: its own
 INSTANTS = 1000
-ONCE = (PAPER, NEWMARK, QUARTER, NEWTON_GAUSS, "SunRadau5", "Gauss6", "Newmark")  # seconds a run on the stiff beam
 QUICK = (PAPER, NEWTON, NEWTON_4, "BDF", "Gauss6", OWN_EXPLICIT)  # IDA takes seconds to compile
 QUICK_TOLERANCES = (1e-1, 1e-3)
 
 
-def with_less_known(problem: Problem, tangent: bool = False) -> ConstrainedSystem:
-    """The same system without the bandwidth of its matrices and, unless `tangent`, the tangent of its force."""
+def without_tangent(problem: Problem) -> ConstrainedSystem:
+    """The same system without the tangent of its force and the bandwidth of its matrices."""
     system = problem.system
     f = system.functions._asdict()
-    for name in ("p", "flags", "force_by_v", "reaction_by_q", *(() if tangent else ("force_by_q",))):
+    for name in ("p", "flags", "force_by_q", "force_by_v", "reaction_by_q"):
         f.pop(name)
     sizes = {"n_q": system.n_q, "n_c": system.n_c, "parameters": system.parameters}
     return ConstrainedSystem(**sizes, **f, constant_mass=True, name=problem.name)  # type: ignore[arg-type]
 
 
-def _two_loop(method: str | Method, case: Case, tol: float, repeat: int) -> Result:
-    problem, span = case.problem, (0.0, case.t_end)
-    return solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
-
-
-def _by_differences(case: Case, tol: float, repeat: int) -> Result:
-    problem, method = case.problem, RungeKutta(radau_iia(4), "newton")
-    system, span = with_less_known(problem), (0.0, case.t_end)
-    return solve_dae(system, span, problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
+def _newton(stages: int, tangent: bool, case: Case, tol: float, repeat: int) -> Result:
+    problem, method = case.problem, RungeKutta(radau_iia(stages), "newton")
+    system = problem.system if tangent else without_tangent(problem)
+    return solve_dae(system, (0.0, case.t_end), problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
 
 
 def _exudyn(case: Case, step: float, repeat: int) -> Result:
@@ -75,26 +76,13 @@ def _exudyn(case: Case, step: float, repeat: int) -> Result:
 
 def solvers() -> dict[str, Solver]:
     """The line-up by name: the catalogue's, and those that only this study has."""
-    made: list[Solver] = [replace(CATALOGUE["PaperIRK, Atol = Rtol varied"], name=PAPER)]
-    made += [CATALOGUE[name] for name in (NEWMARK, QUARTER)]
-    own = {NEWTON_4: RungeKutta(radau_iia(4), "newton"), NEWTON_5: RungeKutta(radau_iia(5), "newton")}
-    own[NEWTON_GAUSS] = RungeKutta(gauss(3), "newton")
-    runs = {name: partial(_two_loop, method) for name, method in own.items()} | {DIFFERENCES: _by_differences}
-    made.append(CATALOGUE[NEWTON])
-    made += [Solver(name, "two-loop", "compiled", True, "tol", run) for name, run in runs.items()]
-    made += [CATALOGUE[name] for name in ("SunRadau5", *FIXED_POINT, OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2, IDA)]
-    made += [CATALOGUE[name] for name in (EXPLICIT, "Radau, index 1", "BDF, index 1", *PEERS)]
+    made: list[Solver] = [replace(CATALOGUE[IRK_LINE], name=PAPER)]
+    made += [CATALOGUE[name] for name in (NEWMARK, QUARTER, NEWTON, NEWTON_4)]
+    for name, run in ((NEWTON_5, partial(_newton, 5, True)), (DIFFERENCES, partial(_newton, 4, False))):
+        made.append(Solver(name, "two-loop", "compiled", True, "tol", run))
+    made += [CATALOGUE[name] for name in (*OURS, *OTHERS)]
     made.append(Solver(EXUDYN, "Exudyn", "compiled, base in Python", True, "h", _exudyn))
     return {solver.name: solver for solver in made}
-
-
-def values_of(solver: Solver, case: Case) -> tuple[float, ...]:
-    """Settings of a solver on a beam, loose to tight."""
-    own = {PAPER: PAPER_TOLERANCES, NEWMARK: ERR_OUT, QUARTER: ERR_OUT, "Newmark": NEWMARK_TOLERANCES}
-    own |= dict.fromkeys(("Radau, index 1", "BDF, index 1"), SLOW_TOLERANCES) | dict.fromkeys(PEERS, PEER_TOLERANCES)
-    own[EXUDYN] = tuple(case.t_end / n for n in EXUDYN_STEPS)
-    tolerances = tuple(tol for tol in TOLERANCES if solver.family == "SUNDIALS" or tol >= TIGHTEST)
-    return own.get(solver.name) or tolerances
 
 
 def cases(quick: bool) -> dict[str, Case]:
@@ -104,19 +92,18 @@ def cases(quick: bool) -> dict[str, Case]:
 
 def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
     """The cells: a solver at one setting on one beam."""
-    for name, case in known.items():
-        for solver in solvers().values():
-            if quick and solver.name not in QUICK:
+    for case in known.values():
+        steps = tuple(case.t_end / n for n in EXUDYN_STEPS)
+        for name, solver in solvers().items():
+            if quick and name not in QUICK:
                 continue
-            values = values_of(solver, case)
+            least = 0.0 if solver.family == "SUNDIALS" else TIGHTEST
+            values = steps if name == EXUDYN else tuple(tol for tol in solver.grid(case) if tol >= least)
+            values = OWN_VALUES.get(name, values)
             if quick:
-                values = (PAPER_TOL,) if solver.name == PAPER else QUICK_TOLERANCES
-            long = solver.called_from == "Python" or (name == STIFF and solver.name in ONCE)
-            for value in values:
-                short = (
-                    not quick and not long and (solver.setting == "h" or value in LOOSE or solver.family != "two-loop")
-                )
-                yield Run(case, solver, value, "run", 3 if short else 1)
+                values = (PAPER_TOL,) if name == PAPER else QUICK_TOLERANCES
+            repeats = 1 if quick or solver.called_from == "Python" else 3
+            yield from (Run(case, solver, value, "run", repeats) for value in values)
 
 
 @lru_cache
@@ -130,28 +117,17 @@ def _exudyn_motion(kind: str, t_end: float) -> tuple[Array, float]:
     return np.asarray(fine), float(np.abs(fine - coarse).max())
 
 
-def tip_error(case: Case, result: Result) -> float | None:
-    """Largest error of the tip's height, at the ends of the run's own steps beside the common instants."""
-    if not result.success or result.t.size < 2:
-        return None
-    left = np.clip(np.searchsorted(result.t, case.instants, side="right") - 1, 0, result.t.size - 2)
-    chosen = np.unique(np.concatenate([left, left + 1]))
-    true, _ = case.reference.states(result.t[chosen])
-    return float(np.abs(tip_height(result.q[:, chosen]) - tip_height(true)).max())
-
-
 def measure(run: Run, result: Result) -> dict[str, Any]:
-    """Columns of this study: the tip's error, by which all is ranked, and the steps taken."""
+    """Columns of this study: the error of the tip's height, by which all is ranked, and the steps taken."""
     case, h = run.case, result.h
-    row: dict[str, Any] = {"n_rejected_convergence": result.stats.n_rejected_convergence}
-    row |= {"h_median": float(np.median(h)) if h.size else None, "h_max": float(h.max()) if h.size else None}
-    row["t_reached"] = float(result.t[-1]) if result.t.size else 0.0
+    row: dict[str, Any] = {"n_rejected_convergence": result.stats.n_rejected_convergence, "error_tip": None}
+    row["h_median"] = float(np.median(h)) if h.size else None
     if run.solver.name == EXUDYN:
-        tip, floor = _exudyn_motion(case.name, case.t_end)
-        row["error_tip"] = float(np.abs(tip_height(result.q) - tip).max()) if result.success else None
-        row["floor"] = floor
-    else:
-        row["error_tip"] = tip_error(case, result)
+        tip, row["floor"] = _exudyn_motion(case.name, case.t_end)
+    if result.success:
+        own = run.solver.name == EXUDYN
+        off = tip_height(result.q) - tip if own else tip_height(deviation(result, case.reference, case.instants)[0])
+        row["error_tip"] = float(np.abs(off).max())
     span = float(np.ptp(tip_height(case.reference.states(case.instants)[0])))
     row["astray"] = row["error_tip"] is None or row["error_tip"] > ASTRAY * span
     return row

@@ -38,9 +38,6 @@ def _known(problem: Problem, t_end: float) -> ReferenceMotion:
         if not result.success:
             raise StudyError(f"no reference for {problem.name}: {result.message}")
     motion = Quintic(first.t, first.q, first.v, first.a)
-    coarse = Quintic(first.t[::2], first.q[:, ::2], first.v[:, ::2], first.a[:, ::2])
-    skipped = first.t[1::2][: first.t[::2].size - 1]
-    between = np.abs(coarse(skipped)[0] - motion(skipped)[0]).max() / 2**6  # a quintic's error falls with h^6
     differ = np.abs(motion(other.t)[0] - other.q).max()
     times = np.linspace(0.0, t_end, 101)[1:]
     apart = np.abs(motion(times)[0] - reduced_motion(problem, times, CHECK)[0]).max()
@@ -48,7 +45,7 @@ def _known(problem: Problem, t_end: float) -> ReferenceMotion:
         f"DOP853 (two-loop) at {TIGHT:.0e}, from which Gauss12 differs by {differ:.1e} and SciPy's DOP853 on the "
         f"equations without constraints by {apart:.1e}"
     )
-    return ReferenceMotion(motion, float(max(differ, apart, between, 1e-13)), source)
+    return ReferenceMotion(motion, float(max(differ, apart, motion.uncertainty(), 1e-13)), source)
 
 
 def case(kind: str, name: str, quick: bool) -> Case:

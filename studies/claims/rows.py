@@ -1,6 +1,7 @@
 """The rows of the other studies, as the judges read them; all that depends on how a study writes them stands here."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam")
 DEFAULT = four_bar().name
 LONG = 100.0  # s, the length of the paper's runs
 BEAM_END = 2.0  # s, of a full run of the beams
-IRK_GROUP, NEWMARK_GROUP = "Table 3: IRK", "Table 3: Newmark"
 
 
 class NotRun(Exception):
@@ -48,27 +48,18 @@ def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
     if {"repeat", "error_q", "cpu_s"} <= set(table):
         repeated = table[table["repeat"].notna()]
         table = pd.concat([tables.medians(repeated), table[table["repeat"].isna()]], ignore_index=True)
-    for column in ("lost", "astray"):
-        if column in table:  # no value: the run gave no result
-            table[column] = table[column].map(lambda x: str(x) not in ("False", "0", "0.0"))
-    if "floor" not in table:
-        table["floor"] = 0.0
-    return table.assign(floor=table["floor"].fillna(0.0))
+    for column in {"lost", "astray"} & set(table):  # no value: the run gave no result
+        table[column] = table[column].map(lambda x: str(x) not in ("False", "0", "0.0"))
+    floor = table["floor"].fillna(0.0) if "floor" in table else 0.0
+    return table.assign(floor=floor)
 
 
+@dataclass(frozen=True)
 class Rows:
-    """What judges read.
+    """What judges read: one row a run of each study, and the numbers of `experiments.py`."""
 
-    Parameters
-    ----------
-    tables : mapping
-        Study to one row a run.
-    experiments : mapping
-        Numbers of the small computations in `experiments.py`.
-    """
-
-    def __init__(self, tables: Mapping[str, pd.DataFrame], experiments: Mapping[str, float]):
-        self.tables, self.experiments = tables, experiments
+    tables: Mapping[str, pd.DataFrame]
+    experiments: Mapping[str, float]
 
     def number(self, key: str) -> float:
         """A number of `experiments.py`."""
@@ -76,69 +67,34 @@ class Rows:
             raise NotRun(f"the experiment {key} was not made")
         return float(self.experiments[key])
 
-    def pick(self, study: str, **equal: Any) -> pd.DataFrame:
-        """The rows in which each column named has that value, or one of a tuple of values."""
+    def pick(self, study: str, least: float = 0.0, named: str = "", **equal: Any) -> pd.DataFrame:
+        """Rows in which each column named has that value, or one of a tuple of values.
+
+        Of solvers whose name contains `named`; not run if none covers `least` seconds.
+        """
         if study not in self.tables:
             raise NotRun(f"there is no {study}.csv")
         found = self.tables[study]
+        found = found[found["solver"].astype(str).str.contains(named, regex=False)]
         for column, value in equal.items():
-            if column not in found:
-                raise NotRun(f"{study}.csv has no column {column}")
             found = found[found[column].isin(value if isinstance(value, tuple) else (value,))]
         if found.empty:
-            raise NotRun(f"{study}.csv has no row with {', '.join(f'{c} = {v}' for c, v in equal.items())}")
+            raise NotRun(f"{study}.csv has no row of {named} with {', '.join(f'{c} = {v}' for c, v in equal.items())}")
+        if least and not found["t_end"].max() >= least:
+            raise NotRun(f"quick rows: they cover {found['t_end'].max():g} s, and the claim is about {least:g} s")
         return found
 
-    @staticmethod
-    def first(runs: pd.DataFrame, what: str) -> pd.Series:
-        """The first of some rows."""
-        if runs.empty:
-            raise NotRun(f"there is no row of {what}")
-        return runs.iloc[0]
-
-    def long(self, study: str, **equal: Any) -> pd.DataFrame:
+    def long(self, study: str, named: str = "", **equal: Any) -> pd.DataFrame:
         """The rows, if they are of runs as long as the paper's."""
-        return _as_long(self.pick(study, **equal), LONG)
+        return self.pick(study, LONG, named, **equal)
 
     def cell(self, group: str, err_in: float, err_out: float, problem: str = DEFAULT) -> pd.Series:
         """A cell of Table 3."""
         return self.long("table3", group=group, problem=problem, err_in=err_in, err_out=err_out).iloc[0]
 
-    def cells(self, group: str, **equal: Any) -> pd.DataFrame:
-        """Cells of Table 3."""
-        return self.long("table3", group=group, **equal)
-
-    def beam(self, case: str, words: str, **equal: Any) -> pd.DataFrame:
-        """Full runs of a beam by the solvers whose name contains the words."""
-        runs = self.pick("beam", **equal)
-        runs = runs[runs["group"] == "run"] if "run" in set(runs["group"]) else runs
-        runs = runs[(runs["case"].astype(str).str.contains(case)) & runs["cpu_s"].notna()]
-        runs = runs[runs["solver"].astype(str).str.contains(words, regex=False)]
-        self.first(runs, f"the {case} beam by {words}")
-        return _as_long(runs, BEAM_END)
-
-    def sensitivity(self, case: str) -> pd.DataFrame:
-        """The beam with E or g changed by 0.1 %."""
-        runs = self.pick("beam", group="sensitivity")
-        runs = runs[runs["case"].astype(str).str.contains(case)]
-        runs = runs[runs["solver"].astype(str).str.contains("0.1 %", regex=False)]
-        self.first(runs, "the beams with E or g changed by 0.1 %")
-        return runs
-
-
-def _as_long(runs: pd.DataFrame, least: float) -> pd.DataFrame:
-    longest = float(runs["t_end"].max())
-    if not longest >= least:
-        raise NotRun(f"quick rows: they cover {longest:g} s, and the claim is about {least:g} s")
-    return runs
-
-
-def cost(runs: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
-    """Cost `what` for an error of at most `target`."""
-    found = tables.time_for(runs, target, what)
-    if np.isnan(found):
-        raise NotRun(f"{runs['solver'].iloc[0]} has no run with an error of {target:g}")
-    return found
+    def beam(self, case: str, named: str, **equal: Any) -> pd.DataFrame:
+        """Full runs of a beam."""
+        return self.pick("beam", BEAM_END, named, case=case, group="run", **equal)
 
 
 def common_costs(one: pd.DataFrame, other: pd.DataFrame, targets: tuple[float, ...], what: str) -> list[float]:

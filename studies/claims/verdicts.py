@@ -23,36 +23,25 @@ class Verdict(StrEnum):
     FAILS = "does not hold"
     CONSISTENT = "consistent"
     CIRCULAR = "holds by construction"
-    UNCHECKED = "cannot be checked"
     NOT_RUN = "not run"
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a judge found.
-
-    Attributes
-    ----------
-    verdict : Verdict
-    values : dict
-        The numbers that decide, the first of them most; a list holds a least and a largest.
-    why : str
-        Of a claim that is not judged.
-    """
+    """A verdict, the numbers that decide (a list holds a least and a largest), and why a claim was not judged."""
 
     verdict: Verdict
     values: Mapping[str, Any] = field(default_factory=dict)
     why: str = ""
 
 
-Judge = Callable[..., Judgement]  # judge(rows, **options)
-
-
-def grade(holds: Any, in_part: Any = False) -> Verdict:
-    """The verdict of a criterion that is met, met in some of the cases of which the claim speaks, or not met."""
-    if bool(holds):
-        return Verdict.HOLDS
-    return Verdict.PART if bool(in_part) else Verdict.FAILS
+def decide(met: Iterable[Any], in_part: Any = None, **values: Any) -> Judgement:
+    """The verdict of conditions: all met, or some of the cases of which the claim speaks, or none."""
+    conditions = [bool(each) for each in met]
+    if all(conditions):
+        return Judgement(Verdict.HOLDS, values)
+    part = any(conditions) if in_part is None else in_part
+    return Judgement(Verdict.PART if part else Verdict.FAILS, values)
 
 
 def span(values: Iterable[Any]) -> list[float]:
@@ -77,16 +66,15 @@ class Claim:
     stand_in: str = ""
     assumed: bool = False
 
-    def judgement(self, judges: Mapping[str, Judge], rows: Rows) -> Judgement:
-        """What the claim's judge makes of the rows; not run where there is nothing to judge by."""
+    def judgement(self, judge: Callable[..., Judgement], rows: Rows) -> Judgement:
+        """What the judge makes of the rows; not run where there is nothing to judge by."""
         try:
-            found = judges[self.judge](rows, **self.options)
+            found = judge(rows, **self.options)
         except NotRun as reason:
             return Judgement(Verdict.NOT_RUN, why=str(reason))
         except KeyError as column:
             return Judgement(Verdict.NOT_RUN, why=f"the rows lack {column}")
-        numbers = [x for value in found.values.values() for x in (value if isinstance(value, list) else [value])]
-        if not np.isfinite(np.asarray(numbers, dtype=float)).all():
+        if not np.isfinite(np.hstack(list(found.values.values()))).all():
             return Judgement(Verdict.NOT_RUN, why="the rows lack a value that decides")
         if found.verdict is Verdict.HOLDS and self.circular:
             return replace(found, verdict=Verdict.CIRCULAR)
@@ -96,9 +84,8 @@ class Claim:
 
     def text(self, found: Judgement) -> str:
         """The numbers of a judgement in the words of `claims.toml`."""
-        if not found.values:
-            return "–"
-        return self.number.format(**{name: _text(value) for name, value in found.values.items()})
+        texts = {name: _text(value) for name, value in found.values.items()}
+        return self.number.format(**texts) if texts else "–"
 
 
 def _text(value: Any) -> str:
@@ -108,6 +95,6 @@ def _text(value: Any) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def load(path: Path = FILE) -> list[Claim]:
+def load() -> list[Claim]:
     """The claims in the order of the paper."""
-    return [Claim(key, **entry) for key, entry in tomllib.loads(path.read_text()).items()]
+    return [Claim(key, **entry) for key, entry in tomllib.loads(FILE.read_text()).items()]

@@ -108,8 +108,20 @@ def test_a_run_past_its_limit_is_a_row(kept):
             pass
         return ours(case, value, repeat)
 
-    got = row(kept, run, case(time_limit=0.05))
-    assert got["status"] == "TIME_LIMIT" and "0.05 s" in got["message"]
+    with kept:  # not repeated, unlike one that ends in time
+        rows = collect([Run(case(time_limit=0.05), solver(run), 1e-6, repeats=3)], kept)
+    assert rows["status"].tolist() == ["TIME_LIMIT"] and "0.05 s" in rows["message"][0]
+
+
+def test_the_warm_up_may_take_longer_than_a_run(kept):
+    limits = []
+
+    def run(case, value, repeat):
+        limits.append(case.time_limit)
+        return ours(case, value, repeat)
+
+    assert row(kept, run, case(time_limit=7.0))["status"] == "REACHED_END"
+    assert limits == [bench.COMPILING, 7.0]  # the first call compiles
 
 
 def test_a_failed_run_keeps_what_it_had(kept):
@@ -187,7 +199,7 @@ def test_a_made_reference_says_how_far_it_holds():
     states = made.states(t)
     assert worst(states[0], q) < 10.0 * made.floor < 1e-10
     assert worst(states[1], v) < 1e-9
-    assert made.digits >= 10 and "Gauss16" in made.source and "DOP853" in made.source
+    assert "Gauss16" in made.source and "DOP853" in made.source
 
 
 def test_a_published_state_checks_the_reference():

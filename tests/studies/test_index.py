@@ -73,8 +73,8 @@ def at_error(error=1e-4, **changed):
 def case(**changed):
     """A case as `work_precision` finds it."""
     found = {"name": "crane", "tags": ["smooth"], "t_end": 1.0, "floor": 1e-9, "at": [at_error()]}
-    found |= {"figure": "crane.png", "default_dominated": True, "default_over": [2.0, 3.0], "default_by": ["ours"]}
-    return found | {"default_by_others": [], "astray": [], "drift": None, "note": ""} | changed
+    found |= {"figure": "crane.png", "default_dominated": True, "default_over": [2.0, 3.0], "astray": []}
+    return found | changed
 
 
 def long_run(name, cpu_s, calm=True):
@@ -114,31 +114,49 @@ def screen(tmp_path, cases=(), dominated=(), **others):
     return index.first_screen(tmp_path, False)
 
 
+WORSE = {"solver": "slow", "by": "ours", "factor": 3.0, "n": 6, "called_from": "Python"}
+WORSE |= {"case": "crane", "error": 1e-4, "cpu_s": 0.6, "by_s": 0.2, "evaluations": 1.5}
+
+
 def test_the_first_screen_turns_with_the_findings(tmp_path):
-    worse = {"solver": "slow", "by": "ours", "factor": 3.0, "n": 6, "called_from": "Python"}
-    worse |= {"case": "crane", "error": 1e-4, "cpu_s": 0.6, "by_s": 0.2, "evaluations": 1.5}
-    text = screen(tmp_path, [case()], [worse])
-    assert (
-        "| smooth, rigid: crane, 1.0 s | 1e-4 | ours: `ours` | 0.10 |" in text
-        and "other: `theirs` (drifts off)" in text
-    )
-    assert "for 1e-4 take `ours` (the cheapest of others takes 2.0 times as long). IDA takes 3.0 times" in text
-    assert "takes 1.0 µs from compiled code and 20 µs from Python" in text
-    assert "so that evaluations should be compared, too" in text
-    assert "| `slow` | Python | `ours` | 6 | × 3.0 | 1e-4, crane | 0.60 | 0.20 | × 1.5 |" in text
-    assert "takes at most 0.50 of their time. Of those called from Python" in text
-    assert "Of those called from Python" not in screen(tmp_path, [case()], [worse | {"called_from": "compiled"}])
+    text = screen(tmp_path, [case()])
+    assert "| smooth, rigid: crane, 1.0 s | 1e-4 | `ours`; `theirs` (Python, drifts off) | 0.10; 0.20 |" in text
+    assert "(crane): `ours` for 1e-4 (0.10 s; the cheapest of others takes 2.0 times as long). IDA takes 3.0" in text
+    assert "20 and 1.0 µs an evaluation: compare the evaluations, too" in text
+    near = THEIRS | {"n_evaluations": 4e5}
+    assert "compare the evaluations" not in screen(tmp_path, [case(at=[at_error(others=near)])])
+
     faster = at_error(others=THEIRS | {"cpu_s": 0.05}, ida=None)
     text = screen(tmp_path, [case(at=[faster])])
-    assert "takes 1.0 µs from compiled code and 5.0 µs from Python" in text
-    near = THEIRS | {"n_evaluations": 4e5}
-    assert "should be compared, too" not in screen(tmp_path, [case(at=[at_error(others=near)])])
-    text = screen(tmp_path, [case(at=[faster])])
-    assert "take `theirs`, which is not ours and drifts off the constraints (our cheapest takes 2.0 times" in text
-    assert "IDA does not reach 1e-4" in text and "is dominated everywhere" in text
+    assert "5.0 and 1.0 µs an evaluation" in text and "IDA does not reach 1e-4" in text
+    assert "`theirs` for 1e-4 (0.050 s; not ours and drifting off the constraints; our cheapest takes 2.0" in text
+    text = screen(tmp_path, [case(at=[faster | {"ours": None}])])
+    assert "none of ours reaches it" in text and "| none reaches it; `theirs`" in text and "| none; 0.050 |" in text
+    text = screen(tmp_path, [case(at=[at_error(others=None), at_error(error=1e-2)])])
+    assert "for 1e-4 and 1e-2 (0.10 s; the cheapest of others takes 2.0 times as long, where one reaches it)" in text
+    assert "no other reaches it" in screen(tmp_path, [case(at=[at_error(others=None)])])
     text = screen(tmp_path, [case(at=[{"error": 1e-4, **NOTHING}], default_dominated=False, default_over=[])])
-    assert "reaches none of these errors" in text and "none reaches it" in text
+    assert "`SunRadau5`, reaches none of these errors on crane." in text
     assert "no solver compared reaches any of these errors" in text
+
+
+def test_mechanisms_of_a_class_with_the_same_picks_are_told_together(tmp_path):
+    other = case(name="hoist", at=[at_error(ours=BEST | {"cpu_s": 0.05}, ida=None)])
+    text = screen(tmp_path, [case(), other])
+    assert "(crane; hoist): `ours` for 1e-4 (0.050 to 0.10 s; the cheapest of others takes 2.0 to 4.0 times" in text
+    assert "IDA does not reach 1e-4 on hoist" in text
+    text = screen(tmp_path, [case(), case(name="hoist", at=[at_error(ours=BEST | {"solver": "mine"})])])
+    assert "(crane): `ours`" in text and "(hoist): `mine`" in text
+
+
+def test_solvers_beaten_everywhere_are_listed_with_their_row(tmp_path):
+    text = screen(tmp_path, [case()], [WORSE])
+    assert "| `slow` (Python) | `ours` | 1e-4, crane | 0.60 against 0.20 | × 1.5 |" in text
+    assert "takes at most 0.50 of their time" in text and "worst eight" not in text
+    many = [WORSE | {"solver": f"slow {k}", "factor": 3.0 + k, "called_from": "compiled"} for k in range(10)]
+    text = screen(tmp_path, [case()], many)
+    assert "the worst eight of 10" in text and "`slow 9` |" in text and "`slow 1`" not in text
+    assert "No solver compared is dominated everywhere" in screen(tmp_path, [case()])
 
 
 def test_picks_are_joined_where_the_solver_is_the_same():
@@ -153,14 +171,12 @@ def test_picks_are_joined_where_the_solver_is_the_same():
     assert index.picks([{"accuracy": "1e-2", "ours": None, "others": None}]) == []
 
 
-def test_the_default_is_named_where_it_is_dominated_and_by_which(tmp_path):
-    text = screen(tmp_path, [case(default_by=["Gauss12", "DOP853"], default_by_others=["LSODA"])])
-    assert "**Not the default** on crane: `SunRadau5` is never the cheapest of ours and takes 2.0 to 3.0 times" in text
-    assert "every error that it reaches: `Gauss12` and `DOP853`, and of other solvers `LSODA`." in text
-    text = screen(tmp_path, [case(default_by=[])])
-    assert "No one of ours is cheaper at every error" in text
-    text = screen(tmp_path, [case(default_dominated=False, default_over=[1.0, 2.0])])
-    assert "is the cheapest of ours at one of these errors" in text and "Not the default" not in text
+def test_the_default_is_named_where_it_is_dominated(tmp_path):
+    best = case(name="hoist", default_dominated=False, default_over=[1.0, 2.0])
+    text = screen(tmp_path, [case(), best])
+    assert "`SunRadau5`, is never the cheapest of ours on crane (× 2.0 to 3.0); is the cheapest of ours at one" in text
+    assert "of these errors at least on hoist (elsewhere up to × 2.0)." in text
+    assert "never" not in screen(tmp_path, [best])
 
 
 def test_classes_come_in_their_order_and_the_long_one_from_the_energy(tmp_path):
@@ -169,39 +185,41 @@ def test_classes_come_in_their_order_and_the_long_one_from_the_energy(tmp_path):
     text = screen(tmp_path, [other, stiff, case()], energy=energy())
     places = [text.index(f"| {label}: ") for label in ("smooth, rigid", "stiff, vibrations wanted", "odd", index.LONG)]
     assert places == sorted(places) and "not conserved" in text
-    assert "for 0.020 J take `LSODA`, which is not ours" in text and "2e-3 (drifts)" in text
+    assert "`LSODA` for 0.020 J (1.0 s; not ours; our cheapest takes 2.0 times as long)." in text
+    assert "Without drift: `Gauss(3)` for 0.020 J (2.0 s)." in text and "2e-3 (drifts)" in text
     assert "not told" in text and "1 of the 1 solvers" in text
     calm = energy()
     calm["long"]["alternatives"] = [long_run("Gauss(3)", 2.0)]
     calm["long"]["at"][0]["drift"]["others"] = None
     text = screen(tmp_path, [case()], energy=calm)
-    assert (
-        "for 0.020 J take `Gauss(3)`" in text
-        and "2e-3 (no drift)" in text
-        and "none of the solvers in the table" in text
-    )
+    assert "`Gauss(3)` for 0.020 J" in text and "none of the solvers in the table" in text
+    assert "2e-3 (no drift)" in text
 
 
-def test_runs_out_of_phase_are_listed_with_their_row(tmp_path):
+def test_runs_out_of_phase_are_told_by_mechanism(tmp_path):
     run = {"solver": "loose", "setting": "tol", "value": 1e-3, "error_q": 0.5, "cpu_s": 0.1}
-    assert "| `loose` | crane | tol = 1e-3 | 0.50 | 0.10 |" in screen(tmp_path, [case(astray=[run])])
+    finer = run | {"solver": "looser", "value": 1e-5}
+    step = run | {"solver": "stepping", "setting": "h", "value": 1e-9}
+    text = screen(tmp_path, [case(astray=[run, finer, step])])
+    assert "(work_precision.csv)): 3 solvers on crane, `looser` down to tol = 1e-5 (error 0.50)." in text
+    assert "1 solver on crane, `stepping` down to h = 1e-9" in screen(tmp_path, [case(astray=[step])])
     assert "Out of phase" not in screen(tmp_path, [case()]) and "is out of phase" in screen(tmp_path, [case()])
-    found = {"one_constant": True, "newmark_astray": ["1e-3"], "irk_astray": [], "newmark_over_irk": []}
+    found = {"one_constant": True, "newmark_astray": ["1e-3"], "irk_astray": []}
     text = screen(tmp_path, [case()], table3=found)
-    assert "on the linkage: `PaperNewmark` with err_out = 1e-3 ([Table 3]" in text
+    assert "(table3.md)): `PaperNewmark` with err_out = 1e-3." in text
     text = screen(tmp_path, [case()], table3=found | {"irk_astray": ["1e-3"]})
-    assert "err_out = 1e-3, `PaperIRK` with err_out = 1e-3 (" in text
+    assert "err_out = 1e-3, `PaperIRK` with err_out = 1e-3." in text
     assert "in phase with all settings" in screen(tmp_path, [case()], table3=found | {"newmark_astray": []})
 
 
-def test_what_the_paper_promised_turns_with_the_findings(tmp_path):
-    found = {"newmark_dearer_everywhere": True, "newmark_over_irk": [2.0, 6.0], "one_constant": False}
-    found |= {"irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0], "newmark_astray": [], "irk_astray": []}
+def test_the_times_of_table_3_turn_with_the_findings(tmp_path):
+    found = {"one_constant": False, "newmark_astray": [], "irk_astray": []}
+    found |= {"irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0]}
     text = screen(tmp_path, [case()], table3=found)
-    assert "holds on the linkage at every error compared, by 2.0 to 6.0 times" in text
     assert "not reproduced up to one factor: the paper's over ours is 8.0 to 15 for Runge" in text
-    text = screen(tmp_path, [case()], table3=found | {"newmark_dearer_everywhere": False, "one_constant": True})
-    assert "does not hold at every error" in text and "Table 3 are reproduced up to one factor" in text
+    assert "Table 3 are reproduced up to one factor" in screen(
+        tmp_path, [case()], table3=found | {"one_constant": True}
+    )
 
 
 def claims(verdict):
@@ -226,7 +244,7 @@ def test_each_promise_has_its_opposite(tmp_path):
         assert says in screen(tmp_path, violation=kept | change).split("Constraints are kept")[1].splitlines()[0]
 
     assert "does not hold; in the paper's variables" in screen(tmp_path, energy=energy())
-    assert "and on momenta it does not drift" in screen(tmp_path, energy=energy())
+    assert "on momenta it does not." in screen(tmp_path, energy=energy())
     assert "over long times*: holds" in screen(tmp_path, energy=energy(sun=long_run("Sun", 1.0)))
     lost = long_run("Sun", 1.0) | {"calm": False, "verdict": "lost"}
     assert "with fixed steps is lost" in screen(tmp_path, energy=energy(sun=lost))
@@ -236,7 +254,6 @@ def test_each_promise_has_its_opposite(tmp_path):
     assert "does not reach 0.10 mm" in screen(tmp_path, beam=beam(0.02, None))
 
     steps = {"holds": True, "longer": True, "irk": {"share_time": 0.99}, "long": 0.02, "ratios": [170.0, 270.0]}
-    steps |= {"evaluations_ratio": [10.0, 20.0]}
     assert "Large steps*: holds; steps longer than 0.02 s cover all but 1.0 % of the time" in screen(
         tmp_path, step_size=steps
     )
@@ -261,8 +278,7 @@ def test_the_readme_changes_between_its_marks_only(tmp_path):
     index.put_in_readme(tmp_path, readme)
     text = readme.read_text()
     assert text.startswith("above\n") and text.endswith("\nbelow\n") and "earlier" not in text
-    assert "| smooth, rigid: crane | 1e-4 | `ours` 0.10 s | `theirs` 0.20 s |" in text
-    assert "for 1e-4 take `ours`" in text and "Not the default" in text
+    assert "`ours` for 1e-4 (0.10 s;" in text and "**The default**, `SunRadau5`, is never the cheapest" in text
     assert "Long and conservative problems: not run yet" in text
     with pytest.raises(StudyError, match="there is no work_precision"):
         index.put_in_readme(tmp_path / "nowhere", readme)

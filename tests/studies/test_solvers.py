@@ -5,7 +5,8 @@ import pytest
 
 from references.four_bar_minimal import trajectory
 from studies.bench import Case
-from studies.solvers import CATALOGUE, IRK, LINE_UP, TOLERANCES, baumgarte, gear
+from studies.metrics import violations
+from studies.solvers import CATALOGUE, EXUDYN, IRK, LINE_UP, TOLERANCES, baumgarte, gear
 from twoloop.mechanisms import four_bar
 
 T_END = 0.2
@@ -33,6 +34,15 @@ def test_every_solver_runs_at_one_setting(name):
     assert result.success and result.t[-1] == pytest.approx(T_END)
     bound = 0.02 if ", order 1" in name else 1e-3  # implicit Euler
     assert np.abs(result.q - trajectory(problem.parameters, result.t)[0]).max() < bound
+
+
+@pytest.mark.parametrize("name", [f"Exudyn, {solver}" for solver in EXUDYN])
+def test_a_solver_in_coarse_steps_keeps_the_constraints_if_its_flag_says_so(name):
+    pytest.importorskip("exudyn")
+    problem = four_bar()
+    result = CATALOGUE[name].run(Case("four-bar", problem, 1.0), 0.02, 0)
+    largest = violations(problem.system, result)[1]["q"].max()
+    assert result.success and (largest < 1e-9) == CATALOGUE[name].keeps_constraints
 
 
 def test_a_solver_carries_what_its_rows_need():

@@ -101,8 +101,8 @@ class Step:
         return q, v
 
     def iterate(self) -> tuple[float, float]:
-        """One iteration, stage after stage; the change by (32), as it should read, and the norm of (33)."""
-        q_old, v_old = self.q1, self.v1
+        """One iteration, stage after stage; the change of all coordinates by (32), corrected, and the norm of (33)."""
+        old = np.concatenate([self.q1, self.v1])
         A, b, c = self.tableau.A, self.tableau.b, self.tableau.c
         for j in range(self.tableau.stages):
             q, v = self._moved(A[j])
@@ -110,13 +110,8 @@ class Step:
             self.A_stage[j], _ = kkt(self.system, self.t + c[j] * self.h, q, v)
             self.V_stage[j] = v
         self.q1, self.v1 = self.dependents(self.t + self.h, *self._moved(b))
-        i = self.independent
-        change = max(
-            np.max(np.abs(new[i] - old[i]) / np.maximum(np.abs(new[i]), 1.0))
-            for new, old in ((self.q1, q_old), (self.v1, v_old))
-        )
-        norm = np.sqrt(np.sum((self.q1 - q_old) ** 2) + np.sum((self.v1 - v_old) ** 2))
-        return float(change), float(norm)
+        new = np.concatenate([self.q1, self.v1])
+        return float(np.max(np.abs(new - old) / np.maximum(np.abs(new), 1.0))), float(np.linalg.norm(new - old))
 
     def _moved(self, weights: Array) -> tuple[Array, Array]:
         """y_n + h sum(weights K) for the independents; the others stay at the beginning of the step."""
@@ -125,18 +120,35 @@ class Step:
         v[i] += self.h * weights @ self.A_stage[:, i]
         return q, v
 
-    def converge(self, tolerance: float) -> tuple[int | None, bool]:
-        """Iterate until (32) holds; after how many iterations (None: never), and whether (33) was violated before."""
-        before, refused = np.inf, False
+    def converge(self, tolerance: float) -> int | None:
+        """Iterate until (32) holds, which takes so many iterations; None: it does not, whatever (33) says."""
         for n in range(1, MAX_ITERATIONS + 1):
             try:
-                change, norm = self.iterate()
+                change, size = self.iterate()
             except np.linalg.LinAlgError:
-                return None, True
-            if not norm < HOPELESS:
-                return None, True
+                return None
             if change <= tolerance:
-                return n, refused
-            refused |= norm > before
-            before = norm
-        return None, refused
+                return n
+            if not size < HOPELESS:
+                return None
+        return None
+
+
+def advance(
+    system: ConstrainedSystem, tableau: Tableau, t: float, h: float, q: Array, v: Array, n: int, tolerance: float
+) -> tuple[Array, int]:
+    """State [q, v] after n steps that cover h together, and how many iterations they took.
+
+    Raises
+    ------
+    RuntimeError
+        If a step does not converge.
+    """
+    count = 0
+    for k in range(n):
+        step = Step(system, tableau, t + k * h / n, h / n, q, v)
+        needed = step.converge(tolerance)
+        if needed is None:
+            raise RuntimeError(f"a step of {h / n:g} s at {t:g} s does not converge")
+        q, v, count = step.q1, step.v1, count + needed
+    return np.concatenate([q, v]), count

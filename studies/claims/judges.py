@@ -1,0 +1,316 @@
+"""The judges: functions from rows to a verdict and the numbers that decide, named in claims.toml, in its order."""
+
+import numpy as np
+import pandas as pd
+
+from studies.claims.rows import DEFAULT, LONG, NotRun, Rows, common_costs
+from studies.claims.verdicts import Judgement, decide, span
+from studies.metrics import ASTRAY
+from studies.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, PAPER_TOL, QUARTER, gear
+from studies.table3_causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells
+from studies.tables import time_for
+
+IRK_GROUP, NEWMARK_GROUP, GSTIFF_GROUP = "Table 3: IRK", "Table 3: Newmark", "GSTIFF stand-in"
+COARSEST, FINEST = TOLERANCES[0], TOLERANCES[-1]
+BEAMS = ("very flexible", "moderately stiff")
+
+GROWTH = 10.0  # of the violation from the first tenth of a run to its last: it drifts
+SATISFIED = 1e-12  # violation that counts as rounding
+GROWS, TIMES = 0.25, 2.0  # a violation grows if it goes as t^p with a greater p and ends above TIMES its beginning
+DEARER = 1.2  # times the cost: beyond the noise of times
+FACTOR = 2.0  # within which an estimate, or a limit, counts as the same
+NEEDLESS = 0.1  # share of steps given up, or of work, that counts as little
+STIFFER = 10.0  # times w_max of the very flexible beam, whose modulus is a hundredth
+RESOLVED = 3.0  # standard errors from which a slope counts as a drift
+EPS = float(np.finfo(float).eps)
+AGREE = 1e-10  # m or rad
+PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it
+VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
+STEP = 0.02  # s
+MAIN = 2.0  # times a logarithm must exceed another for its tolerance to be the one that governs
+CHANGE = 1.1  # times the steps: a tolerance affects them
+PRINTED_RATIO = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]  # 50.93 s over 3.60 s
+SECONDS = (56.27, 6278.54)  # s of the beams, printed
+HALF_A_DECADE = 10.0**0.5
+FOLLOWS = 1e-3  # m, of the tip over the run
+A_LOT = 5.0  # times; the frequencies grow by 10
+TIP = 1e-4  # m, tip error at which methods are compared on the beams
+TIPS = (1e-2, 1e-3, 1e-4)  # m or rad, errors over the run at which costs are compared: tip, or the linkage
+TARGETS = (1e-1, *TIPS)
+ERRORS = (0.3, 0.1, 0.03, 0.01)  # the same for Newmark's method on the linkage, which reaches no less
+
+
+def low_index_on_index_3(rows: Rows) -> Judgement:
+    runs = rows.long("motion", group=GSTIFF_GROUP)
+    runs = runs[~runs["solver"].str.contains("ramp")]
+    good = runs[(runs["status"] == "REACHED_END") & ~runs["astray"]]
+    least = 0.0 if good.empty else float(good["error_y3"].min())
+    return decide([good.empty], good=len(good), runs=len(runs), least=least)
+
+
+def index_1_drifts(rows: Rows) -> Judgement:
+    runs = rows.long("table3", solver=("DOP853, index 1", "LSODA, index 1", "IDA, index1"), problem=DEFAULT)
+    growth = runs["violation_late"] / runs["violation_early"]
+    return decide(growth > GROWTH, growth=span(growth))
+
+
+def baumgarte_inexact(rows: Rows) -> Judgement:
+    size = rows.long("violation", "Baumgarte", group=("line-up", "tolerances"))["violation_q"].astype(float)
+    off = size > SATISFIED
+    return decide(off, violation=span(size), off=int(off.sum()), runs=len(off))
+
+
+def projection_exact(rows: Rows) -> Judgement:
+    solvers = {"projected": "DOP853, projected", "multipliers": "IDA, stabilised"}
+    worst = {key: float(rows.long("table3", solver=name)["violation_q"].max()) for key, name in solvers.items()}
+    return decide((each < SATISFIED for each in worst.values()), **worst)
+
+
+def projection_inefficient(rows: Rows) -> Judgement:
+    ratios: list[float] = []
+    for names in (("IDA, stabilised", "IDA, index1"), ("DOP853, projected", "DOP853, index 1")):
+        with_it, without = (rows.long("table3", solver=name, problem=DEFAULT) for name in names)
+        for what in ("n_evaluations", "cpu_s"):
+            ratios += common_costs(with_it, without, TARGETS, what)
+    return decide((ratio > DEARER for ratio in ratios), ratio=span(ratios))
+
+
+def jacobian_difficult(rows: Rows) -> Judgement:
+    soft, stiff = ([time_for(rows.beam(case, name), TIP) for name in ("differences", IRK)] for case in BEAMS)
+    values = {"stiff": stiff[0], "stiff_paper": stiff[1], "soft": soft[0], "soft_paper": soft[1]}
+    return decide((newton > paper for newton, paper in (soft, stiff)), **values)
+
+
+def constraints_kept(rows: Rows) -> Judgement:
+    run = rows.long("violation", solver=IRK, group="line-up").iloc[0]
+    worst = max(float(run[f"violation_{level}"]) for level in "qva")
+    grows = run["growth_q"] > GROWS and run["late_q"] > TIMES * run["early_q"]
+    loosest = float(rows.long("table3", group=IRK_GROUP, problem=DEFAULT)["violation_q"].max())
+    return decide([worst < SATISFIED and not grows], levels=worst, loosest=loosest)
+
+
+def stiff_applicable(rows: Rows) -> Judgement:
+    limit = rows.pick("beam", named="latest stages", group="limit").iloc[0]
+    steps = [float(_paper_on(rows, case)["h_median"]) for case in BEAMS]
+    h_omega = [steps[0] * limit["w_max"], steps[1] * limit["w_max"] * STIFFER]
+    limited = max(h_omega) < limit["theory"] and max(h_omega) < FACTOR * min(h_omega)  # h goes as 1 / w_max
+    return decide([not limited], h_omega=span(h_omega), limit=float(limit["theory"]))
+
+
+def symplectic_stable(rows: Rows) -> Judgement:
+    runs = rows.pick("energy", 10.0 * LONG, solver=("Sun Radau IIB(3)", IRK), partition="lasting")
+    runs = runs[runs["t_end"] == runs["t_end"].max()]
+    rounding = EPS * runs["kinetic"] * runs["n_steps"] / runs["t_end"]
+    steady = runs["slope"].abs() <= np.maximum(RESOLVED * runs["slope_error"], rounding)
+    drifts = (runs["status"] != "REACHED_END") | ~steady
+    own, canonical = runs["variables"] == "velocities", (runs["variables"] == "momenta") & runs["h"].notna()
+    change = float((runs["slope"].abs() * runs["t_end"])[own].max())
+    steady_on_momenta, t_end = int((~drifts[canonical]).sum()), float(runs["t_end"].max())
+    values = {"drifting": int(drifts[own].sum()), "runs": int(own.sum()), "change": change, "t_end": t_end}
+    return decide([not drifts[own].any()], steady_on_momenta=steady_on_momenta, **values)
+
+
+def euler_predictor(rows: Rows) -> Judgement:
+    euler, continued = rows.number("iterations from Euler"), rows.number("iterations from the step before")
+    return decide([continued > (1.0 - NEEDLESS) * euler], euler=euler, continued=continued)
+
+
+def richardson_cheap(rows: Rows) -> Judgement:
+    share = rows.number("share of the step for the estimate")
+    return decide([share < NEEDLESS], share=100.0 * share)
+
+
+def difference_is_the_error(rows: Rows) -> Judgement:
+    ratio = rows.number("estimate over error")
+    return decide([1.0 / FACTOR < ratio < FACTOR], ratio=ratio)
+
+
+def limit_reset_34(rows: Rows) -> Judgement:
+    runs = pd.concat([rows.beam(case, IRK) for case in BEAMS])
+    share = 100.0 * runs["n_rejected_convergence"] / (runs["n_steps"] + runs["n_rejected"])
+    return decide(share < 100.0 * NEEDLESS, share=span(share))
+
+
+def agree_and_reach(rows: Rows) -> Judgement:
+    runs = rows.long("motion", solver=(IRK, NEWMARK), group="line-up")
+    met = (runs["error_y3_short"] < VISIBLE).all() & (runs["top"] < PASSES) & (runs["top_late"] > -PASSES)
+    late, top, short = 1e3 * runs["top_late"].min(), 1e3 * runs["top"].max(), runs["error_y3_short"].max()
+    return decide(met, short=short, late=late, top=top)
+
+
+def gstiff(rows: Rows, part: str) -> Judgement:
+    """The statements on Gstiff, of orders for which all are true: its order is not told."""
+    met: dict[str, set[int]] = {"short": set(), "long": set()}
+    for order in GEAR_ORDERS:
+        runs = rows.long("motion", group=GSTIFF_GROUP, solver=gear(order)).set_index("h")
+        coarse, fine = runs.loc[STEP], runs.loc[STEP / 2]
+        # written so that a failed run is off, too
+        if not coarse["error_y3_short"] <= VISIBLE and fine["error_y3_short"] <= VISIBLE:
+            met["short"].add(order)
+        if not fine["error_y3"] <= ASTRAY * fine["range_y3"]:
+            met["long"].add(order)
+    together = len(met["short"] & met["long"])
+    return decide([together], orders=len(met[part]), of=len(GEAR_ORDERS), together=together)
+
+
+def stand_in_as_foil(rows: Rows) -> Judgement:
+    ours = rows.long("table3", solver=IRK_LINE, problem=DEFAULT)
+    theirs = rows.long("motion", group=GSTIFF_GROUP, solver=gear(5))
+    ratios = common_costs(theirs, ours, TIPS, "cpu_s")
+    return decide((ratio > 1.0 for ratio in ratios), ratio=span(ratios))
+
+
+def large_steps(rows: Rows) -> Judgement:
+    runs = rows.long("step_size", solver=(IRK, NEWMARK, QUARTER), group="paper").groupby("solver").first()
+    share, ratios = float(runs["share_time"][IRK]), runs["h_median"][IRK] / runs["h_median"].drop(IRK)
+    return decide([share > 0.5, (ratios > 1.0).all()], share=100.0 * share, ratio=span(ratios))
+
+
+def tolerances_and_steps(rows: Rows) -> Judgement:
+    changes = {}
+    for name, group in (("irk", IRK_GROUP), ("newmark", NEWMARK_GROUP)):
+        finest = float(rows.cell(group, FINEST, FINEST)["n_steps"])
+        changes[f"{name}_in"] = finest / rows.cell(group, COARSEST, FINEST)["n_steps"]
+        changes[f"{name}_out"] = finest / rows.cell(group, FINEST, COARSEST)["n_steps"]
+    affected = [max(change, 1.0 / change) > CHANGE for change in changes.values()]
+    return decide(affected, affected=int(sum(affected)), **changes)
+
+
+def _influence(rows: Rows, group: str, coarsest: float) -> tuple[float, ...]:
+    """Mean factors in time from `coarsest` to 1e-9: of err_in at every err_out from there on, and the reverse."""
+    out = [e for e in TOLERANCES if e <= coarsest]
+    by_in = [rows.cell(group, FINEST, e)["cpu_s"] / rows.cell(group, coarsest, e)["cpu_s"] for e in out]
+    by_out = [rows.cell(group, e, FINEST)["cpu_s"] / rows.cell(group, e, coarsest)["cpu_s"] for e in out]
+    return tuple(float(np.exp(np.log(np.asarray(each, dtype=float)).mean())) for each in (by_in, by_out))
+
+
+def newmark_tolerances(rows: Rows) -> Judgement:
+    by_in, by_out = _influence(rows, NEWMARK_GROUP, 1e-5)
+    return decide([np.log(by_out) > MAIN * abs(np.log(by_in))], by_out=by_out, by_in=by_in)
+
+
+def irk_tolerances(rows: Rows) -> Judgement:
+    by_in, by_out = _influence(rows, IRK_GROUP, 1e-3)
+    return decide([by_in > max(by_out, 1.0 / by_out)], by_in=by_in, by_out=by_out)
+
+
+def newmark_star(rows: Rows) -> Judgement:
+    runs = rows.long("table3", group=NEWMARK_GROUP, problem=DEFAULT)
+    coarse, fine = runs[runs["err_out"] == COARSEST], runs[runs["err_out"] < COARSEST]
+    values = {"lost": int(coarse["lost"].sum()), "cells": len(coarse), "fine_lost": int(fine["lost"].sum())}
+    values |= {"fine": len(fine), "astray": int(fine["astray"].sum())}
+    return decide([coarse["lost"].all() and not fine["lost"].any()], **values)
+
+
+def irk_star(rows: Rows) -> Judgement:
+    runs = rows.long("table3", group=IRK_GROUP, problem=DEFAULT, err_out=COARSEST)
+    good = ~runs["lost"] & ~runs["astray"] & (runs["y3_max"] < PASSES)
+    values = {"astray": int(runs["astray"].sum()), "cells": len(runs), "error": float(runs["error_q"].max())}
+    return decide([good.all()], top=1e3 * float(runs["y3_max"].max()), **values)
+
+
+def fourteen_times(rows: Rows) -> Judgement:
+    ratios: dict[str, list[float]] = {"cpu_s": [], "n_evaluations": []}
+    for problem in dict.fromkeys(rows.long("table3", group=IRK_GROUP)["problem"]):
+        slow, fast = (rows.cell(group, FINEST, FINEST, problem) for group in (NEWMARK_GROUP, IRK_GROUP))
+        for what, each in ratios.items():
+            each.append(slow[what] / fast[what])
+    times, evaluations = ratios.values()
+    return decide([min(times + evaluations) >= PRINTED_RATIO / FLAT], time=times[0], evaluations=evaluations[0])
+
+
+def table_3_seconds(rows: Rows) -> Judgement:
+    parts = (cells(rows.long("table3", problem=DEFAULT, group=group)) for group in (IRK_GROUP, NEWMARK_GROUP))
+    irk, newmark = (span(part["paper"] / part["cpu_s"]) for part in parts)
+    return decide([max(irk + newmark) <= FLAT * min(irk + newmark)], irk=irk, newmark=newmark)
+
+
+def works_long(rows: Rows) -> Judgement:
+    run = rows.long("motion", solver=IRK, group="line-up").iloc[0]
+    values = {"error": float(run["error_y3"]), "energy": float(abs(run["energy"])), "kinetic": float(run["kinetic"])}
+    return decide([not run["lost"] and not run["astray"]], **values)
+
+
+def _along(rows: Rows, solver: str, problem: str) -> pd.DataFrame:
+    """Runs of the linkage by one solver along its setting, with err_in = 1e-9."""
+    runs = rows.long("table3", solver=solver, problem=problem)
+    return runs[runs["err_in"].isna() | (runs["err_in"] == FINEST)]
+
+
+def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
+    """CPU time of Newmark, both beta, over Runge-Kutta's at equal error: linkage, and both beams."""
+    ratios: dict[str, list[float]] = {"linkage": [], "soft": [], "stiff": []}
+    for name in (NEWMARK, QUARTER):
+        for problem in dict.fromkeys(rows.long("table3")["problem"]):
+            one, other = (_along(rows, solver, problem) for solver in (name, IRK_LINE))
+            ratios["linkage"] += common_costs(one, other, tuple(e for e in ERRORS if e < one["error_q"].max()), "cpu_s")
+        for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
+            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), TIPS, "cpu_s")
+    return ratios
+
+
+def more_efficient(rows: Rows) -> Judgement:
+    ratios = {name: span(each) for name, each in _newmark_over_irk(rows).items()}
+    return decide((low > 1.0 for low, _ in ratios.values()), **ratios)
+
+
+def because_of_order(rows: Rows) -> Judgement:
+    found = {}
+    for name, solver in (("irk", IRK_LINE), ("newmark", NEWMARK)):
+        runs = _along(rows, solver, DEFAULT)
+        runs = runs[~runs["astray"]]
+        if runs["error_q"].nunique() < 2:
+            raise NotRun(f"fewer than two runs of {solver} follow the motion")
+        x, y = np.log(1.0 / runs["error_q"].astype(float)), np.log(runs["n_evaluations"].astype(float))
+        found[name] = float(np.polyfit(x, y, 1)[0])
+    near = (abs(found[name] * order - 1.0) < 0.25 for name, order in (("irk", 5), ("newmark", 2)))
+    won = [min(each) > 1.0 for each in _newmark_over_irk(rows).values()]
+    least = found["irk"] < found["newmark"]
+    return decide([*near, least, *won], least and any(won), won=sum(won), cases=len(won), **found)
+
+
+def implicit_needed(rows: Rows) -> Judgement:
+    names = ("DOP853, projected", "DOP853 (two-loop)", IRK)
+    costs = np.array([[time_for(rows.beam(case, name), TIP, "n_evaluations") for name in names] for case in BEAMS])
+    ratios = costs[:, :2].min(axis=1) / costs[:, 2]
+    return decide(ratios > 1.0, ratio=span(ratios))
+
+
+def _paper_on(rows: Rows, case: str) -> pd.Series:
+    return rows.beam(case, IRK, tol=PAPER_TOL).iloc[0]
+
+
+def step_order(rows: Rows, case: str, order: float) -> Judgement:
+    run = _paper_on(rows, case)
+    met = order / HALF_A_DECADE <= run["h_median"] <= order * HALF_A_DECADE
+    return decide([met], median=float(run["h_median"]), largest=float(run["h_max"]))
+
+
+def beams_work(rows: Rows) -> Judgement:
+    runs = [_paper_on(rows, case) for case in BEAMS]
+    good = (run["status"] == "REACHED_END" and run["error_q"] < FOLLOWS for run in runs)
+    return decide(good, soft=float(runs[0]["error_q"]), stiff=float(runs[1]["error_q"]))
+
+
+def grows_a_lot(rows: Rows) -> Judgement:
+    soft, stiff = (_paper_on(rows, case) for case in BEAMS)
+    time, evaluations = (float(stiff[what] / soft[what]) for what in ("cpu_s", "n_evaluations"))
+    return decide([min(time, evaluations) >= A_LOT], time=time)
+
+
+def beam_seconds(rows: Rows) -> Judgement:
+    over = [seconds / float(_paper_on(rows, case)["cpu_s"]) for seconds, case in zip(SECONDS, BEAMS, strict=True)]
+    return decide([max(over) <= FLAT * min(over)], soft=over[0], stiff=over[1])
+
+
+def values_alone(rows: Rows) -> Judgement:
+    worst, given, differenced = (rows.number(key) for key in ("difference", "calls given", "calls differenced"))
+    met = [worst < AGREE, differenced <= given]
+    return decide(met, met[0], difference=worst, given=given, differenced=differenced)
+
+
+def any_method(rows: Rows) -> Judgement:
+    line_up = rows.pick("motion", solver=IMPLICIT, group="line-up")[["solver", "status"]]
+    others = rows.pick("energy", variables="velocities", partition="lasting")[["solver", "status"]]
+    reached = pd.concat([line_up, others]).groupby("solver")["status"].agg(lambda each: "REACHED_END" in set(each))
+    return decide(reached, reached=int(reached.sum()), methods=len(reached))

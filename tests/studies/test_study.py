@@ -1,0 +1,30 @@
+"""What the studies with series share."""
+
+import pandas as pd
+import pytest
+
+from studies import energy, motion, step_size, violation
+from studies.study import key
+
+
+def rows_of(study, quick):
+    told = [
+        {"group": run.group, "case": run.case.name, "solver": run.solver.name, **run.settings}
+        for run in study.runs(quick)
+    ]
+    return pd.DataFrame(told)
+
+
+@pytest.mark.parametrize("study", [energy.STUDY, motion.STUDY, step_size.STUDY, violation.STUDY], ids=lambda s: s.name)
+def test_every_run_has_curves_of_its_own(study):
+    for quick in (True, False):
+        rows = rows_of(study, quick)
+        keys = [key(row, "curve") for _, row in rows.iterrows()]
+        assert len(set(keys)) == len(keys) > 10
+
+
+def test_a_key_survives_the_file_of_rows(tmp_path):
+    rows = rows_of(energy.STUDY, True)
+    rows.to_csv(tmp_path / "rows.csv", index=False)
+    read = pd.read_csv(tmp_path / "rows.csv")
+    assert [key(row, "t") for _, row in read.iterrows()] == [key(row, "t") for _, row in rows.iterrows()]
