@@ -48,11 +48,12 @@ table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes secon
 reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
 
-# two processes that compile the same kernels at the same time would do everything twice; newton takes so long that
-# automatic finds runge_kutta compiled
+# the inner loop first, which all others need; then two processes, so that none compiles what another compiles
 compile: install ## compile the kernels, on two cores
-	@$(RUN) -c "import twoloop.kernels.newton, twoloop.kernels.automatic" & \
-	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, advance" && wait $$!
+	@$(RUN) -c "import twoloop.kernels.calls"
+	@$(RUN) -c "import twoloop.kernels.newton" & \
+	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, bridge, advance" && wait $$! && \
+	$(RUN) -c "import twoloop.kernels.automatic"
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)

@@ -3,11 +3,13 @@
 from functools import cache
 
 import numpy as np
+from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.kernels.common import FORCE_BY_Q_GIVEN
+from twoloop.kernels.calls import inner_loop
+from twoloop.kernels.common import FORCE_BY_Q_GIVEN, Kit
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -45,7 +47,22 @@ def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
         "gamma": gamma if callable(gamma) else right_side if gamma else None,
         "name": "pendulum",
     }
-    return ConstrainedSystem.from_python(n_q=2, n_c=1, compile=compile, **{**functions, **changed})
+    return ConstrainedSystem.from_python(compile=compile, **{"n_q": 2, "n_c": 1, **functions, **changed})
+
+
+def kit_of(system):
+    """What the steps of the integrator get of a system."""
+    return Kit(system.functions, inner_loop)
+
+
+def called(helper, *arguments):
+    """Call a helper of the kernels, which has no entry from Python, from a compiled function."""
+
+    @njit
+    def call(arguments):
+        return helper(*arguments)
+
+    return call(arguments)
 
 
 def pendulum_state(t, angle=-0.5 * np.pi):

@@ -128,11 +128,15 @@ def test_results_of_callbacks(kind, value, error, words):
         solve(pendulum(**{kind: lambda *arguments: value}))
 
 
-@pytest.mark.parametrize("mass", [np.diag([1.0, -2.0]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.diag([1.0, 0.0])])
+@pytest.mark.parametrize("mass", [np.diag([1.0, -2.0]), np.diag([0.0, -1.0]), np.zeros((2, 2))])
 @pytest.mark.parametrize("constant", [True, False])
 def test_a_mass_that_is_not_positive_definite(mass, constant):
     system = pendulum(mass=mass if constant else lambda t, q: mass)
-    refuses(ValueError, "mass of 'pendulum' must be positive definite; its smallest eigenvalue", system)
+    refuses(
+        ValueError,
+        "mass of 'pendulum' must be positive definite on the velocities .* next to no inertia",
+        system,
+    )
 
 
 def test_a_callback_whose_shape_changes_later_names_the_time():

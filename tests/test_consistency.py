@@ -9,7 +9,7 @@ import pytest
 
 from tests.derivative_cases import UNITS, lever, linkage, slider_crank
 from tests.problems import pendulum, worst
-from twoloop import ConstrainedSystem, consistent_state, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, consistent_state, solve_dae
 from twoloop.consistency import check_start
 from twoloop.mechanisms import four_bar
 
@@ -103,15 +103,15 @@ def test_redundant_rows_name_what_they_depend_on():
         constraint=lambda t, q: rows @ q,
         jacobian=lambda t, q: rows,
     )
-    with pytest.raises(ValueError, match=r"rank 2 < n_c = 3.*row\(s\) \[\d\] depend on the others \(row ") as caught:
+    with pytest.warns(ConstraintWarning, match=r"rank 2 of 3.*row\(s\) \[\d\] depend on the others \(row ") as caught:
         solve_dae(system, (0.0, 1.0), np.zeros(3), np.zeros(3))
     equations = ("row 2 = 2 row 0 - 0.5 row 1", "row 1 = 4 row 0 - 2 row 2", "row 0 = 0.25 row 1 + 0.5 row 2")
-    assert any(equation in str(caught.value) for equation in equations)
+    assert any(equation in str(caught[0].message) for equation in equations)
 
 
 def test_a_start_without_rank_names_its_row():
     flat = np.array([0.5, 0.0, 0.0, 2.0, 0.0, 0.0, 2.5, 0.0, np.pi])
-    with pytest.raises(ValueError, match=r"rank 7 < n_c = 8.*row\(s\) \[7\] depend on the others \(row 7 = "):
+    with pytest.raises(ValueError, match=r"lost rank there \(row\(s\) \[7\] depend on the others \(row 7 = "):
         solve_dae(four_bar((1.0, 2.0, 1.0), 2.0, theta3=2.0).system, (0.0, 1.0), flat, np.zeros(9))
 
 

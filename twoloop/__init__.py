@@ -2,6 +2,7 @@
 
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
+from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state
@@ -16,6 +17,7 @@ __all__ = [
     "DOP853",
     "ConsistentState",
     "ConstrainedSystem",
+    "ConstraintWarning",
     "Newmark",
     "Result",
     "RungeKutta",

@@ -43,27 +43,30 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
     """Run one callback as `check_bounds` does all."""
     if system.called_in_python or kind in system.within_bounds:
         return
-    function, p, out = getattr(system.functions, kind), system.parameters, np.zeros(system.shape_of(kind))
+    function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
     error = _index_error(function, t, state, p, out)
     if error is not None:
         longer = np.concatenate([p, np.ones(MANY)])
         too_short = _index_error(function, t, state, longer, out) is None
+        filled = ", ".join(f"{name} has shape {x.shape}" for (name, _), x in zip(KINDS[kind].outputs, out, strict=True))
         sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
         raise ValueError(
             f"{kind} of {system.name!r} goes out of bounds: {error}{_place(error)}. {', '.join(sizes)}, p has "
-            f"{p.size}, {KINDS[kind].output} has shape {out.shape} (n_q = {system.n_q}, n_c = {system.n_c})"
+            f"{p.size}, {filled} (n_q = {system.n_q}, n_c = {system.n_c})"
             + (". Give more `parameters`: it reads more of them than there are" if too_short else "")
         )
     system.within_bounds.add(kind)
 
 
-def _index_error(function: Dispatcher, t: float, state: list[Array], p: Array, out: Array) -> IndexError | None:
+def _index_error(function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array]) -> IndexError | None:
     """The first index out of bounds, if there is one."""
     for wrap in (_in_python, _with_bounds_checked):
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                _Rewritten(wrap).value(function)(t, *(array.copy() for array in state), p.copy(), out.copy())
+                _Rewritten(wrap).value(function)(
+                    t, *(array.copy() for array in state), p.copy(), *(array.copy() for array in out)
+                )
         except IndexError as error:
             return error
         except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called

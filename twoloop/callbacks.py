@@ -22,7 +22,7 @@ VECTOR = numba.types.float64[::1]
 MATRIX = numba.types.float64[:, ::1]
 
 # what callbacks depend on beside t and p, and the size of each
-STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}
+STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}  # of the multipliers those of C alone
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,10 @@ class Kind:
         What is in its place where it is left out. "": it must be given; "zeros": a callback that leaves zeros;
         "differences": one that differences C, see `jacobian.py`; "kernels": nothing that could be called, as the
         kernels take differences of their own.
+    needed_by : str
+        The size of the system, "n_c" or "n_a", above zero of which it must be given.
+    more : tuple
+        Name and shape of further arrays that it fills. Such a callback must be compiled.
     """
 
     state: tuple[str, ...]
@@ -53,6 +57,8 @@ class Kind:
     meaning: str
     note: str = ""
     absent: str = ""
+    needed_by: str = ""
+    more: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
     @property
     def optional(self) -> bool:
@@ -60,26 +66,37 @@ class Kind:
         return self.absent != ""
 
     @property
+    def outputs(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """Names and sizes of all arrays that it fills."""
+        return ((self.output, self.shape), *self.more)
+
+    @property
     def arguments(self) -> tuple[str, ...]:
         """Names of the arguments of a callback that works in place."""
-        return ("t", *self.state, "p", self.output)
+        return ("t", *self.state, "p", *(name for name, _ in self.outputs))
 
     @property
     def signature(self) -> Any:
         """What numba compiles a callback for."""
-        filled = VECTOR if len(self.shape) == 1 else MATRIX
-        return numba.types.void(f8, *[VECTOR] * len(self.state), VECTOR, filled)
+        filled = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
+        return numba.types.void(f8, *[VECTOR] * len(self.state), VECTOR, *filled)
 
     @property
     def size(self) -> str:
-        """The shape of the array, in words."""
-        return f"({', '.join(self.shape)}{',' if len(self.shape) == 1 else ''})"
+        """The shapes of the arrays, in words."""
+        return ", ".join(f"({', '.join(shape)}{',' if len(shape) == 1 else ''})" for _, shape in self.outputs)
 
 
 KINDS = {
-    "mass": Kind(("q",), "M", ("n_q", "n_q"), "the mass matrix M", "Symmetric and positive definite."),
+    "mass": Kind(
+        ("q",),
+        "M",
+        ("n_q", "n_q"),
+        "the mass matrix M",
+        "Symmetric; positive definite on the velocities that the constraints allow.",
+    ),
     "force": Kind(("q", "v"), "Q", ("n_q",), "the force Q"),
-    "constraint": Kind(("q",), "C", ("n_c",), "the constraints C"),
+    "constraint": Kind(("q",), "C", ("n_c",), "the constraints C", "None: n_c is 0.", absent="zeros", needed_by="n_c"),
     "jacobian": Kind(
         ("q",),
         "Cq",
@@ -133,6 +150,35 @@ KINDS = {
         "d(C_q^T lam)/dq with lam held, the derivative of the reactions with respect to q",
         "None: by differences of C_q, none where C_q does not change.",
         absent="zeros",
+    ),
+    "nonholonomic": Kind(
+        ("q",),
+        "A",
+        ("n_a", "n_q"),
+        "A of the non-holonomic constraints A v + b = 0",
+        "None: n_a is 0.",
+        absent="zeros",
+        needed_by="n_a",
+    ),
+    "nonholonomic_rate": Kind(
+        ("q",), "b", ("n_a",), "b of the non-holonomic constraints A v + b = 0", "None: zero.", absent="zeros"
+    ),
+    "nonholonomic_gamma": Kind(
+        ("q", "v"),
+        "Qa",
+        ("n_a",),
+        "-((A v)_q v + A_t v + b_q v + b_t), the right-hand side of A a = Q_a",
+        "None: by differences of A and b along the motion.",
+        absent="kernels",
+    ),
+    "kinematics": Kind(
+        ("q", "v"),
+        "C",
+        ("n_c",),
+        "C, C_q, C_t and Q_d together",
+        "They share sines: one call instead of four. Goes with constraint, jacobian and gamma, and must agree.",
+        absent="zeros",
+        more=(("Cq", ("n_c", "n_q")), ("Ct", ("n_c",)), ("Qd", ("n_c",))),
     ),
 }
 OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
@@ -215,7 +261,10 @@ def stand_in(kind: str) -> Dispatcher:
     def leaves_zeros_too(t, q, x, p, out):
         pass
 
-    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_zeros_too
+    def leaves_four(t, q, v, p, C, Cq, Ct, Qd):
+        pass
+
+    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_four if KINDS[kind].more else leaves_zeros_too
     return compile_callback(kind, function, ("leaves zeros", ""))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
+from scipy.linalg import null_space, qr
 
 from twoloop.bounds import check_bounds
 from twoloop.callbacks import KINDS
@@ -16,7 +16,12 @@ Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+
+
+class ConstraintWarning(UserWarning):
+    """Constraints of a system depend on one another: those left out are checked, and multipliers are not unique."""
 
 
 def check_system(system: object) -> None:
@@ -41,7 +46,7 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
     matrix = system.mass(t0, q0)
-    jacobian = system.jacobian(t0, q0)
+    jacobian, rows = system.jacobian(t0, q0), system.rows(t0, q0)
     reason = not_finite(system, t0, q0, v0)
     if reason is not None:
         raise ValueError(f"at the start, t = {t0:g}, {reason}")
@@ -50,20 +55,19 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
             f"mass of {system.name!r} must be symmetric; at t = {t0:g} max|M - M^T| is "
             f"{np.abs(matrix - matrix.T).max():.3g}"
         )
-    scales = scales_of(system, t0, q0, jacobian)
-    violation = Violation.of_position(system, t0, q0, jacobian, scales)
-    violation.refuse("q0")
+    if system.n_c > 0:
+        violation = Violation.of_position(system, t0, q0, jacobian, scales_of(system, t0, q0, jacobian))
+        violation.refuse("q0")
     if derivatives:
         check_derivatives(system, t0, q0)
-    violation = Violation.of_velocity(system, t0, q0, v0, jacobian, scales)
-    violation.refuse("v0")
-    redundant = redundant_rows(scales.scaled(jacobian))
-    if redundant:
+    empty = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) == 0.0).tolist()
+    if empty:
         raise ValueError(
-            f"the constraint Jacobian of {system.name!r} has rank {system.n_c - len(redundant)} < n_c = {system.n_c} "
-            f"at t = {t0:g}: {in_words(jacobian, redundant)}. Leave these constraints out (redundant "
-            "constraints are not handled yet), or start from another position"
+            f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "
+            "there. Leave these constraints out, or start from another position"
         )
+    if len(rows) > 0:
+        Violation.of_velocity(system, t0, q0, v0, rows, scales_of(system, t0, q0, rows)).refuse("v0")
 
 
 class Violation:
@@ -111,18 +115,30 @@ class Violation:
     def of_velocity(
         cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
     ) -> Violation:
-        """C_q v + C_t at a state, beside what is fast there: velocities, drives, and what forces can bring about."""
-        rate = system.constraint_rate(t, q)
+        """C_q v + C_t and A v + b, beside what is fast there: velocities, drives, what forces can bring about."""
+        rate = system.rates(t, q)
         fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+        mass, force = system.mass(t, q), system.force(t, q, v)
         try:
-            pull = np.linalg.solve(system.mass(t, q), system.force(t, q, v))
-        except np.linalg.LinAlgError:
-            pull = np.zeros(system.n_q)
+            np.linalg.cholesky(mass)
+            pull = np.linalg.solve(mass, force)
+        except np.linalg.LinAlgError:  # no inertia in some directions, which the constraints exclude
+            pull = np.linalg.lstsq(mass, force, rcond=1e-12)[0]
         falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
         terms = np.abs(jacobian) @ np.abs(v) + np.abs(rate)
         values = jacobian @ v + rate
-        return cls(system, t, "C_q v + C_t", values, terms, jacobian, scales, speeds, np.abs(v))
+        return cls(
+            system,
+            t,
+            "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)",
+            values,
+            terms,
+            jacobian,
+            scales,
+            speeds,
+            np.abs(v),
+        )
 
     @property
     def excess(self) -> float:
@@ -176,14 +192,46 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
 
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
-    jacobian = system.jacobian(t, q)
+    jacobian = system.rows(t, q)
     rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
     return in_words(jacobian, rows) if rows else "or so nearly that Newton cannot tell"
+
+
+def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float, str]:
+    """Smallest over largest eigenvalue of T^T M T, and which coordinates move in the motion that it belongs to."""
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    free = null_space(rows) if len(rows) > 0 else np.eye(system.n_q)
+    if free.shape[1] == 0:
+        return 1.0, "the constraints allow no motion"
+    energies, motions = np.linalg.eigh(free.T @ mass @ free)
+    motion = np.abs(free @ motions[:, 0])
+    coordinates = np.flatnonzero(motion > 0.1 * motion.max()).tolist()
+    return float(energies[0] / max(energies[-1], np.finfo(np.float64).tiny)), (
+        f"a motion of coordinate(s) {coordinates}, which the constraints allow, has next to no inertia, or a negative "
+        f"one: the smallest eigenvalue of T^T M T is {energies[0]:.3g}, the largest {energies[-1]:.3g}"
+    )
+
+
+def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q)."""
+    generator = np.random.default_rng(4)
+    found = np.zeros((system.n_c + system.n_a, system.n_q))
+    for share in NEARBY:
+        place = q + share * np.maximum(np.abs(q), np.abs(q).max()) * generator.uniform(-1.0, 1.0, system.n_q)
+        try:
+            found[system.rows(t, place) != 0.0] = 1.0
+        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
+            continue
+    return found
+
+
+def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
+    return value if isinstance(value, tuple) else (value,)
 
 
 def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
     """Which callbacks give values that are not finite at (t, q, v); None: all are."""
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
     values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in system.given}
-    wrong = [kind for kind, value in values.items() if not np.isfinite(value).all()]
+    wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in _parts(value))]
     return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None

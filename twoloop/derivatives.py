@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.differences import EPS, Estimate, Function, confirms, differentiate
-from twoloop.kernels.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, GAMMA_GIVEN, REACTION_BY_Q_GIVEN
+from twoloop.kernels.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 from twoloop.scales import column_scales, sizes
 from twoloop.system import ConstrainedSystem
 
@@ -23,12 +23,14 @@ TIME = 0.1  # s: first guess at how fast constraints move
 NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
+SAME = 1e-11  # relative: values that two callbacks must share
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 WHAT = {
     "jacobian": "the derivative of constraint with respect to q",
     "constraint_rate": "the derivative of constraint with respect to t",
     "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = gamma",
+    "nonholonomic_gamma": "-((A v)_q v + A_t v + b_q v + b_t), the right-hand side of A a = nonholonomic_gamma",
     "force_by_q": "the derivative of force with respect to q",
     "force_by_v": "the derivative of force with respect to v",
     "reaction_by_q": "the derivative of C_q^T lam with respect to q",
@@ -36,6 +38,7 @@ WHAT = {
 HINTS = {
     "constraint_rate": ", or give constraint_rate: the constraints depend on time",
     "gamma": ", or leave gamma out to have it differenced",
+    "nonholonomic_gamma": ", or leave nonholonomic_gamma out to have it differenced",
     "force_by_q": ", or leave all tangents out to have the force differenced",
     "reaction_by_q": ", or leave reaction_by_q out to have it differenced",
 }
@@ -58,6 +61,7 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     wrong = _wrong_constraint(system, t, q, FORWARD) or _wrong_tangent(system, t, q)
     if wrong is not None:
         raise ValueError(wrong)
+    _check_kinematics(system, t, q)
     _check_constant_mass(system, t, q)
     if system.bandwidth is not None:
         _check_bandwidth(system, system.bandwidth, t, q)
@@ -72,25 +76,29 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they decide
     whether Newton's method converges, not what it converges to.
     """
-    jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
+    jacobian, rate = system.rows(t, q), system.rates(t, q)
     if jacobian.size == 0 or not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
         return None
+    n_c = system.n_c
     generic = _generic_velocities(jacobian, rate, q)[-1]
     generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
     scale = min(TIME, _time_scale(q, generic))
-    noise = EPS * (np.abs(jacobian) @ np.abs(q))
-    given = jacobian @ generic + rate
-    along = _along(system, t, q, generic)
+    noise = EPS * (np.abs(jacobian) @ np.abs(q))[:n_c]
+    given = (jacobian @ generic + rate)[:n_c]
     spacing = _spacing(t, q, generic)
-    found = _along_a_run(along, scale, noise, given, spacing)
-    suspicious = found.disagrees(given, EPS * (np.abs(jacobian) @ np.abs(generic))).max() > 1.0
-    if not suspicious and system.functions.flags[GAMMA_GIVEN] == 1:
-        right = _defined(lambda: system.gamma(t, q, generic))
+    suspicious = False
+    if n_c > 0:
+        found = _along_a_run(_along(system, t, q, generic), scale, noise, given, spacing)
+        suspicious = found.disagrees(given, EPS * (np.abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
+    for kind, rows in _gammas(system):
+        if suspicious:
+            break
+        right = _defined(lambda kind=kind: system.evaluate(kind, t, q, generic))  # type: ignore[misc]
         if right is None:
             return None
         given = -right
-        noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))
-        rate_along = _along_a_line(system, t, q, generic)
+        noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
+        rate_along = _along_a_line(system, t, q, generic, rows)
         found = _along_a_run(rate_along, scale, noise, given, spacing)
         suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
     return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
@@ -142,6 +150,35 @@ class _Comparison:
 
 def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
     """Which entry of C_q, C_t or gamma is wrong: the first of them that is, because each relies on those before."""
+    wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
+    if wrong is not None:
+        return wrong
+    jacobian, rate = system.rows(t, q), system.rates(t, q)
+    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+        return None
+    for kind, rows in _gammas(system):
+        for v in _generic_velocities(jacobian, rate, q):
+            given = _defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
+            if given is None:
+                continue
+            noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
+            rounding = _rounding(lambda x, kind=kind, v=v: system.evaluate(kind, t, x, v), given, q)  # type: ignore[misc]
+            turned = _minus(_along_a_line(system, t, q, v, rows))
+            compared = _Comparison(system, kind, t, turned, 0.0, given, spacing=_spacing(t, q, v))
+            wrong = compared.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
+            if wrong is not None:
+                return wrong
+    return None
+
+
+def _gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
+    """The right-hand sides of the acceleration constraints that are given, and the rows they belong to."""
+    rows = {"gamma": slice(0, system.n_c), "nonholonomic_gamma": slice(system.n_c, None)}
+    return [(kind, part) for kind, part in rows.items() if kind in system.given]
+
+
+def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
+    """Which entry of C_q or C_t is wrong."""
     jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
     if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
         return None  # outside what they are made for; at a state of the run consistency.py names it
@@ -151,21 +188,7 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
     noise = EPS * (np.abs(jacobian) @ np.abs(q))
     rounding = _rounding(lambda x: system.constraint_rate(t, x), rate, q)
     in_t = _Comparison(system, "constraint_rate", t, lambda s: system.constraint(t + s, q), t, rate)
-    wrong = in_t.wrong(TIME, noise, np.abs(rate), rounding, sides)
-    if wrong is not None or system.functions.flags[GAMMA_GIVEN] == 0:
-        return wrong
-    for v in _generic_velocities(jacobian, rate, q):
-        given = _defined(lambda v=v: system.gamma(t, q, v))  # type: ignore[misc]
-        if given is None:
-            continue
-        noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))
-        rounding = _rounding(lambda x, v=v: system.gamma(t, x, v), given, q)  # type: ignore[misc]
-        turned = _minus(_along_a_line(system, t, q, v))
-        compared = _Comparison(system, "gamma", t, turned, 0.0, given, spacing=_spacing(t, q, v))
-        wrong = compared.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
-        if wrong is not None:
-            return wrong
-    return None
+    return in_t.wrong(TIME, noise, np.abs(rate), rounding, sides)
 
 
 def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
@@ -281,13 +304,38 @@ def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
     return lambda s: system.constraint(t + s, q + s * v)
 
 
-def _along_a_line(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
-    """C_q v + C_t along a straight motion."""
-    return lambda s: system.velocity_constraint(t + s, q + s * v, v)
+def _along_a_line(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
+    """Rows of C_q v + C_t and A v + b along a straight motion."""
+    return lambda s: system.velocity_constraint(t + s, q + s * v, v)[rows]
 
 
 def _minus(function: Function) -> Function:
     return lambda s: -function(s)
+
+
+def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare the fused callback with the separate ones, which were compared with differences before."""
+    if "kinematics" not in system.given:
+        return
+    v = _generic_velocities(system.jacobian(t, q), system.constraint_rate(t, q), q)[-1]
+    for place in (q, q + NEAR_START * v):
+        separate = {
+            "constraint": system.constraint(t, place),
+            "jacobian": system.jacobian(t, place),
+            "constraint_rate": system.constraint_rate(t, place),
+            "gamma": system.gamma(t, place, v),
+        }
+        size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # of the terms in a constraint
+        for fused, (kind, given) in zip(system.kinematics(t, place, v), separate.items(), strict=True):
+            off = np.abs(fused - given)
+            level = SAME * np.abs(given).max(initial=0.0) + (100.0 * size if kind == "constraint" else 0.0)
+            if (off > level).any():
+                entry = np.unravel_index(int((off - level).argmax()), off.shape)
+                where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
+                raise ValueError(
+                    f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
+                    f"{fused[entry]:.9g} and {given[entry]:.9g} (near t = {t:.10g}). Correct it, or leave it out"
+                )
 
 
 def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twoloop.plan import INNER_TOL, Plan, check_tolerances
+from twoloop.plan import INNER_TOL, Plan, check_tolerances, least_tolerance
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
+REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
 SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
 
 
@@ -72,4 +73,5 @@ class DOP853:
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,
             safety=SAFETY,
+            reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )

@@ -35,6 +35,7 @@ class Plan:
     symmetric: bool = False
     predictive: bool = False
     least_error: float = LEAST_ERROR
+    reuse: float = 0.0  # correction of a position up to which the Jacobian before it serves, within a step
 
 
 def least_tolerance(rtol: float, atol: float) -> float:

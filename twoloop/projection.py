@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 MAX_ITERATIONS = 50
 CONVERGED = 1e-2  # of what a start may be off
 SINGULAR = 1e-10  # smallest singular value of scaled columns that still count as independent
+NEGLIGIBLE, WEAK = 1e-13, 1e-2  # singular values of rows of length 1 that count as zero: as a rule; redundant
 DEAD_CENTRE = 0.05  # the same, below which a position is called near a dead centre
 
 
@@ -91,13 +92,13 @@ def consistent_state(
     reason = not_finite(system, t, guess, speeds)
     if reason is not None:
         raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
-    found = _position(system, t, guess, free, kept)
-    jacobian = system.jacobian(t, found)
+    found = _position(system, t, guess, free, kept) if system.n_c > 0 else guess
+    jacobian = system.rows(t, found)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, found, speeds))
     velocity = speeds + change
     scales = scales_of(system, t, found, jacobian)
-    wrong = Violation.of_velocity(system, t, found, velocity, jacobian, scales)
-    if wrong.excess > 1.0:
+    wrong = Violation.of_velocity(system, t, found, velocity, jacobian, scales) if len(jacobian) > 0 else None
+    if wrong is not None and wrong.excess > 1.0:
         why = f"max|C_q v + C_t| stays at {_largest(wrong.values)}"
         raise ValueError(_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
     state = ConsistentState((found, velocity))
@@ -115,6 +116,10 @@ def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[n
         why = f"max|C| stays at {_largest(start.values)}"
         raise ValueError(_no_freedom(system, t, scaled, free, kept, why))
     found, excess, iterations = _gauss_newton(system, t, guess, free)
+    redundant = found is None or _rank(scales.scaled(system.jacobian(t, found))) < system.n_c
+    cut = WEAK if redundant else NEGLIGIBLE
+    if redundant:  # rows that depend on one another do so on the constraints, and beside them only nearly
+        found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if found is None or not excess <= CONVERGED:
         where = guess if found is None else found
         raise ValueError(
@@ -130,7 +135,7 @@ def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[n
     dependent, sign, _ = _assembly(there, free)
     weakest = far * _weakest_direction(there, free)
     for other in (-2.0 * moved, weakest, -weakest):
-        again, excess, _ = _gauss_newton(system, t, found + other * scales.columns, free)
+        again, excess, _ = _gauss_newton(system, t, found + other * scales.columns, free, cut)
         same = again is not None and excess <= CONVERGED
         if again is not None and same:
             block = scales.scaled(system.jacobian(t, again))[:, list(dependent)]
@@ -148,7 +153,7 @@ def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[n
 
 
 def _gauss_newton(
-    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp]
+    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
     """Position (None: lost), what it is still off over what is accepted, and how many iterations it took."""
     best, iteration = np.inf, 0
@@ -159,7 +164,7 @@ def _gauss_newton(
             return None, np.inf, iteration
         if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
             return None, np.inf, iteration
-        step = _least_change(jacobian, free, -values)
+        step = _least_change(jacobian, free, -values, cut)
         excess = Violation.of_position(system, t, q, jacobian, scales_of(system, t, q, jacobian)).excess
         if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
             return q, excess, iteration  # as far as rounding lets it
@@ -170,12 +175,12 @@ def _gauss_newton(
     return q, best, iteration
 
 
-def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array) -> Array:
+def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
     """The smallest change of the free coordinates that changes C by these values to first order."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
-    change[free] = np.linalg.lstsq(jacobian[:, free] / norms[:, None], values / norms, rcond=1e-13)[0]
+    change[free] = np.linalg.lstsq(jacobian[:, free] / norms[:, None], values / norms, rcond=cut)[0]
     return change
 
 
@@ -219,12 +224,13 @@ def _smallest(scaled: Array, free: NDArray[np.intp], kept: list[int]) -> str:
 def _no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    ranks = f"rank {_rank(scaled[:, free])} of {system.n_c}"
+    ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
+    rows = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:
-        return f"C_q of {system.name!r} has {ranks} at t = {t!r}, and {why}: give a guess away from this position"
+        return f"{rows} of {system.name!r} has {ranks} at t = {t!r}, and {why}: give a guess away from this position"
     return (
-        f"keep leaves too little freedom: without the columns {kept} C_q of {system.name!r} has {ranks} at t = {t!r}, "
-        f"and {why}. Keep fewer coordinates, or give a guess away from a dead centre"
+        f"keep leaves too little freedom: without the columns {kept} {rows} of {system.name!r} has {ranks} at "
+        f"t = {t!r}, and {why}. Keep fewer coordinates, or give a guess away from a dead centre"
     )
 
 

@@ -25,6 +25,7 @@ class Status(IntEnum):
     STAGNATED = -8
     WRONG_DERIVATIVE = -9
     TIME_LIMIT = -10
+    ROWS_CONTRADICT = -11
 
 
 MEANINGS: dict[Status, str] = {
@@ -40,6 +41,7 @@ MEANINGS: dict[Status, str] = {
     Status.STAGNATED: "the steps became so short that the end is out of reach",
     Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong at a state of the run",
     Status.TIME_LIMIT: "the run reached its time_limit",
+    Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
 }
 
 
@@ -91,8 +93,8 @@ class Result:
         Times, s.
     q, v, a : ndarray (n_q, n_t)
         Coordinates, velocities, accelerations: one column an instant.
-    lam : ndarray (n_c, n_t)
-        Multipliers of M a + C_q^T lam = Q.
+    lam : ndarray (n_c + n_a, n_t)
+        Multipliers [lam; mu] of M a + C_q^T lam + A^T mu = Q; of least norm where rows depend on one another.
     h : ndarray
         Sizes of the accepted steps, s.
     status : Status
@@ -108,6 +110,10 @@ class Result:
     partitioned : ndarray of int (n_accepted,) or None
         How often the coordinates were partitioned anew in the same interval; the partition at the start of the run
         is not among them. None where a foreign solver has none.
+    rank : int or None
+        Rank of the constraints C_q and A at the start. None where a foreign solver does not tell.
+    redundant : ndarray of int or None
+        Rows of C_q and A, counted as in `lam`, that depended on the others at the start and were left out.
     sol, t_events
         None: dense output and events are not available yet.
     """
@@ -124,6 +130,8 @@ class Result:
     rejected_error: NDArray[np.int64] | None = None
     rejected_convergence: NDArray[np.int64] | None = None
     partitioned: NDArray[np.int64] | None = None
+    rank: int | None = None
+    redundant: NDArray[np.int64] | None = None
     sol: Callable[[float], Array] | None = None
     t_events: list[Array] | None = None
 

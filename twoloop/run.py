@@ -1,16 +1,19 @@
 """One run: its arrays, the chunks that the compiled `advance` returns, and what to say of how it ended."""
 
 import time
+import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.consistency import dependent_rows, not_finite
+from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
 from twoloop.derivatives import wrong_derivative
 from twoloop.kernels import common
 from twoloop.kernels.banded import banded_pays
 from twoloop.kernels.lapack import addresses
+from twoloop.kernels.layout import make_work
 from twoloop.plan import Plan, least_tolerance
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -29,6 +32,12 @@ GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked f
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
 STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
 STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
+CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
+SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
+# of the longest of the last steps: lengths tried for a step across a singular position, on which no stage should fall
+BRIDGES = tuple(0.85**k for k in range(28))
+CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
@@ -53,22 +62,30 @@ class Run:
         atol: Array,
         step_size: float | None,
     ):
-        from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
+        from twoloop.kernels import advance
+        from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
 
         self.a = advance
         self.system, self.plan, self.t0 = system, plan, t0
-        self.work = common.make_work(system.n_q, system.n_c)
-        self.work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
-        self.work.notes[common.GAMMA_SHARE] = 1.0
+        self.memory = plan.memory.copy()
+        self.rtol, self.reuse = rtol, plan.reuse
         flags = system.functions.flags.copy()
         if system.constant_mass:
             mass = system.mass(t0, q0)
             flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
-        if system.bandwidth is not None and banded_pays(system.n_q, system.n_c, system.bandwidth):
-            flags[common.BANDWIDTH] = system.bandwidth
-            self.work.lapack[:] = addresses()
+        n_rows = system.n_c + system.n_a
+        definite = bool(
+            np.linalg.eigvalsh(system.mass(t0, q0)).min() > SINGULAR_MASS * np.abs(system.mass(t0, q0)).max()
+        )
+        flags[common.REDUCED] = not definite or system.n_q <= 2 * n_rows
+        bandwidth = system.bandwidth if definite and system.n_a == 0 else None
+        if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
+            flags[common.BANDWIDTH], flags[common.REDUCED] = bandwidth, 0
         self.functions = system.functions._replace(flags=flags)
-        self.state = np.concatenate([q0, v0, np.zeros(system.n_q + system.n_c)])
+        self.kit = common.Kit(self.functions, inner_loop)
+        self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
+        self.pattern = pattern_of(system, t0, q0)
+        self.work = self._workspace()
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.ATOL + system.n_q)
         self.tolerances[common.RTOL] = rtol
@@ -89,6 +106,7 @@ class Run:
         self.control[advance.PREDICTIVE] = plan.predictive
         self.control[advance.LEAST_ERROR] = plan.least_error
         self.control[advance.MAX_STEPS] = np.inf
+        self.control[advance.BRIDGE] = 1.0
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.control[advance.MAX_ATTEMPTS] = max(1, first_chunk // max(1, system.n_q // SMALL))
         self.clock = np.zeros(advance.N_CLOCK)
@@ -96,21 +114,39 @@ class Run:
         self.clock[advance.H_LIMIT] = plan.limit_start
         self._begin()
 
+    def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
+        """Arrays for ranks of C_q and of all rows; without them for full ones."""
+        system = self.system
+        reduced = bool(self.functions.flags[common.REDUCED])
+        work = make_work(system.n_q, system.n_c, system.n_a, rank, rank_v, reduced)
+        work.notes[common.GAMMA_REQUIRED] = max(self.rtol, GAMMA_ACCURACY)
+        work.notes[common.GAMMA_SHARE] = 1.0
+        work.notes[common.ROUNDED] = ROUNDING * float(np.abs(self.state[: system.n_q]).max())
+        work.notes[common.REUSE] = max(self.reuse, work.notes[common.ROUNDED])
+        work.pattern[:] = self.pattern
+        if self.functions.flags[common.BANDWIDTH] >= 0:
+            work.lapack[:] = addresses()
+        return work
+
     def _begin(self) -> None:
-        code = self.a.start(self.functions, self.work, self.t0, self.state)
+        code = self.a.start(self.kit, self.work, self.t0, self.state)
+        if code == common.RANK_DIFFERS:
+            ranks = [int(self.work.notes[place]) for place in (common.RANK, common.RANK_V)]
+            self.work = self._workspace(*ranks)
+            code = self.a.start(self.kit, self.work, self.t0, self.state)
         if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
             required = self.work.notes[common.GAMMA_REQUIRED]
             self.work.notes[common.GAMMA_REQUIRED] = np.inf
-            code = self.a.start(self.functions, self.work, self.t0, self.state)
+            code = self.a.start(self.kit, self.work, self.t0, self.state)
             self.work.notes[common.GAMMA_REQUIRED] = required
-        if code == common.DONE:
-            return
         n = self.system.n_q
+        if code == common.DONE:
+            self._warn_of_redundant_rows()
+            return
         if code == common.MASS_NOT_DEFINITE:
-            eigenvalues = np.linalg.eigvalsh(self.system.mass(self.t0, self.state[:n]))
             raise ValueError(
-                f"mass of {self.system.name!r} must be positive definite; its smallest eigenvalue at t = {self.t0!r} "
-                f"is {eigenvalues.min():.3g}"
+                f"mass of {self.system.name!r} must be positive definite on the velocities that the constraints allow; "
+                f"at t = {self.t0!r} {least_inertia(self.system, self.t0, self.state[:n])[1]}"
             )
         if code == common.SINGULAR:
             raise ValueError(
@@ -121,6 +157,29 @@ class Run:
         raise ValueError(
             f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {self._not_finite()}"
         )
+
+    def _warn_of_redundant_rows(self) -> None:
+        n_rows = self.system.n_c + self.system.n_a
+        self.rank = len(self.work.rows_v)
+        self.redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
+        if self.rank < n_rows:
+            n = self.system.n_q
+            rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+            off = np.abs(rows @ a - self.work.Gamma)
+            allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
+            wrong = np.flatnonzero(off > allowed).tolist()
+            if wrong:
+                raise ValueError(
+                    f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
+                    f"{in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
+                )
+            warnings.warn(
+                f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
+                f"{in_words(rows, self.redundant.tolist())}. They are left out of the solution and checked at every "
+                "step; multipliers are those of least norm",
+                ConstraintWarning,
+                stacklevel=4,
+            )
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""
@@ -165,18 +224,19 @@ class Run:
         pace = _Pace(self.t0)
         cpu = 0.0
         code = a.PAUSED
+        plan, control = self.plan, self.control
         while code == a.PAUSED:
             filled[:] = 0
             began = time.process_time()
             try:
                 code = a.advance(
-                    self.functions,
+                    self.kit,
                     self.work,
-                    self.plan.step,
-                    self.plan.options,
-                    self.plan.memory,
+                    plan.step,
+                    plan.options,
+                    plan.memory,
                     self.tolerances,
-                    self.control,
+                    control,
                     self.clock,
                     self.state,
                     self.new_state,
@@ -200,6 +260,11 @@ class Run:
                 code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
+            if code == a.NEAR_SINGULAR:
+                plan, control = self._bridge()
+                code = a.PAUSED
+            elif plan is not self.plan and code != a.ALL_OUTPUT_DONE:
+                plan, control, code = self._beyond(plan, control, code, int(filled[1]))
             report(self.clock[a.T])
         t = np.concatenate(t_parts)
         table = np.concatenate(rows)
@@ -221,10 +286,45 @@ class Run:
             status=status,
             message=message,
             stats=self._statistics(cpu),
+            rank=self.rank,
+            redundant=self.redundant,
             rejected_error=errors,
             rejected_convergence=failures,
             partitioned=partitions,
         )
+
+    def _bridge(self) -> tuple[Plan, Array]:
+        """The plan and the controls for steps across a singular position, see kernels/bridge.py."""
+        from twoloop.dop853 import DOP853
+        from twoloop.kernels import bridge
+
+        a, clock = self.a, self.clock
+        plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
+        control = self.control.copy()
+        control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
+        control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.factor_min, plan.factor_max
+        control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+        clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
+        self.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
+        clock[a.H_NEXT] = self.lengths.pop(0)
+        return replace(plan, step=bridge.bridging_step), control
+
+    def _beyond(self, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
+        """What goes on after an attempt at a step across: the same, or the run's own steps again."""
+        a = self.a
+        if code == a.PAUSED and accepted == 0 and self.lengths:
+            self.clock[a.H_NEXT], self.clock[a.H_LIMIT] = self.lengths.pop(0), np.inf
+            return plan, control, code
+        if code == a.PAUSED and accepted > 0 and (self.work.notes[common.PIVOT] < CLEAR * self.clock[a.LARGEST_PIVOT]):
+            self.lengths = [float(self.clock[a.H_LONG]) * part for part in BRIDGES]
+            return plan, control, code
+        if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
+            return plan, control, code
+        if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
+            self.control[a.BRIDGE] = 0.0
+        self.plan.memory[:] = self.memory
+        self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
+        return self.plan, self.control, a.PAUSED
 
     def _statistics(self, cpu: float) -> Statistics:
         c = self.work.counters
@@ -272,6 +372,8 @@ class Run:
                 "singular position or a stiff force near this time, or take another method; with max_steps the run "
                 "goes on up to that number of steps.",
             )
+        if code == a.ROWS_VIOLATED:
+            return Status.ROWS_CONTRADICT, self._contradiction()
         if failure == common.NOT_FINITE:
             return (
                 Status.NOT_FINITE,
@@ -282,8 +384,8 @@ class Run:
             return (
                 Status.RANK_LOST,
                 f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
-                "coordinates exists. Redundant constraints and singular positions are not handled yet: end t_span "
-                "before, or change the geometry.",
+                "coordinates exists at this singular position, and no step led across: end t_span before, take another "
+                "method, or change the geometry.",
             )
         if failure == common.GAMMA_INACCURATE:
             reached, required = self.work.notes[common.GAMMA_ACCURACY], self.work.notes[common.GAMMA_REQUIRED]
@@ -302,21 +404,37 @@ class Run:
         return (
             Status.STEP_TOO_SMALL,
             f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-            f"{self._near_singular()}Look for a discontinuity near this time, loosen rtol and atol, or use coordinates "
-            "of similar scale.",
+            f"{self._near_singular()}{self._near_massless()}Look for a discontinuity near this time, loosen rtol and "
+            "atol, or use coordinates of similar scale.",
+        )
+
+    def _contradiction(self) -> str:
+        """Which row that was left out is violated, and which rows it depended on."""
+        t, n, row = float(self.clock[self.a.T]), self.system.n_q, int(self.work.notes[common.CONTRADICTION])
+        words = in_words(self.system.rows(t, self.state[:n]), [row])
+        return (
+            f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
+            f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "
+            "they are independent but for the start: start from another position, or correct the constraints."
         )
 
     def _near_singular(self) -> str:
         """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
-        jacobian = self.system.jacobian(float(self.clock[self.a.T]), self.state[: self.system.n_q])
-        values = np.linalg.svd(jacobian, compute_uv=False)
-        if values[-1] > NEARLY_SINGULAR * values[0]:
+        rows = self.system.rows(float(self.clock[self.a.T]), self.state[: self.system.n_q])
+        values = np.linalg.svd(rows, compute_uv=False)[: self.rank]
+        if len(values) == 0 or values[-1] > NEARLY_SINGULAR * values[0]:
             return ""
         return (
             f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-            f"{values[-1] / values[0]:.1g} of the largest. Positions where it does are not handled yet: end t_span "
-            "before, or change the geometry. "
+            f"{values[-1] / values[0]:.1g} of the largest. No step led across: end t_span before, take another "
+            "method, or change the geometry. "
         )
+
+    def _near_massless(self) -> str:
+        """A sentence where some motion has next to no inertia at the last state, else nothing."""
+        t, q = float(self.clock[self.a.T]), self.state[: self.system.n_q]
+        ratio, words = least_inertia(self.system, t, q)
+        return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
     def _check_again(self, t: Array, table: Array, status: Status, message: str) -> tuple[Status, str]:
         """Status and message, unless a derivative is wrong where the run went."""

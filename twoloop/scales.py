@@ -64,32 +64,33 @@ def column_scales(jacobian: Array, typical: Array) -> Array:
 
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
-    """Scales at a position, from C_q there and nearby."""
+    """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
     size = np.abs(q)
-    typical = float(np.median(size[size > 0.0])) if size.any() else 1.0
+    typical = float(np.median(size[size > NEGLIGIBLE * size.max()])) if size.any() else 1.0
     columns = column_scales(jacobian, np.maximum(size, typical))
-    norms, curvature = np.linalg.norm(jacobian * columns, axis=1), _curvature(system, t, q, columns)
+    norms, curvature = np.linalg.norm(jacobian * columns, axis=1), _curvature(system, t, q, columns, len(jacobian))
     rows = np.maximum(norms, TURNS * curvature)
     rows = np.where(rows > 0.0, rows, 1.0)
     radius = np.where(norms > 0.0, norms, 1.0) / np.maximum(curvature, 1e-300)
     in_units = np.where(jacobian != 0.0, size / columns, 0.0)
-    reach = np.ones(len(rows))
+    reach, negligible = np.ones(len(rows)), NEGLIGIBLE * float(in_units.max(initial=0.0))
     for i, row in enumerate(in_units):
         largest = float(row.max())
         if radius[i] <= max(largest, 1.0):
             reach[i] = radius[i]
-        elif largest > 0.0:  # straight: the smaller half of the coordinates, so that an offset does not count
+        elif largest > negligible:  # straight: the smaller half of the coordinates, so that an offset does not count
             reach[i] = float(np.quantile(row[row > NEGLIGIBLE * largest], 0.5, method="lower"))
     return Scales(columns, rows, reach)
 
 
-def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array) -> Array:
+def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_rows: int) -> Array:
     """How fast each row of C_q turns, per unit of the coordinates: one digit is enough."""
     signs = np.random.default_rng(3).choice((-1.0, 1.0), len(q))
-    largest = np.zeros(system.n_c)
+    rows = system.jacobian if n_rows == system.n_c else system.rows
+    largest = np.zeros(n_rows)
     for part in DISPLACEMENTS:
         try:
-            ends = [system.jacobian(t, q + side * part * columns * signs) for side in (1.0, -1.0)]
+            ends = [rows(t, q + side * part * columns * signs) for side in (1.0, -1.0)]
         except Exception:  # outside what the constraints are made for
             continue
         change = np.linalg.norm((ends[0] - ends[1]) * columns, axis=1) / (2.0 * part)

@@ -142,6 +142,11 @@ def solve_dae(
         check_size("max_steps", max_steps, 1)
     if time_limit is not None:
         check_positive("time_limit", time_limit)
+    if system.n_a > 0 and getattr(method, "variables", "velocities") == "momenta":
+        raise ValueError(
+            f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
+            f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
+        )
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     check_start(system, t0, q0, v0, derivatives=check_derivatives)
 

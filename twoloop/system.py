@@ -1,4 +1,4 @@
-"""The problem: M(t, q) q'' + C_q^T lam = Q(t, q, v) with C(t, q) = 0, as compiled callbacks, sizes and parameters."""
+"""The problem: M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0, as compiled callbacks and sizes."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
@@ -32,15 +32,21 @@ Array = NDArray[np.float64]
 
 @add_callbacks
 class ConstrainedSystem:
-    """A constrained mechanical system, M(t, q) a + C_q^T lam = Q(t, q, v), C(t, q) = 0 (eq. (1) of the paper).
+    """A constrained mechanical system, M(t, q) a + C_q^T lam + A^T mu = Q(t, q, v).
+
+    Constraints are C(t, q) = 0 (with eq. (1) of the paper) and, if there are any, A(t, q) v + b(t, q) = 0, which need
+    not come from positions. Rows may depend on one another where they do not contradict; without any the system is one
+    of ordinary differential equations.
 
     Each callback can be evaluated by the method of its name, which checks the arguments: `system.force(t, q, v)`.
 
     Parameters
     ----------
     n_q, n_c : int
-        Number of coordinates and of constraints, 1 <= n_c <= n_q.
+        Number of coordinates and of constraints C.
     {callbacks}
+    n_a : int
+        Number of non-holonomic constraints.
     parameters : array_like, optional
         The vector `p` that every callback gets.
     constant_mass : bool
@@ -55,8 +61,8 @@ class ConstrainedSystem:
     Raises
     ------
     TypeError, ValueError
-        If a size or the bandwidth is not a sensible integer, a callback was not made by `twoloop.callback`, or
-        force_by_v or reaction_by_q is given without force_by_q.
+        If a size or the bandwidth is not a sensible integer, a callback was not made by `twoloop.callback`, one that a
+        size asks for is missing, or force_by_v or reaction_by_q is given without force_by_q.
 
     Notes
     -----
@@ -73,6 +79,7 @@ class ConstrainedSystem:
         *,
         n_q: int,
         n_c: int,
+        n_a: int = 0,
         parameters: ArrayLike = (),
         constant_mass: bool = False,
         bandwidth: int | None = None,
@@ -80,9 +87,7 @@ class ConstrainedSystem:
         **callbacks: Dispatcher | None,
     ):
         self.n_q = check_size("n_q", n_q, 1)
-        self.n_c = check_size("n_c", n_c, 1)
-        if self.n_c > self.n_q:
-            raise ValueError(f"n_c must not exceed n_q = {self.n_q}; given {self.n_c}")
+        self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
         self.name = name
         self.parameters = check_real("parameters", parameters)
         if self.parameters.ndim != 1 or not np.isfinite(self.parameters).all():
@@ -95,7 +100,7 @@ class ConstrainedSystem:
             raise ValueError(
                 f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
             )
-        self.given = _given(callbacks)
+        self.given = _given(callbacks, self.n_c, self.n_a)
         for kind, function in self.given.items():
             entry = KINDS[kind]
             if not isinstance(function, Dispatcher) or entry.signature.args not in function.overloads:
@@ -124,6 +129,7 @@ class ConstrainedSystem:
         *,
         n_q: int,
         n_c: int,
+        n_a: int = 0,
         compile: bool = False,
         bandwidth: int | None = None,
         name: str = "system",
@@ -134,8 +140,10 @@ class ConstrainedSystem:
         Parameters
         ----------
         n_q, n_c : int
-            Number of coordinates and of constraints.
+            Number of coordinates and of constraints C.
         {callbacks}
+        n_a : int
+            Number of non-holonomic constraints.
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
@@ -157,8 +165,13 @@ class ConstrainedSystem:
         (before t too): good to about 1e-11 unless coordinates of very different scale, or a driving motion of
         kilohertz, ask for the formula.
         """
-        n_q, n_c = check_size("n_q", n_q, 1), check_size("n_c", n_c, 1)
-        functions = _given(functions)
+        n_q, n_c, n_a = check_size("n_q", n_q, 1), check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
+        if functions.get("kinematics") is not None:
+            raise TypeError(
+                "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
+                "with compiled callbacks to ConstrainedSystem(...)"
+            )
+        functions = _given(functions, n_c, n_a)
         constant_mass = not callable(functions["mass"])
         if constant_mass:
             matrix = check_real("mass", functions["mass"])
@@ -169,15 +182,16 @@ class ConstrainedSystem:
             if not callable(function):
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
             check_arguments(kind, function)
+        sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
         options: dict[str, Any] = {"constant_mass": constant_mass, "bandwidth": bandwidth, "name": name}
         if compile:
             compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
-            system = cls(n_q=n_q, n_c=n_c, **options, **compiled)
+            system = cls(**sizes, **options, **compiled)
             system._returning = functions
             return system
         python = PythonFunctions(name, functions)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
-        system = cls(n_q=n_q, n_c=n_c, **options, **wrappers, parameters=[python.handle])
+        system = cls(**sizes, **options, **wrappers, parameters=[python.handle])
         system._python = python  # the registry holds it weakly
         return system
 
@@ -186,11 +200,11 @@ class ConstrainedSystem:
         """Whether the callbacks are plain Python functions."""
         return self._python is not None
 
-    def shape_of(self, kind: str) -> tuple[int, ...]:
-        """Shape of the array that a kind of callback fills."""
-        return tuple(getattr(self, size) for size in KINDS[kind].shape)
+    def arrays_of(self, kind: str) -> list[Array]:
+        """Zeros for a kind of callback to fill."""
+        return [np.zeros([getattr(self, size) for size in shape]) for _, shape in KINDS[kind].outputs]
 
-    def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Array:
+    def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
         """What a callback gives at (t, q), (t, q, v) or (t, q, lam), whichever its kind asks for.
 
         Raises
@@ -214,9 +228,9 @@ class ConstrainedSystem:
                 )
             arrays.append(np.ascontiguousarray(array))
         check_callback(self, kind, t, arrays)
-        out = np.zeros(self.shape_of(kind))
-        getattr(self.functions, kind)(t, *arrays, self.functions.p, out)
-        return out
+        out = self.arrays_of(kind)
+        getattr(self.functions, kind)(t, *arrays, self.functions.p, *out)
+        return out[0] if len(out) == 1 else tuple(out)
 
     def check_returned(self, t: float, q: Array, v: Array) -> None:
         """Say what is wrong with the arrays that functions given with `compile=True` return at (t, q, v).
@@ -227,15 +241,24 @@ class ConstrainedSystem:
             known = {"q": q, "v": v, "lam": np.ones(self.n_c)}
             arguments = [known[name] for name in KINDS[kind].state]
             copies = [np.array(argument) for argument in arguments]
-            store(kind, self.name, t, function(t, *copies), np.zeros(self.shape_of(kind)))
+            store(kind, self.name, t, function(t, *copies), self.arrays_of(kind)[0])
             if any((copy != argument).any() for copy, argument in zip(copies, arguments, strict=True)):
                 raise ValueError(
                     f"{kind} of {self.name!r} must not change the arrays that it is given; copy them first"
                 )
 
     def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
-        """C_q v + C_t, (n_c,): zero for consistent velocities (eq. (4))."""
-        return self.jacobian(t, q) @ np.asarray(v, dtype=np.float64) + self.constraint_rate(t, q)
+        """C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
+        return self.rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
+
+    def rows(self, t: float, q: ArrayLike) -> Array:
+        """C_q, then A, (n_c + n_a, n_q)."""
+        return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
+
+    def rates(self, t: float, q: ArrayLike) -> Array:
+        """C_t, then b, (n_c + n_a,)."""
+        rate = self.constraint_rate(t, q)
+        return rate if self.n_a == 0 else np.append(rate, self.nonholonomic_rate(t, q))
 
     def __copy__(self) -> ConstrainedSystem:
         other = object.__new__(type(self))
@@ -253,7 +276,8 @@ class ConstrainedSystem:
 
     def __reduce__(self) -> tuple[Any, ...]:
         plain = self._returning or (self._python.functions if self._python is not None else {})
-        options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "bandwidth": self.bandwidth, "name": self.name}
+        options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "n_a": self.n_a}
+        options |= {"bandwidth": self.bandwidth, "name": self.name}
         if plain:
             options["compile"] = not self.called_in_python
         else:
@@ -274,20 +298,32 @@ def _made_again(
     return system
 
 
-def _given(callbacks: dict[str, Any]) -> dict[str, Any]:
+def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
     """The callbacks that are given, in the order of KINDS, or what is wrong with their choice."""
     unknown = [kind for kind in callbacks if kind not in KINDS]
     if unknown:
         raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
-    missing = [kind for kind, entry in KINDS.items() if not entry.optional and kind not in callbacks]
+    sizes = {"n_c": n_c, "n_a": n_a}
+    needed = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
+    missing = [kind for kind in needed if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
     if missing:
-        raise TypeError(f"a system needs {', '.join(missing)}: not given")
+        rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
+        raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
     given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
     given = {
         kind: each
         for kind, each in given.items()
-        if not (KINDS[kind].optional and (each is None or (KINDS[kind].absent == "zeros" and each is stand_in(kind))))
+        if not (
+            KINDS[kind].optional and (each is None or (KINDS[kind].absent != "differences" and each is stand_in(kind)))
+        )
     }
+    for kind, entry in KINDS.items():
+        if kind in given and sizes.get(entry.shape[0], 1) == 0:
+            of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
+            raise ValueError(f"{kind} goes with {of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
+    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in given]
+    if missing:
+        raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
     if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
         raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
     return given
@@ -295,7 +331,7 @@ def _given(callbacks: dict[str, Any]) -> dict[str, Any]:
 
 def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
     """The callback that stands in the place of one that is not given."""
-    if KINDS[kind].absent != "differences":
+    if KINDS[kind].absent != "differences" or "constraint" not in given:
         return stand_in(kind)
     constraint = given["constraint"]
     # what is called in Python cannot be watched, and need not be: it is looked up at every call

@@ -6,5 +6,6 @@ from tests.bad_input.projection import PROJECTION
 from tests.bad_input.solving import SOLVE
 from tests.bad_input.start import START
 from tests.bad_input.systems import SYSTEMS
+from tests.general.wrong_rows import ROWS
 
-CASES = [*SOLVE, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS]
+CASES = [*SOLVE, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS]

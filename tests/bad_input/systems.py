@@ -47,7 +47,6 @@ SYSTEMS = [
         [
             (-1, ValueError, "must be at least", "give the number of constraints"),
             (True, TypeError, "must be an int; given True", "give the number of constraints"),
-            (3, ValueError, "must not exceed n_q = 2; given 3", "leave redundant constraints out"),
         ],
     ),
     *argument(

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
-from tests.problems import without_tangent, worst
+from tests.problems import called, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop import run as run_module
 from twoloop.kernels import common, lapack
 from twoloop.kernels.banded import factor_bordered, lu_band, solve_bordered
+from twoloop.kernels.layout import make_work
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
 from twoloop.methods import Newmark, RungeKutta
 from twoloop.tableaux import gauss, radau_iia
@@ -87,7 +88,7 @@ def random_band(rng, n, b, complex_numbers):
 def test_bordered_system(complex_numbers):
     rng = np.random.default_rng(2)
     n, n_c, b = 20, 3, 2
-    w = common.make_work(n, n_c)
+    w = make_work(n, n_c)
     w.lapack[:] = lapack.addresses()
     B = random_band(rng, n, b, complex_numbers)
     Cq = rng.normal(size=(n_c, n))
@@ -96,10 +97,10 @@ def test_bordered_system(complex_numbers):
         lu_band.py_func(numbers, n, b)[j, 2 * b + i - j] = B[i, j]
     pivots = np.zeros(n, dtype=np.int64)
     factorize, substitute = (lapack.ZGBTRF, lapack.ZGBTRS) if complex_numbers else (lapack.DGBTRF, lapack.DGBTRS)
-    assert factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute) == common.DONE
+    assert called(factor_bordered, w, b, Cq, numbers, pivots, factorize, substitute) == common.DONE
     r = rng.normal(size=n) + (1j * rng.normal(size=n) if complex_numbers else 0.0)
     x = r.copy()
-    solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
+    called(solve_bordered, w, b, Cq, numbers, pivots, substitute, x)
     whole = np.block([[B, Cq.T], [Cq, np.zeros((n_c, n_c))]])
     assert worst(x, np.linalg.solve(whole, np.append(r, np.zeros(n_c)))[:n]) < 1e-12
 

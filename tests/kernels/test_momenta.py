@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from tests.problems import (
+    called,
     double_pendulum,
     double_pendulum_canonical,
     double_pendulum_state,
+    kit_of,
     moving_pivot,
     moving_pivot_state,
     oblique_pendulum,
@@ -21,6 +23,7 @@ from tests.problems import (
 )
 from twoloop import RungeKutta, solve_dae
 from twoloop.kernels import advance, common, momenta
+from twoloop.kernels.layout import make_work
 from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 SYMPLECTIC = {"Sun": sun_radau_iib(3), "Gauss": gauss(3), "Lobatto": lobatto_iiie(4), "midpoint": gauss(1)}
@@ -111,9 +114,9 @@ def test_momentum_rates_are_the_derivative_of_the_momenta_along_the_motion():
     q, v = double_pendulum_state(START[:2], START[2:])
     h = 1e-3
     run = solve_dae(system, (0.0, 4 * h), q, v, "Gauss12", 1e-12, 1e-12, t_eval=h * np.arange(5))
-    work = common.make_work(4, 2)
+    work = make_work(4, 2)
     state = np.concatenate([run.q[:, 2], run.v[:, 2], np.zeros(6)])
-    assert advance.start(system.functions, work, 0.0, state) == common.DONE
+    assert advance.start(kit_of(system), work, 0.0, state) == common.DONE
     i, d = work.independent, work.dependent
 
     def momentum(k):
@@ -127,9 +130,9 @@ def test_momentum_rates_are_the_derivative_of_the_momenta_along_the_motion():
     tangent, reduced, u = np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(4)
     Mv, shifted, found = np.zeros(4), np.zeros(4), np.zeros(4)
     q, v = run.q[:, 2].copy(), run.v[:, 2].copy()
-    f = system.functions
-    assert momenta._tangents(f, work, 0.0, q, tangent, reduced, u) == common.DONE
-    momenta._momentum_rates(f, work, 0.0, q, v, tangent, Mv, shifted, found)
+    kit = kit_of(system)
+    assert called(momenta._tangents, kit, work, 0.0, q, tangent, reduced, u) == common.DONE
+    called(momenta._momentum_rates, kit, work, 0.0, q, v, tangent, Mv, shifted, found)
     assert worst(found[i], rate) < 1e-8
 
 

@@ -143,7 +143,7 @@ def test_auto_pays_for_no_derivatives_where_nothing_is_stiff(tol):
         for o in ("fixed-point", "auto")
     ]
     assert runs[1].stats.n_evaluations < 1.1 * runs[0].stats.n_evaluations
-    assert np.allclose(runs[1].h[:20], runs[0].h[:20], rtol=1e-6)  # until it may try
+    assert np.allclose(runs[1].h[:20], runs[0].h[:20], rtol=1e-5)  # until it may try
 
 
 def test_auto_does_not_crawl_on_the_stiff_beam():

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from tests.problems import oblique_pendulum, oblique_start, without_tangent, worst
+from tests.problems import called, kit_of, oblique_pendulum, oblique_start, without_tangent, worst
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
 from twoloop import run as run_module
 from twoloop.kernels import common
+from twoloop.kernels.layout import make_work
 from twoloop.kernels.newton_tangents import tangent_by_q, tangent_by_v
 from twoloop.mechanisms import moderately_stiff_beam, very_flexible_beam
 from twoloop.tableaux import gauss, radau_iia
@@ -85,12 +86,12 @@ def test_kernel_has_the_derivative_of_the_force_less_the_reaction(bandwidth, rea
     n = system.n_q
     generator = np.random.default_rng(3)
     q, v = START[0] + 0.1 * generator.normal(size=n), START[1] + generator.normal(size=n)
-    w = common.make_work(n, system.n_c)
+    w = make_work(n, system.n_c)
     w.lam[:] = generator.normal(size=system.n_c)
-    w.Cq[:, :] = system.jacobian(0.0, q)
+    w.G[: system.n_c] = system.jacobian(0.0, q)
     K, R, D, moved = np.full((n, n), 7.0), np.full((n, n), 7.0), np.full((n, n), 7.0), np.zeros(n)
-    assert tangent_by_q(system.functions, w, 0.0, q, v, bandwidth, moved, K, R) == common.DONE
-    assert tangent_by_v(system.functions, 0.0, q, v, bandwidth, D) == common.DONE
+    assert called(tangent_by_q, kit_of(system), w, 0.0, q, v, bandwidth, moved, K, R) == common.DONE
+    assert called(tangent_by_v, kit_of(system), 0.0, q, v, bandwidth, D) == common.DONE
 
     def left(q, v):
         return system.force(0.0, q, v) - w.lam @ system.jacobian(0.0, q)

@@ -5,14 +5,22 @@
 
 import numpy as np
 
+from twoloop.kernels.calls import (
+    accelerations,
+    check_redundant,
+    find_tangents,
+    prepare_mass,
+    renew_partition,
+    take_midpoint,
+)
 from twoloop.kernels.common import (
     DEPARTURE,
     DONE,
     FAULT_KIND,
-    FUNCTIONS,
     GAMMA_GIVEN,
     INNER_DIVERGED,
     INTEGERS,
+    KIT,
     MATRIX,
     N_ACCEPTED,
     N_PARTITIONS,
@@ -21,6 +29,8 @@ from twoloop.kernels.common import (
     NOT_FINITE,
     ORIENTATION,
     ORIENTATION_NEW,
+    PIVOT,
+    REDUCED,
     SINGULAR,
     VECTOR,
     WORK,
@@ -28,16 +38,27 @@ from twoloop.kernels.common import (
     f8,
     i8,
     kernel,
+    merged,
 )
 from twoloop.kernels.differences import representable
-from twoloop.kernels.inner import accelerations, factor_mass
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.partition import CHANGED, partition_is_worn, partition_of_midpoint
-from twoloop.kernels.predictor import renew_partition
+from twoloop.kernels.partition import CHANGED, partition_is_poor
 
 # what advance() returns; PAUSED: a buffer is full, or MAX_ATTEMPTS were made
-ALL_OUTPUT_DONE, PAUSED, STEP_TOO_SMALL, FIXED_STEP_FAILED, RANK_LOST, MAX_STEPS_REACHED = range(6)
+(
+    ALL_OUTPUT_DONE,
+    PAUSED,
+    STEP_TOO_SMALL,
+    FIXED_STEP_FAILED,
+    RANK_LOST,
+    MAX_STEPS_REACHED,
+    ROWS_VIOLATED,
+    NEAR_SINGULAR,
+) = range(8)
 
+SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
+SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
+FADING = 0.98  # of the longest step, with each accepted one
 KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
@@ -58,9 +79,10 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson), see also KEPT
     LEAST_ERROR,  # what an error below it counts as in the trend (Hairer & Wanner II, IV.8)
     MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
+    BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
     SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
     N_CONTROL,
-) = range(17)
+) = range(18)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far
 H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
@@ -78,27 +100,37 @@ H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
     H_FAILED,
     H_BEFORE,  # size and error of the last accepted step
     ERROR_BEFORE,
+    H_LONG,  # the longest of the last steps, fading
+    LARGEST_PIVOT,  # of the smallest pivots of C_q so far
     N_CLOCK,
-) = range(12)
+) = range(14)
 
 
-@kernel(i8(FUNCTIONS, WORK, f8, VECTOR))
+@kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
     """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    code = factor_mass(f, w, t, q)
+    code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
     if code == DONE:
+        code = find_tangents(f, w, t, q)
+    if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
+    if code == DONE and f.callbacks.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
+@merged
+def _near_singular(w, control, clock):
+    """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know."""
+    return control[BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]
+
+
 _ADVANCE = i8(
-    FUNCTIONS,
+    KIT,
     WORK,
     StepFunction,
     *(VECTOR,) * 9,
@@ -179,7 +211,7 @@ def advance(
         w.notes[FAULT_KIND] = -1.0
         code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
-            code = partition_of_midpoint(f, w, t + 0.5 * size, state, new_state)
+            code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
             if code == CHANGED:
                 memory[0] = 0.0  # what the step keeps is of one that is not taken
                 w.notes[DEPARTURE] = 0.0
@@ -195,11 +227,13 @@ def advance(
             if fixed:
                 # the step keeps its size; only a partition that went bad within it may be the reason
                 if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
-                    return FIXED_STEP_FAILED
+                    return NEAR_SINGULAR if _near_singular(w, control, clock) else FIXED_STEP_FAILED
                 if renew_partition(f, w, t, state[:n]) != DONE:
                     return RANK_LOST
                 retried = t
                 continue
+            if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
+                return NEAR_SINGULAR
             clock[H_LIMIT] = control[LIMIT_FACTOR] * size
             clock[LIMIT_AGE] = 0.0
             clock[H_NEXT] = 0.5 * size
@@ -220,8 +254,14 @@ def advance(
             w.counters[N_REJECTED_ERROR] += 1
             clock[FAILURE_CODE] = DONE
             clock[H_NEXT] = proposal
+            if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
+                return NEAR_SINGULAR
             continue
+        if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
+            clock[H_FAILED] = size
+            return ROWS_VIOLATED
         w.counters[N_ACCEPTED] += 1
+        clock[H_LONG] = max(size, FADING * clock[H_LONG])
         clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
         clock[FAILURE_CODE] = DONE
         clock[N_FIXED] += in_grid
@@ -250,5 +290,12 @@ def advance(
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
-        if control[SYMMETRIC] == 0.0 and partition_is_worn(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
-            return RANK_LOST
+        if control[SYMMETRIC] == 0.0:
+            if f.callbacks.flags[REDUCED] == 0:
+                find_tangents(f, w, clock[T], state[:n])
+            if partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
+                return RANK_LOST
+            clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+            short = size < SHORT * clock[H_LONG] and not fixed and not lands
+            if short and _near_singular(w, control, clock):
+                return NEAR_SINGULAR

@@ -21,7 +21,7 @@ GAIN = 3.0  # Newton's steps have an estimate of lower order and no extrapolatio
 PATIENCE = 10.0  # windows before the first trial of the fixed point, or of Newton's method once more
 LOOPS = 3.0  # solutions of the stages in one attempt: a whole step, two half ones
 
-SWEEPS, NEWTON_ON_TRIAL, NEWTON, SWEEPS_ON_TRIAL = range(4)  # phases
+FIXED_POINT, NEWTON_ON_TRIAL, NEWTON, FIXED_POINT_ON_TRIAL = range(4)  # phases
 
 # places in `memory`: advance() sets LAST_ACCEPTED; behind the scalars stand the memories of the two steps
 (
@@ -33,31 +33,31 @@ SWEEPS, NEWTON_ON_TRIAL, NEWTON, SWEEPS_ON_TRIAL = range(4)  # phases
     ATTEMPTS,
     T_BEGIN,
     EVALUATIONS_BEGIN,
-    SWEEPS_BEGIN,
+    ITERATIONS_BEGIN,
     PRICE,  # evaluations a second, of the loop before a trial
     EXPONENT,
     NEWTON_EXPONENT,
-    SWEEP_MEMORY,  # length of the first of the two memories
+    FIRST_MEMORY,  # length of the first of the two memories
     N_MEMORY_SCALARS,
 ) = range(14)
 
 
-def automatic_memory(sweep_size: int, newton_size: int, exponent: float, newton_exponent: float) -> NDArray[np.float64]:
+def automatic_memory(first_size: int, newton_size: int, exponent: float, newton_exponent: float) -> NDArray[np.float64]:
     """`memory` for steps whose own memories have these lengths and whose errors go with these exponents."""
-    memory = np.zeros(N_MEMORY_SCALARS + sweep_size + newton_size)
+    memory = np.zeros(N_MEMORY_SCALARS + first_size + newton_size)
     memory[WAIT] = PATIENCE
     memory[EXPONENT], memory[NEWTON_EXPONENT] = exponent, newton_exponent
-    memory[SWEEP_MEMORY] = sweep_size
+    memory[FIRST_MEMORY] = first_size
     return memory
 
 
 @compiled
-def _go_over(memory, sweeps, own, phase):
+def _go_over(memory, fixed_point, own, phase):
     """Begin another phase; the loop it uses knows nothing of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
-    sweeps[runge_kutta.HAS_TRIAL] = 0.0
-    sweeps[runge_kutta.HAS_PREVIOUS] = 0.0
+    fixed_point[runge_kutta.HAS_TRIAL] = 0.0
+    fixed_point[runge_kutta.HAS_PREVIOUS] = 0.0
     own[newton.HAS_TRIAL] = 0.0
     own[newton.HAS_PREVIOUS] = 0.0
     own[newton.HAS_JACOBIAN] = 0.0
@@ -65,7 +65,7 @@ def _go_over(memory, sweeps, own, phase):
 
 
 @compiled
-def _choose(w, memory, sweeps, own, t):
+def _choose(w, memory, fixed_point, own, t):
     """After an accepted step: measure, and go over to the other loop where that is due."""
     memory[STEPS] += 1.0
     if memory[STEPS] < SETTLE:
@@ -74,46 +74,46 @@ def _choose(w, memory, sweeps, own, t):
         if memory[STEPS] == SETTLE:
             memory[T_BEGIN] = t
             memory[EVALUATIONS_BEGIN] = w.counters[N_EVALUATIONS]
-            memory[SWEEPS_BEGIN] = w.counters[N_OUTER]
+            memory[ITERATIONS_BEGIN] = w.counters[N_OUTER]
             memory[ATTEMPTS] = 0.0
         return
     price = (w.counters[N_EVALUATIONS] - memory[EVALUATIONS_BEGIN]) / (t - memory[T_BEGIN])
-    slow = w.counters[N_OUTER] - memory[SWEEPS_BEGIN] >= SLOW * LOOPS * memory[ATTEMPTS]
+    slow = w.counters[N_OUTER] - memory[ITERATIONS_BEGIN] >= SLOW * LOOPS * memory[ATTEMPTS]
     phase = memory[PHASE]
     memory[STEPS] = SETTLE - 1.0  # the next window, unless the phase ends
     memory[WINDOWS_TO_WAIT] -= 1.0
-    if phase == SWEEPS and slow and memory[WINDOWS_TO_WAIT] < 0.0:
+    if phase == FIXED_POINT and slow and memory[WINDOWS_TO_WAIT] < 0.0:
         memory[PRICE] = price
-        _go_over(memory, sweeps, own, NEWTON_ON_TRIAL)
+        _go_over(memory, fixed_point, own, NEWTON_ON_TRIAL)
     elif phase == NEWTON and memory[WINDOWS_TO_WAIT] < 0.0:
         memory[PRICE] = price
-        _go_over(memory, sweeps, own, SWEEPS_ON_TRIAL)
-    elif phase in (NEWTON_ON_TRIAL, SWEEPS_ON_TRIAL):
+        _go_over(memory, fixed_point, own, FIXED_POINT_ON_TRIAL)
+    elif phase in (NEWTON_ON_TRIAL, FIXED_POINT_ON_TRIAL):
         by_newton = GAIN * price <= memory[PRICE] if phase == NEWTON_ON_TRIAL else price > GAIN * memory[PRICE]
         passed = by_newton == (phase == NEWTON_ON_TRIAL)
         memory[WAIT] = PATIENCE if passed else 2.0 * memory[WAIT]
         memory[WINDOWS_TO_WAIT] = memory[WAIT]
         if passed:
-            memory[PHASE] = NEWTON if by_newton else SWEEPS
+            memory[PHASE] = NEWTON if by_newton else FIXED_POINT
         else:
-            _go_over(memory, sweeps, own, NEWTON if by_newton else SWEEPS)
+            _go_over(memory, fixed_point, own, NEWTON if by_newton else FIXED_POINT)
 
 
 @kernel(STEP)
 def automatic_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by one of the two loops; errors are raised to their exponents, so that advance() needs none."""
-    split = N_MEMORY_SCALARS + int(memory[SWEEP_MEMORY])
-    sweeps, own = memory[N_MEMORY_SCALARS:split], memory[split:]
+    split = N_MEMORY_SCALARS + int(memory[FIRST_MEMORY])
+    fixed_point, own = memory[N_MEMORY_SCALARS:split], memory[split:]
     accepted = memory[LAST_ACCEPTED]
-    sweeps[runge_kutta.LAST_ACCEPTED] = accepted
+    fixed_point[runge_kutta.LAST_ACCEPTED] = accepted
     own[newton.LAST_ACCEPTED] = accepted
     if accepted == 1.0 and tolerances[ESTIMATE] == 1.0:
-        _choose(w, memory, sweeps, own, t)
+        _choose(w, memory, fixed_point, own, t)
     memory[ATTEMPTS] += 1.0
-    if memory[PHASE] == SWEEPS or memory[PHASE] == SWEEPS_ON_TRIAL:
-        code, error = runge_kutta_step(f, w, options, sweeps, t, h, tolerances, state, new_state)
+    if memory[PHASE] == FIXED_POINT or memory[PHASE] == FIXED_POINT_ON_TRIAL:
+        code, error = runge_kutta_step(f, w, options, fixed_point, t, h, tolerances, state, new_state)
         if code != OUTER_DIVERGED or tolerances[ESTIMATE] == 1.0:
             return code, error ** memory[EXPONENT] if code == DONE else error
-        _go_over(memory, sweeps, own, NEWTON)  # a fixed step cannot become shorter
+        _go_over(memory, fixed_point, own, NEWTON)  # a fixed step cannot become shorter
     code, error = newton_step(f, w, options, own, t, h, tolerances, state, new_state)
     return code, error ** memory[NEWTON_EXPONENT] if code == DONE else error

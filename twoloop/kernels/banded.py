@@ -6,7 +6,16 @@ of M, 2 b for an LU, whose row exchanges fill another b diagonals. b is the band
 
 import numpy as np
 
-from twoloop.kernels.common import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR, compiled, inlined
+from twoloop.kernels.common import (
+    BANDWIDTH,
+    DIAGONAL_MASS,
+    DONE,
+    MASS_NOT_DEFINITE,
+    SINGULAR,
+    compiled,
+    inlined,
+    merged,
+)
 from twoloop.kernels.lapack import DPBTRF, DPBTRS, NO_TRANSPOSE, UPPER, call
 from twoloop.kernels.linalg import lu_factor, lu_solve
 
@@ -18,10 +27,10 @@ BANDED_FROM = 56
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
     """Whether banded linear algebra is faster than dense, and fits into the memory that is there for the dense."""
-    return n_q >= max(BANDED_FROM, 3 * bandwidth + 1 + 2 * n_c)
+    return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
 
 
-@inlined
+@merged
 def banded_mass(f):
     """Whether M is factored as a band (a diagonal M is simpler still)."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
@@ -56,19 +65,12 @@ def factor_banded_mass(f, w):
     return DONE if call(w.lapack[DPBTRF], (UPPER, n, b, band, b + 1)) == 0 else MASS_NOT_DEFINITE
 
 
-@inlined
+@merged
 def solve_banded_mass(f, w, x):
     """x becomes M^-1 x."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     call(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
-
-
-@inlined
-def inverse_mass_border(w):
-    """M^-1 Cq^T as rows (n_c, n_q), in the memory of w.W."""
-    n_c, n = w.Cq.shape
-    return w.W.reshape(n_c * n).reshape((n_c, n))
 
 
 @compiled

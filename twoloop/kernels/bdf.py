@@ -8,18 +8,18 @@ differences of the full (q, v), dependents with their restored values, so that a
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.kernels.calls import accelerations, evaluate_state, rounding_floor
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, inlined, kernel
-from twoloop.kernels.inner import accelerations, evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure
-from twoloop.kernels.runge_kutta import sweep_accelerations
+from twoloop.kernels.runge_kutta import iterate_accelerations
 from twoloop.kernels.stages import options_array as gauss_options
 from twoloop.tableaux import gauss
 
 MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
-MAX_SWEEPS = 60
+MAX_ITERATIONS = 60
 SAFETY = 0.9  # of advance(): the next step is SAFETY over the returned error times this one
 BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
 NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
@@ -154,12 +154,12 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
     copy(prediction, new_state[: 2 * n])  # dependents: where Newton starts
     copy(rate[n:], a1)
     before = np.inf
-    for sweep in range(MAX_SWEEPS):
+    for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for m in w.independent:
             v1[m] = prediction[n + m] + c * (a1[m] - rate[n + m])
             q1[m] = prediction[m] + c * (v1[m] - rate[m])
-        code = evaluate(f, w, t, q1, v1, options[INNER_TOL], a_new, lam1)
+        code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a_new, lam1)
         if code != DONE:
             return code
         change = 0.0
@@ -169,7 +169,7 @@ def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
         # the first iteration evaluates the prediction, never to be accepted: extrapolation alone is unstable
-        if sweep > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
+        if iteration > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]
                 w.predicted[k] = prediction[m] + c * (prediction[n + m] + c * (a1[m] - rate[n + m]) - rate[m])
@@ -257,7 +257,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     V_stage = scratch[2 * s * n : 3 * s * n].reshape((s, n))
     for j in range(s):
         copy(state[2 * n : 3 * n], A_stage[j])
-    code = sweep_accelerations(
+    code = iterate_accelerations(
         f, w, options[N_SCALARS:], tolerances, t, h, state[:n], state[n : 2 * n], A_stage, Q_stage, V_stage, q1, v1
     )
     if code == DONE:

@@ -5,20 +5,20 @@ and takes any mechanism (and any method) as a first-class function.
 """
 
 import hashlib
+import inspect
+import re
 from collections import namedtuple
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from numba import njit, types
 from numba.core.dispatcher import Dispatcher
 from numba.extending import typeof_impl
 
 from twoloop.caches import compile_kept
 from twoloop.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
-from twoloop.kernels.lapack import N_ROUTINES
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
@@ -36,46 +36,78 @@ def _type_of_functions(value: Any, context: Any) -> Any:
     return FUNCTIONS
 
 
-# places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FIRST_GIVEN = range(4)
+class Kit(NamedTuple):
+    """What a step gets: the callbacks, and the inner loop, which is compiled once and not again in every step."""
+
+    callbacks: Any
+    inner: Any
+
+
+# places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense; REDUCED: accelerations from T^T M T
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, REDUCED, FIRST_GIVEN = range(5)
 GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
-GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN = (
-    GIVEN[name] for name in ("gamma", "force_by_q", "force_by_v", "reaction_by_q")
+CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
+    GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")
+)
+NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
+    GIVEN[name] for name in ("nonholonomic_rate", "nonholonomic_gamma")
 )
 
 
 class Work(NamedTuple):
-    """Arrays that an evaluation writes; made once a run. Sizes: n_q coordinates, n_c constraints."""
+    """Arrays that an evaluation writes; made once a run.
+
+    Sizes: n_q coordinates; n_c + n_a rows of C_q and A, of which r_v have full rank, among them r of C_q; n_dof = n_q -
+    r_v. Fields that end in _v belong to velocities; without rows of A they are the same arrays as those of positions.
+    """
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) of a constant M the inverse, else its factors, see ldl_factor; or banded ones, see banded.py
-    Cq: Any  # (n_c, n_q) constraint Jacobian at the last position
-    Cqd: Any  # (n_c, n_c) LU factors of its dependent columns
-    S: Any  # (n_c, n_c) Cq M^-1 Cq^T and its factors
-    W: Any  # (n_q, n_c) Cq^T with a diagonal M; else M^-1 Cq^T, column after column
-    Cqx: Any  # (n_c, n_q) Jacobian at a displaced point (Q_d by differences); scratch for full pivoting
-    Cq_of_S: Any  # (n_c, n_q) the Cq that S and W belong to, where M is constant, not diagonal; NaN: none
+    L: Any  # (n_q, n_q) of a constant M the inverse, else its factors, see ldl_factor; or banded ones
+    G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
+    entries: Any  # the same numbers as a vector
+    S: Any  # (r_v, r_v) G M^-1 G^T of the rows that count, and its factors
+    W: Any  # (r_v, n_q) its rows G M^-1
+    A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
+    MT: Any  # (n_q, n_dof) M T
+    D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0: in order of elimination
+    Gx: Any  # (n_c + n_a, n_q) rows at a displaced point (Q_d by differences); scratch for full pivoting
+    G_of_S: Any  # (n_c + n_a, n_q) the G that S and W belong to, where M is constant, not diagonal; NaN: none
+    pattern: Any  # (n_c + n_a, n_q) 1 where G was ever seen to have an entry
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
+    y: Any  # (n_q) scratch
     C: Any  # (n_c) constraint, and corrections
-    Ct: Any  # (n_c) constraint rate
-    Qd: Any  # (n_c) right-hand side of Cq a = Qd
-    Qd_tried: Any  # (2, n_c) the same by differences over a double length, and with the length tried before
-    g: Any  # (n_c) scratch
-    lam: Any  # (n_c) multipliers of an evaluation that is not kept
-    dependent: Any  # (n_c) columns of the dependent coordinates
-    independent: Any  # (n_q - n_c) columns of the independent coordinates
-    pivots: Any  # (n_c) row exchanges of the LU factors
+    Rate: Any  # (n_c + n_a) C_t and b
+    Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma
+    g: Any  # (n_c + n_a) scratch
+    z: Any  # (r_v) scratch
+    lam: Any  # (n_c + n_a) multipliers of an evaluation that is not kept
+    minimum: Any  # room for the multipliers of least norm
+    rows: Any  # (r) rows of C that count
+    dependent: Any  # (r) columns of the coordinates that they determine
+    independent: Any  # (n_q - r) columns of the others
+    index: Any  # program of the factors of C_qd, see factors.py
+    values: Any  # the factors
+    rows_v: Any  # (r_v) rows of G that count
+    dependent_v: Any  # (r_v)
+    independent_v: Any  # (n_dof)
+    index_v: Any
+    values_v: Any
     order: Any  # (n_q) scratch: column order of the full pivoting
+    row_order: Any  # (n_c + n_a) scratch: row order
     counters: Any  # (N_COUNTERS) see below
     lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
-    predicted: Any  # (n_c) dependent positions that the integration formula gives, before the constraints restore them
+    predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see below
 
 
-_INTEGER_FIELDS = ("dependent", "independent", "pivots", "order", "counters", "lapack")
-_MATRIX_FIELDS = ("M", "L", "Cq", "Cqd", "S", "W", "Cqx", "Cq_of_S", "Qd_tried")
+_INTEGER_FIELDS = {
+    *("rows", "dependent", "independent", "index", "rows_v", "dependent_v", "independent_v", "index_v"),
+    *("order", "row_order", "counters", "lapack"),
+}
+_MATRIX_FIELDS = {"M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "Gamma_tried"}
 WORK = types.NamedTuple(
     [MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields],
     Work,
@@ -107,14 +139,42 @@ WORK = types.NamedTuple(
     GAMMA_SHARE,  # of the longest length over which to difference
     GAMMA_ACCURACY,  # reached when that share was chosen
     GAMMA_SCALE,  # largest entry of Q_d so far
+    REUSE,  # correction of a position below which the Jacobian before it serves for velocities and accelerations
+    ROUNDED,  # the same at a state that may be accepted: rounding of the positions
+    GENERATION,  # how many partitions there were
+    RANK,  # of C_q, and of C_q and A, where they are not what the workspace is made for
+    RANK_V,
+    CONTRADICTION,  # row that was taken for redundant and is violated
+    PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
+    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     N_NOTES,
-) = range(11)
+) = range(19)
 
 # what a kernel returns: DONE, or why it could not
-DONE, OUTER_DIVERGED, INNER_DIVERGED, SINGULAR, NOT_FINITE, MASS_NOT_DEFINITE, GAMMA_INACCURATE = range(7)
+(
+    DONE,
+    OUTER_DIVERGED,
+    INNER_DIVERGED,
+    SINGULAR,
+    NOT_FINITE,
+    MASS_NOT_DEFINITE,
+    GAMMA_INACCURATE,
+    RANK_DIFFERS,
+    ROWS_CONTRADICT,
+) = range(9)
 
-# (functions, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
-STEP = types.Tuple((i8, f8))(FUNCTIONS, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
+# (callbacks, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
+INNER = i8(FUNCTIONS, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
+KIT = types.NamedTuple([FUNCTIONS, types.FunctionType(INNER)], Kit)
+
+
+@typeof_impl.register(Kit)
+def _type_of_kit(value: Any, context: Any) -> Any:
+    return KIT
+
+
+# (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
+STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
 StepFunction = types.FunctionType(STEP)
 
 # places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance; from
@@ -123,11 +183,29 @@ RTOL, ESTIMATE, LEAST, ATOL = range(4)
 
 
 @cache
-def _stamp() -> str:
-    """A digest of what kernels depend on: all their sources, and the table of callbacks."""
+def _text(module: str) -> str:
+    path = Path(__file__).parent / f"{module}.py"
+    return path.read_text() if path.exists() else ""
+
+
+def _imports(text: str) -> set[str]:
+    """Names of the modules of this folder that a source imports."""
+    together = re.findall(r"^from twoloop\.kernels import (.+)$", text, re.MULTILINE)
+    names = [name.strip() for line in together for name in line.split(",")]
+    return {*names, *re.findall(r"^from twoloop\.kernels\.(\w+) import", text, re.MULTILINE)}
+
+
+@cache
+def _stamp(module: str) -> str:
+    """A digest of what the kernels of a module depend on: its source, those of all it imports, and the callbacks."""
+    known: set[str] = set()
+    found = {module}
+    while found:
+        known |= found
+        found = {name for each in found for name in _imports(_text(each)) if name not in known}
     digest = hashlib.sha256(repr((FUNCTIONS, GIVEN)).encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for each in sorted(known):
+        digest.update(_text(each).encode())
     return digest.hexdigest()
 
 
@@ -135,10 +213,16 @@ _ANNOUNCEMENT = "twoloop: compiling the integrator, two or three minutes; later 
 
 
 def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Compile a function of the integrator for `signature` and keep the machine code on disk."""
+    """Compile a function of the integrator, and keep the machine code until a file that it needs changes."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
-        return compile_kept(function, signature, (_stamp(), ""), announcement=_ANNOUNCEMENT, **_OPTIONS)
+        return compile_kept(
+            function,
+            signature,
+            (_stamp(Path(inspect.getfile(function)).stem), ""),
+            announcement=_ANNOUNCEMENT,
+            **_OPTIONS,
+        )
 
     return compile_now
 
@@ -151,38 +235,26 @@ _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "_nrt": False,
 }
+
+
+def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """A decorator for what kernels call.
+
+    Functions of `f` and `w` get no code to take arguments from Python, which would be long; they must not be called
+    from there.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Dispatcher:
+        code = function.__code__
+        internal = not {"f", "w"}.isdisjoint(code.co_varnames[: code.co_argcount])
+        return njit(**{**_OPTIONS, "no_cpython_wrapper": internal, "no_cfunc_wrapper": internal, **options})(function)
+
+    return decorate
+
+
 # a helper whose floating-point operations keep their order; said outright, because a callee inherits its caller's flags
-exact = njit(**{**_OPTIONS, "fastmath": False})
-compiled = njit(**_OPTIONS)  # a helper that kernels call
-# a helper that vanishes in its caller: a call would pass the thirty fields of Functions and Work by value
-inlined = njit(**_OPTIONS, inline="always")
-
-
-def make_work(n_q: int, n_c: int) -> Work:
-    """Allocate the workspace of one run."""
-    return Work(
-        M=np.zeros((n_q, n_q)),
-        L=np.zeros((n_q, n_q)),
-        Cqd=np.zeros((n_c, n_c)),
-        S=np.zeros((n_c, n_c)),
-        W=np.zeros((n_q, n_c)),
-        Cq=np.zeros((n_c, n_q)),
-        Cqx=np.zeros((n_c, n_q)),
-        Cq_of_S=np.full((n_c, n_q), np.nan),
-        Q=np.zeros(n_q),
-        x=np.zeros(n_q),
-        C=np.zeros(n_c),
-        Ct=np.zeros(n_c),
-        Qd=np.zeros(n_c),
-        Qd_tried=np.zeros((2, n_c)),
-        g=np.zeros(n_c),
-        lam=np.zeros(n_c),
-        dependent=np.zeros(n_c, dtype=np.int64),
-        independent=np.zeros(n_q - n_c, dtype=np.int64),
-        pivots=np.zeros(n_c, dtype=np.int64),
-        order=np.zeros(n_q, dtype=np.int64),
-        counters=np.zeros(N_COUNTERS, dtype=np.int64),
-        lapack=np.zeros(N_ROUTINES, dtype=np.int64),
-        predicted=np.zeros(n_c),
-        notes=np.zeros(N_NOTES),
-    )
+exact = _helper(fastmath=False)
+compiled = _helper()  # a helper that kernels call
+inlined = _helper(inline="always")  # one that vanishes in its caller; only such a one can return views of arrays
+# the same later, by LLVM, and so typed once. Calls of what gets Functions and Work are dear
+merged = _helper(forceinline=True)

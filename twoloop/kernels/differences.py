@@ -1,4 +1,4 @@
-"""Q_d by differences of C_q v + C_t along the motion, with a length that is checked and shortened where it must be.
+"""Q_d and its like for non-holonomic rows, by differences along the motion over a length that is checked.
 
 Two central differences, over a length e and over 2 e, give the derivative to order 4, and their disagreement its error.
 """
@@ -14,8 +14,9 @@ from twoloop.kernels.common import (
     GAMMA_SHARE,
     compiled,
     exact,
-    inlined,
+    merged,
 )
+from twoloop.kernels.constraints import constraint_rates, constraint_rows
 from twoloop.kernels.linalg import copy
 
 LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference
@@ -31,7 +32,7 @@ def representable(t, h):
     return (t + h) - t
 
 
-@inlined
+@merged
 def longest_difference(q, v):
     """Seconds over which to difference along the motion: LENGTH, or until q moves by LENGTH max|q|.
 
@@ -47,45 +48,45 @@ def longest_difference(q, v):
 
 
 @compiled
-def _differences(f, w, t, q, v, e):
-    """Q_d into w.Qd, by differences over e and 2 e; its largest entry and the largest disagreement of the two."""
-    n_c = w.g.size
-    w.Qd[:] = 0.0
-    w.Qd_tried[0][:] = 0.0
+def _differences(f, w, t, q, v, e, first, last):
+    """Gamma by differences over e and 2 e; its largest entry and the largest disagreement of the two."""
+    twice = w.Gamma_tried[0]
+    for i in range(first, last):
+        w.Gamma[i] = 0.0
+        twice[i] = 0.0
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * e
         for j in range(q.size):
             w.x[j] = q[j] + shift * v[j]
-        w.Cqx[:, :] = 0.0
-        f.jacobian(t + shift, w.x, f.p, w.Cqx)
-        w.g[:] = 0.0
-        f.constraint_rate(t + shift, w.x, f.p, w.g)
-        for i in range(n_c):
+        w.Gx[:, :] = 0.0
+        constraint_rows(f, w, t + shift, w.x, w.Gx)
+        constraint_rates(f, w, t + shift, w.x, w.g)
+        for i in range(first, last):
             for j in range(v.size):
-                w.g[i] += w.Cqx[i, j] * v[j]
+                w.g[i] += w.Gx[i, j] * v[j]
             if k == 0 or k == 3:
-                w.Qd_tried[0][i] -= w.g[i] / (2.0 * shift)
+                twice[i] -= w.g[i] / (2.0 * shift)
             else:
-                w.Qd[i] -= w.g[i] / (2.0 * shift)
+                w.Gamma[i] -= w.g[i] / (2.0 * shift)
     largest = 0.0
     disagreement = 0.0
-    for i in range(n_c):
-        disagreement = max(disagreement, abs(w.Qd[i] - w.Qd_tried[0][i]))
-        w.Qd[i] = (4.0 * w.Qd[i] - w.Qd_tried[0][i]) / 3.0
-        largest = max(largest, abs(w.Qd[i]))
-        if not np.isfinite(w.Qd[i]):
+    for i in range(first, last):
+        disagreement = max(disagreement, abs(w.Gamma[i] - twice[i]))
+        w.Gamma[i] = (4.0 * w.Gamma[i] - twice[i]) / 3.0
+        largest = max(largest, abs(w.Gamma[i]))
+        if not np.isfinite(w.Gamma[i]):
             return np.nan, np.nan
     return largest, disagreement
 
 
-@inlined
+@merged
 def _limit(notes):
     """Largest disagreement that needs no other length: the result is better by far, were it not for rounding."""
     return max(notes[GAMMA_REQUIRED], CERTAIN) * notes[GAMMA_SCALE]
 
 
 @compiled
-def _choose_length(f, w, t, q, v, longest):
+def _choose_length(f, w, t, q, v, longest, first, last):
     """Difference over ever shorter lengths until the result no longer changes, else keep the one that changed it least.
 
     DONE, or GAMMA_INACCURATE where it changed by more than is allowed.
@@ -96,14 +97,14 @@ def _choose_length(f, w, t, q, v, longest):
         e = representable(t, share * longest)
         if e <= 0.0:
             break
-        copy(w.Qd, w.Qd_tried[1])
-        largest, disagreement = _differences(f, w, t, q, v, e)
+        copy(w.Gamma, w.Gamma_tried[1])
+        largest, disagreement = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest):
             return DONE
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
         change = 0.0
-        for i in range(w.Qd.size):
-            change = max(change, abs(w.Qd[i] - w.Qd_tried[1, i]))
+        for i in range(first, last):
+            change = max(change, abs(w.Gamma[i] - w.Gamma_tried[1, i]))
         if level > 0 and change < best and disagreement <= _limit(w.notes):
             best = change
             w.notes[GAMMA_SHARE] = share
@@ -111,21 +112,23 @@ def _choose_length(f, w, t, q, v, longest):
                 break
         share *= 0.25
     w.notes[GAMMA_ACCURACY] = best / w.notes[GAMMA_SCALE]
-    _differences(f, w, t, q, v, representable(t, w.notes[GAMMA_SHARE] * longest))
+    _differences(f, w, t, q, v, representable(t, w.notes[GAMMA_SHARE] * longest), first, last)
     return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
 
 
 @compiled
-def gamma_by_differences(f, w, t, q, v):
-    """Q_d = -d/de [C_q v + C_t](t + e, q + e v) at e = 0, into w.Qd, or GAMMA_INACCURATE where no length will do.
+def gamma_by_differences(f, w, t, q, v, first, last):
+    """Rows first to last of Gamma by differences, into w.Gamma, or GAMMA_INACCURATE where no length will do.
 
-    Errors are judged relative to the largest entry that Q_d has had in this run. The length is a share of
+    Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
+
+    Errors are judged relative to the largest entry that Gamma has had in this run. The length is a share of
     longest_difference, found by trial where the two differences disagree: a drive of kilohertz needs a short one.
     """
     longest = longest_difference(q, v)
     e = representable(t, w.notes[GAMMA_SHARE] * longest)
     if e > 0.0:
-        largest, disagreement = _differences(f, w, t, q, v, e)
+        largest, disagreement = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
             return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
@@ -133,4 +136,4 @@ def gamma_by_differences(f, w, t, q, v):
             w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
         if disagreement <= _limit(w.notes):
             return DONE
-    return _choose_length(f, w, t, q, v, longest)
+    return _choose_length(f, w, t, q, v, longest, first, last)

@@ -7,10 +7,10 @@ inner loop restores the dependents of every stage, so that the step never leaves
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twoloop.kernels.calls import evaluate, evaluate_state
 from twoloop.kernels.common import ATOL, DEPARTURE, DONE, ESTIMATE, N_OUTER, RTOL, STEP, compiled, inlined, kernel
-from twoloop.kernels.inner import accelerations, evaluate
 from twoloop.kernels.linalg import copy
-from twoloop.kernels.predictor import restore_predicted
+from twoloop.kernels.predictor import departure, keep_predicted
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, N_SCALARS = range(3)
@@ -121,7 +121,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         # dependents too: where Newton starts
         _move(q, h, A[j, :j], V_stage, q_stage)
         _move(v, h, A[j, :j], A_stage, V_stage[j])
-        code = evaluate(f, w, t + c[j] * h, q_stage, V_stage[j], options[INNER_TOL], A_stage[j], w.lam)
+        code = evaluate(f, w, t + c[j] * h, q_stage, V_stage[j], options[INNER_TOL], A_stage[j])
         if code != DONE:
             return code, np.inf
     _move(q, h, b, V_stage, q1)
@@ -131,7 +131,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, estimate)
         if not error <= 1.0:
             return DONE, error
-    code = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
+    keep_predicted(w, q1)
+    code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
-        code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+        w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
     return code, max(error, w.notes[DEPARTURE])

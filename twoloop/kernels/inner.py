@@ -1,336 +1,179 @@
-"""The inner loop: dependent positions by Newton, dependent velocities by a linear solve, then accelerations.
+"""The inner loop: dependent positions by Newton, dependent velocities by a linear solve.
 
 Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8.
 """
 
 import numpy as np
 
-from twoloop.kernels.banded import banded_mass, factor_banded_mass, inverse_mass_border, solve_banded_mass
 from twoloop.kernels.common import (
-    CONSTANT_MASS,
-    DIAGONAL_MASS,
+    CONSTRAINT_RATE_GIVEN,
+    CONTRADICTION,
     DONE,
-    FAULT_KIND,
-    FAULT_TIME,
-    GAMMA_GIVEN,
-    GAMMA_SCALE,
     INNER_DIVERGED,
-    MASS_NOT_DEFINITE,
-    N_EVALUATIONS,
+    KINEMATICS_GIVEN,
+    KNOWN,
     N_FACTORIZATIONS,
     N_INNER,
-    NOT_FINITE,
+    NONHOLONOMIC_RATE_GIVEN,
+    REDUCED,
+    ROWS_CONTRADICT,
     SINGULAR,
-    Functions,
     compiled,
-    inlined,
+    merged,
 )
-from twoloop.kernels.differences import gamma_by_differences
-from twoloop.kernels.linalg import copy, invert_definite, ldl_factor, ldl_solve, lu_factor, lu_solve
-from twoloop.kernels.partition import RANK_TOLERANCE
+from twoloop.kernels.constraints import constraint_rates, constraint_rows, gather_independent_columns, kinematics
+from twoloop.kernels.factors import columns_of, factor, rows_of, solve, solve_rows
+from twoloop.kernels.finite import CONSTRAINT, JACOBIAN, finite, not_finite
+from twoloop.kernels.partition import RANK_TOLERANCE, note_pattern, write_programs
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
 ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
-ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
-
-_MASS, _FORCE, _CONSTRAINT, _JACOBIAN, _RATE, _GAMMA = (
-    Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
-)
+CONTRADICTS = 1e-7  # relative to the mechanism's size: what a redundant row may be violated by
 
 
 @compiled
-def _finite(A):
-    for i in range(A.shape[0]):
-        for j in range(A.shape[1]):
-            if not np.isfinite(A[i, j]):
-                return False
-    return True
+def _factor_anew(w, t, q):
+    """The factors by another order of elimination, or why there are none."""
+    note_pattern(w.G, w.pattern)
+    if not finite(w.G):
+        return not_finite(w.notes, JACOBIAN, t, q)
+    if not write_programs(w):
+        return SINGULAR
+    ratio = min(factor(w.entries, w.index, w.values), factor(w.entries, w.index_v, w.values_v))
+    return DONE if ratio > RANK_TOLERANCE else SINGULAR
 
 
-@inlined
-def _equal(A, B):
-    for i in range(A.shape[0]):
-        for j in range(A.shape[1]):
-            if A[i, j] != B[i, j]:  # also true for NaN
-                return False
-    return True
-
-
-@compiled
-def _not_finite(notes, kind, t, q):
-    """Note which callback gave a value that is not finite, for the message; none where q itself is not finite."""
-    notes[FAULT_KIND] = kind if _finite_vector(q) else -1.0
-    notes[FAULT_TIME] = t
-    return NOT_FINITE
-
-
-@compiled
-def _finite_vector(x):
-    finite = True
-    for j in range(x.size):
-        finite = finite and np.isfinite(x[j])
-    return finite
-
-
-@compiled
-def _which_acceleration(Ct, Qd, Q):
-    """Place in Functions of the callback that gave a value that is not finite; -1: none of these three."""
-    if not _finite_vector(Ct):
-        return _RATE
-    if not _finite_vector(Qd):
-        return _GAMMA
-    return _FORCE if not _finite_vector(Q) else -1
-
-
-@inlined
-def factor_dependent(f, w, t, q):
-    """C_q at (t, q), and the LU factors of its dependent columns."""
-    w.Cq[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.Cq)
-    n_c = w.C.size
-    for i in range(n_c):
-        for k in range(n_c):
-            w.Cqd[i, k] = w.Cq[i, w.dependent[k]]
-    ratio = lu_factor(w.Cqd, w.pivots)
+@merged
+def _factor_rows(w, t, q):
+    """The factors of the dependent columns of w.G."""
+    ratio = factor(w.entries, w.index, w.values)
     w.counters[N_FACTORIZATIONS] += 1
-    if not ratio > RANK_TOLERANCE:
-        return SINGULAR if _finite(w.Cq) else _not_finite(w.notes, _JACOBIAN, t, q)
-    return DONE
+    if w.Rate.size > w.C.size:
+        ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
+        w.counters[N_FACTORIZATIONS] += 1
+    # else the order of elimination suits these numbers no longer, or there are none
+    return DONE if ratio > RANK_TOLERANCE else _factor_anew(w, t, q)
 
 
-@inlined
-def _positions(f, w, t, q, tolerance):
-    """Eq. (15): Newton on the dependent positions of q, update first, then test the correction."""
+@merged
+def factor_dependent(f, w, t, q):
+    """C_q and A at (t, q), and the factors of the dependent columns."""
+    w.notes[KNOWN] = 0.0
+    w.entries[:] = 0.0
+    constraint_rows(f, w, t, q, w.G)
+    return _factor_rows(w, t, q)
+
+
+@merged
+def positions(f, w, t, q, v, tolerance, reuse):
+    """Eq. (15): Newton on the dependent positions of q, update first, then test the correction.
+
+    Leaves rows and factors at q in w, or those before a last correction of at most `reuse`; by the fused callback also
+    w.Rate and w.Gamma at v, which is not restored yet.
+    """
     before = np.inf
+    converged = w.C.size == 0
+    fused = f.flags[KINEMATICS_GIVEN] == 1
     for _ in range(MAX_INNER):
-        code = factor_dependent(f, w, t, q)
-        if code != DONE:
+        if fused:
+            kinematics(f, w, t, q, v)
+            code = _factor_rows(w, t, q)
+        else:
+            code = factor_dependent(f, w, t, q)
+        if code != DONE or converged:
             return code
-        w.C[:] = 0.0
-        f.constraint(t, q, f.p, w.C)
-        lu_solve(w.Cqd, w.pivots, w.C)
+        if not fused:
+            w.C[:] = 0.0
+            f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
+        rows, columns = rows_of(w.index), columns_of(w.index)
+        for k in range(rows.size):
+            w.z[k] = w.C[rows[k]]
+        solve(w.index, w.values, w.z)
         correction = 0.0
-        for k in range(w.C.size):
-            if not np.isfinite(w.C[k]):
-                return _not_finite(w.notes, _CONSTRAINT, t, q)
-            q[w.dependent[k]] -= w.C[k]
-            correction = max(correction, abs(w.C[k]))
-        if correction <= tolerance:
+        for k in range(rows.size):
+            if not np.isfinite(w.z[k]):
+                return not_finite(w.notes, CONSTRAINT, t, q)
+            q[columns[k]] -= w.z[k]
+            correction = max(correction, abs(w.z[k]))
+        if correction <= reuse:
             return DONE
-        if correction > CONTRACTION * before:
+        converged = correction <= tolerance
+        if not converged and correction > CONTRACTION * before:
             # at large coordinates rounding may stand above the tolerance; else this is no longer Newton's region,
             # and to go on could end on another assembly of the mechanism
             largest = 0.0
             for j in range(q.size):
                 largest = max(largest, abs(q[j]))
-            return DONE if correction <= ROUNDING * largest else INNER_DIVERGED
+            converged = correction <= ROUNDING * largest
+            if not converged:
+                return INNER_DIVERGED
         before = correction
     return INNER_DIVERGED
 
 
-@inlined
-def _velocities(f, w, t, q, v):
-    """Eq. (14): the dependent velocities of v, C_qd v_d = -C_t - C_qi v_i; leaves C_q at q in w.Cq."""
-    code = factor_dependent(f, w, t, q)
-    if code != DONE:
-        return code
-    w.Ct[:] = 0.0
-    f.constraint_rate(t, q, f.p, w.Ct)
-    for i in range(w.Ct.size):
-        total = -w.Ct[i]
-        for k in range(w.independent.size):
-            j = w.independent[k]
-            total -= w.Cq[i, j] * v[j]
-        w.g[i] = total
-    lu_solve(w.Cqd, w.pivots, w.g)
-    for k in range(w.g.size):
-        v[w.dependent[k]] = w.g[k]
-    return DONE
+@merged
+def tangents(f, w, t, q):
+    """The velocities that the constraints allow into w.D, from the rows and factors in w."""
+    if f.flags[KINEMATICS_GIVEN] == 0 or w.notes[KNOWN] == 0.0:
+        constraint_rates(f, w, t, q, w.Rate)
+    gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
+    driven = f.flags[CONSTRAINT_RATE_GIVEN] == 1 or f.flags[NONHOLONOMIC_RATE_GIVEN] == 1
+    solve_rows(w.index_v, w.values_v, w.D, w.D.shape[0] if driven else w.D.shape[0] - 1)
 
 
-@inlined
-def rounding_floor(q):
-    """Relative change below which a fixed-point iteration that stops shrinking has converged: q is rounded."""
-    size = 0.0
+@merged
+def velocities(f, w, t, q, v, reuse):
+    """Eq. (14): the dependent velocities of v, G_d v_d = -(C_t, b) - G_i v_i, from the rows and factors in w.
+
+    After the fused callback w.Gamma is known where they change by at most `reuse`.
+    """
+    rows, columns = rows_of(w.index_v), columns_of(w.index_v)
+    n_dof = w.independent_v.size
+    w.notes[KNOWN] = float(f.flags[KINEMATICS_GIVEN])
+    if f.flags[REDUCED] == 1:
+        tangents(f, w, t, q)
+        for k in range(rows.size):
+            w.z[k] = w.D[n_dof, k]
+        for j in range(n_dof):
+            speed = v[w.independent_v[j]]
+            for k in range(rows.size):
+                w.z[k] += w.D[j, k] * speed
+    else:
+        if w.notes[KNOWN] == 0.0:
+            constraint_rates(f, w, t, q, w.Rate)
+        for k in range(rows.size):
+            total = -w.Rate[rows[k]]
+            for j in w.independent_v:
+                total -= w.G[rows[k], j] * v[j]
+            w.z[k] = total
+        solve(w.index_v, w.values_v, w.z)
+    change = 0.0
+    for k in range(rows.size):
+        change = max(change, abs(v[columns[k]] - w.z[k]))
+        v[columns[k]] = w.z[k]
+    if not change <= reuse:
+        w.notes[KNOWN] = 0.0
+
+
+@compiled
+def redundant_rows_hold(f, w, t, q, v):
+    """Whether the rows that were left out hold at an accepted state; needs C_q and A there in w.G."""
+    w.C[:] = 0.0
+    f.constraint(t, q, f.p, w.C)
+    size, speed = 1.0, 1.0
     for j in range(q.size):
         size = max(size, abs(q[j]))
-    return max(ROUNDING, ROUNDING_OF_Q * size)
-
-
-@inlined
-def acceleration_constraint(f, w, t, q, v):
-    """The right-hand side Q_d of C_q a = Q_d, into w.Qd; DONE, or why it cannot be had."""
-    code = DONE
-    if f.flags[GAMMA_GIVEN] == 1:
-        w.Qd[:] = 0.0
-        f.gamma(t, q, v, f.p, w.Qd)
-    else:
-        code = gamma_by_differences(f, w, t, q, v)
-    return code
-
-
-@inlined
-def factor_mass(f, w, t, q):
-    """M(t, q), and of a constant M its inverse, which is quicker to apply; else its factors."""
-    w.M[:, :] = 0.0
-    f.mass(t, q, f.p, w.M)
-    if banded_mass(f):
-        code = factor_banded_mass(f, w)
-    else:
-        for i in range(w.Q.size):
-            copy(w.M[i], w.L[i])
-        definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
-        code = DONE if definite else MASS_NOT_DEFINITE
-    if code == DONE:
-        return DONE
-    return MASS_NOT_DEFINITE if _finite(w.M) else _not_finite(w.notes, _MASS, t, q)
-
-
-@inlined
-def _times_inverse_mass(f, w, x, y):
-    """y = M^-1 x; they may be one array unless M is constant, dense and not diagonal."""
-    n = x.size
-    if f.flags[DIAGONAL_MASS] == 1:
-        for i in range(n):
-            y[i] = x[i] * w.L[i, i]
-    elif f.flags[CONSTANT_MASS] == 1 and not banded_mass(f):
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += w.L[i, j] * x[j]
-            y[i] = total
-    else:
-        copy(x, y)
-        if banded_mass(f):
-            solve_banded_mass(f, w, y)
-        else:
-            ldl_solve(w.L, y)
-
-
-@inlined
-def _schur_complement(f, w):
-    """Upper triangle of S = C_q M^-1 C_q^T into w.S."""
-    n_c, n_q = w.Cq.shape
-    w.S[:, :] = 0.0
-    if f.flags[DIAGONAL_MASS] == 1:
-        for j in range(n_q):
-            for i in range(n_c):
-                w.W[j, i] = w.Cq[i, j]
-        for j in range(n_q):
-            for i in range(n_c):
-                if w.W[j, i] != 0.0:
-                    factor = w.W[j, i] * w.L[j, j]
-                    for k in range(i, n_c):
-                        w.S[i, k] += factor * w.W[j, k]
-        return
-    solved = inverse_mass_border(w)
-    for i in range(n_c):
-        _times_inverse_mass(f, w, w.Cq[i], solved[i])
-    for i in range(n_c):
-        for k in range(i, n_c):
-            total = 0.0
-            for j in range(n_q):
-                total += w.Cq[i, j] * solved[k, j]
-            w.S[i, k] = total
-
-
-@inlined
-def _factor_schur_complement(f, w):
-    """S and its factors; with a constant M only if C_q has changed, as that of linear constraints never does."""
-    keep = f.flags[CONSTANT_MASS] == 1 and f.flags[DIAGONAL_MASS] == 0
-    if keep:
-        if _equal(w.Cq, w.Cq_of_S):
-            return DONE
-        w.Cq_of_S[0, 0] = np.nan
-    _schur_complement(f, w)
-    w.counters[N_FACTORIZATIONS] += 1
-    if not ldl_factor(w.S):
-        return SINGULAR if _finite(w.S) else NOT_FINITE
-    if keep:
-        for i in range(w.C.size):
-            copy(w.Cq[i], w.Cq_of_S[i])
+        speed = max(speed, abs(v[j]))
+    for i in range(w.Rate.size):
+        largest = 0.0
+        total = w.Rate[i]
+        for j in range(q.size):
+            largest = max(largest, abs(w.G[i, j]))
+            total += w.G[i, j] * v[j]
+        off = abs(w.C[i]) > CONTRADICTS * size * largest if i < w.C.size else False
+        if off or abs(total) > CONTRADICTS * speed * largest:
+            w.notes[CONTRADICTION] = i
+            return ROWS_CONTRADICT
     return DONE
-
-
-@inlined
-def _accelerations(f, w, t, q, v, a, lam):
-    """Eqs. (6)-(8); needs C_q(t, q) in w.Cq."""
-    n_c, n_q = w.Cq.shape
-    w.counters[N_EVALUATIONS] += 1
-    if f.flags[CONSTANT_MASS] == 0:
-        w.counters[N_FACTORIZATIONS] += 1
-        code = factor_mass(f, w, t, q)
-        if code != DONE:
-            return code
-    code = acceleration_constraint(f, w, t, q, v)
-    if code != DONE:
-        return code
-    w.Q[:] = 0.0
-    f.force(t, q, v, f.p, w.Q)
-    code = _factor_schur_complement(f, w)
-    if code != DONE:
-        return code
-    _times_inverse_mass(f, w, w.Q, w.x)
-    for i in range(n_c):
-        total = -w.Qd[i]
-        for j in range(n_q):
-            total += w.Cq[i, j] * w.x[j]
-        lam[i] = total
-    ldl_solve(w.S, lam)  # (7)
-    if f.flags[DIAGONAL_MASS] == 0:
-        # (8) with M^-1 Q and M^-1 Cq^T as they stand
-        copy(w.x, a)
-        solved = inverse_mass_border(w)
-        for i in range(n_c):
-            for j in range(n_q):
-                a[j] -= solved[i, j] * lam[i]
-    else:
-        copy(w.Q, a)
-        for i in range(n_c):
-            for j in range(n_q):
-                a[j] -= w.Cq[i, j] * lam[i]
-        _times_inverse_mass(f, w, a, a)  # (8)
-    for j in range(n_q):
-        if not np.isfinite(a[j]):
-            return _not_finite(w.notes, _which_acceleration(w.Ct, w.Qd, w.Q), t, q)
-    if f.flags[GAMMA_GIVEN] == 0:
-        for i in range(n_c):
-            total = 0.0
-            for j in range(n_q):
-                total += abs(w.Cq[i, j] * a[j])
-            w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], total)
-    return DONE
-
-
-@compiled
-def evaluate(f, w, t, q, v, tolerance, a, lam):
-    """One evaluation of the right-hand side: dependents of q and v from their independents, then a and lam."""
-    code = _positions(f, w, t, q, tolerance)
-    if code == DONE:
-        code = _velocities(f, w, t, q, v)
-    if code == DONE:
-        code = _accelerations(f, w, t, q, v, a, lam)
-    return code
-
-
-@compiled
-def dependent_positions(f, w, t, q, tolerance):
-    """Dependents of q from its independents."""
-    return _positions(f, w, t, q, tolerance)
-
-
-@compiled
-def restore(f, w, t, q, v, tolerance):
-    """Dependents of q and v from their independents; leaves C_q at q for `accelerations`."""
-    code = _positions(f, w, t, q, tolerance)
-    if code == DONE:
-        code = _velocities(f, w, t, q, v)
-    return code
-
-
-@compiled
-def accelerations(f, w, t, q, v, a, lam):
-    """Eqs. (6)-(8) at a state that was restored just before."""
-    return _accelerations(f, w, t, q, v, a, lam)

@@ -3,23 +3,31 @@
 All run along rows and skip zero factors: constraint Jacobians are sparse even where they are small.
 """
 
-from twoloop.kernels.common import inlined
+from twoloop.kernels.common import merged
 
 
-@inlined
+@merged
 def copy(source, target):
     """Element by element: numba's slice assignment allocates."""
     for i in range(source.size):
         target[i] = source[i]
 
 
-@inlined
+@merged
+def copy_matrix(source, target):
+    """Row by row, as far as both have them."""
+    for i in range(min(source.shape[0], target.shape[0])):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@merged
 def _size(x):
     """|x|, or of a complex number the sum of its parts' as LAPACK has it: no square root."""
     return abs(x.real) + abs(x.imag)
 
 
-@inlined
+@merged
 def lu_factor(A, pivots):
     """LU factors of A, real or complex, with row exchanges, in place, 1/u_kk on the diagonal.
 
@@ -55,7 +63,7 @@ def lu_factor(A, pivots):
     return smallest / largest if n > 0 else 1.0
 
 
-@inlined
+@merged
 def lu_sign(A, pivots):
     """Sign of the determinant of a real matrix, from the factors of `lu_factor`."""
     sign = 1.0
@@ -65,7 +73,7 @@ def lu_sign(A, pivots):
     return sign
 
 
-@inlined
+@merged
 def lu_solve(A, pivots, x):
     """Solve with the factors of `lu_factor`; x is overwritten."""
     n = A.shape[0]
@@ -85,7 +93,7 @@ def lu_solve(A, pivots, x):
         x[i] = total * A[i, i]
 
 
-@inlined
+@merged
 def ldl_factor(A):
     """Factors U^T D^-1 U of a symmetric A from its upper triangle, in place: 1/d_k on the diagonal, U above it.
 
@@ -105,7 +113,7 @@ def ldl_factor(A):
     return True
 
 
-@inlined
+@merged
 def invert_definite(A):
     """A symmetric positive definite A becomes its inverse, by Gauss and Jordan's elimination.
 
@@ -128,7 +136,7 @@ def invert_definite(A):
     return True
 
 
-@inlined
+@merged
 def ldl_solve(A, x):
     """Solve with the factors of `ldl_factor`; x is overwritten."""
     n = A.shape[0]
@@ -144,7 +152,7 @@ def ldl_solve(A, x):
         x[k] = total * A[k, k]
 
 
-@inlined
+@merged
 def ldl_solve_rows(A, B):
     """Solve with the factors of `ldl_factor` for all columns of B at once, row by row; B is overwritten."""
     n, m = B.shape

@@ -13,6 +13,7 @@ C_q' T_k = -[Q_d(v + T_k) - Q_d(v - T_k)] / 4.
 
 import numpy as np
 
+from twoloop.kernels.calls import accelerations, dependent_positions, find_gamma, find_tangents, rounding_floor
 from twoloop.kernels.common import (
     CONSTANT_MASS,
     DEPARTURE,
@@ -30,16 +31,10 @@ from twoloop.kernels.common import (
     kernel,
 )
 from twoloop.kernels.differences import longest_difference
-from twoloop.kernels.inner import (
-    acceleration_constraint,
-    accelerations,
-    dependent_positions,
-    factor_dependent,
-    rounding_floor,
-)
-from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve, lu_solve
+from twoloop.kernels.factors import columns_of, rows_of, solve
+from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve
 from twoloop.kernels.predictor import departure, keep_predicted
-from twoloop.kernels.runge_kutta import GROWTH, MAX_SWEEPS, PATIENCE, conclude
+from twoloop.kernels.runge_kutta import GROWTH, MAX_ITERATIONS, PATIENCE, conclude
 from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 # places in `memory`: advance() sets the first after every attempt; then stage blocks (s, n), vectors (n), matrices
@@ -74,30 +69,22 @@ def _matrix(memory, s, n, rows, columns, which):
 
 @compiled
 def _tangents(f, w, t, q, tangent, reduced, u):
-    """Rows T_k, the velocity u at v_i = 0 and the factors of T^T M T at q on the constraints; C_q, C_qd stay in w."""
-    code = factor_dependent(f, w, t, q)
+    """Rows T_k, the velocity u at v_i = 0 and the factors of T^T M T at q on the constraints; C_q stays in w."""
+    code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    w.Ct[:] = 0.0
-    f.constraint_rate(t, q, f.p, w.Ct)
-    for i in range(w.g.size):
-        w.g[i] = -w.Ct[i]
-    lu_solve(w.Cqd, w.pivots, w.g)
+    columns, n_dof = columns_of(w.index), w.independent.size
     u[:] = 0.0
-    for i in range(w.g.size):
-        u[w.dependent[i]] = w.g[i]
+    for i in range(columns.size):
+        u[columns[i]] = w.D[n_dof, i]
     tangent[:, :] = 0.0
-    for k in range(w.independent.size):
-        m = w.independent[k]
-        for i in range(w.g.size):
-            w.g[i] = -w.Cq[i, m]
-        lu_solve(w.Cqd, w.pivots, w.g)
-        tangent[k, m] = 1.0
-        for i in range(w.g.size):
-            tangent[k, w.dependent[i]] = w.g[i]
-    if f.flags[CONSTANT_MASS] == 0:
+    for k in range(n_dof):
+        tangent[k, w.independent[k]] = 1.0
+        for i in range(columns.size):
+            tangent[k, columns[i]] = w.D[k, i]
+    if f.callbacks.flags[CONSTANT_MASS] == 0:
         w.M[:, :] = 0.0
-        f.mass(t, q, f.p, w.M)
+        f.callbacks.mass(t, q, f.callbacks.p, w.M)
     for k in range(w.independent.size):
         _times_mass(w, tangent[k], w.x)
         for m in range(k, w.independent.size):
@@ -157,7 +144,7 @@ def _mass_rate(f, w, t, q, v, shifted, y):
         for j in range(q.size):
             shifted[j] = q[j] + shift * v[j]
         w.L[:, :] = 0.0
-        f.mass(t + shift, shifted, f.p, w.L)
+        f.callbacks.mass(t + shift, shifted, f.callbacks.p, w.L)
         for i in range(q.size):
             for j in range(q.size):
                 y[i] += weight * w.L[i, j] * v[j]
@@ -167,10 +154,11 @@ def _mass_rate(f, w, t, q, v, shifted, y):
 def _momentum_rates(f, w, t, q, v, tangent, Mv, shifted, rate):
     """p_i' at (t, q, v) after `_tangents`; Mv is scratch."""
     w.counters[N_EVALUATIONS] += 1
-    n_c, n_q = w.Cq.shape
+    n_q = v.size
+    rows, columns = rows_of(w.index), columns_of(w.index)
     w.Q[:] = 0.0
-    f.force(t, q, v, f.p, w.Q)
-    if f.flags[CONSTANT_MASS] == 0:
+    f.callbacks.force(t, q, v, f.callbacks.p, w.Q)
+    if f.callbacks.flags[CONSTANT_MASS] == 0:
         _mass_rate(f, w, t, q, v, shifted, w.Q)
     _times_mass(w, v, Mv)
     for k in range(w.independent.size):
@@ -179,26 +167,26 @@ def _momentum_rates(f, w, t, q, v, tangent, Mv, shifted, rate):
             total += tangent[k, j] * w.Q[j]
         for j in range(n_q):
             shifted[j] = v[j] - tangent[k, j]
-        code = acceleration_constraint(f, w, t, q, shifted)
-        for i in range(n_c):
-            w.C[i] = -w.Qd[i]
+        code = find_gamma(f, w, t, q, shifted)
+        for i in range(rows.size):
+            w.z[i] = -w.Gamma[rows[i]]
         for j in range(n_q):
             shifted[j] = v[j] + tangent[k, j]
         if code == DONE:
-            code = acceleration_constraint(f, w, t, q, shifted)
+            code = find_gamma(f, w, t, q, shifted)
         if code != DONE:
             return code
-        for i in range(n_c):
-            w.C[i] = 0.25 * (w.C[i] + w.Qd[i])  # -C_q' T_k
-        lu_solve(w.Cqd, w.pivots, w.C)
-        for i in range(n_c):
-            total += w.C[i] * Mv[w.dependent[i]]
+        for i in range(rows.size):
+            w.z[i] = 0.25 * (w.z[i] + w.Gamma[rows[i]])  # -C_q' T_k
+        solve(w.index, w.values, w.z)
+        for i in range(rows.size):
+            total += w.z[i] * Mv[columns[i]]
         rate[w.independent[k]] = total
     return DONE
 
 
 @compiled
-def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, q1, p1, v1):
+def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, q1, p1, v1):
     """One step of size h from (q, p) by a fixed-point iteration.
 
     V_stage, R_stage hold predicted velocities and rates of p on entry.
@@ -226,7 +214,7 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
     before = 0.0
     earlier = np.inf
     converged = False
-    for sweep in range(MAX_SWEEPS):
+    for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for j in range(s):
             for m in w.independent:
@@ -239,7 +227,7 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
                 P_stage[j, m] = p[m] + h * in_p
         change = 0.0
         for j in range(s):
-            code = dependent_positions(f, w, t + c[j] * h, Q_stage[j], options[INNER_TOL])
+            code = dependent_positions(f, w, t + c[j] * h, Q_stage[j], v, options[INNER_TOL])
             if code == DONE:
                 code = _tangents(f, w, t + c[j] * h, Q_stage[j], tangent, reduced, u)
             if code != DONE:
@@ -256,7 +244,7 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
         if change <= options[OUTER_TOL]:
             converged = True
             break
-        if sweep < 2:
+        if iteration < 2:
             first = max(first, change)
         elif not change <= GROWTH * first:
             return OUTER_DIVERGED
@@ -264,9 +252,9 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
             if change <= rounding_floor(q):
                 converged = True
                 break
-            if sweep >= PATIENCE:
+            if iteration >= PATIENCE:
                 return OUTER_DIVERGED
-        earlier = before if sweep > 0 else np.inf
+        earlier = before if iteration > 0 else np.inf
         before = change
     if not converged:
         return OUTER_DIVERGED
@@ -281,7 +269,7 @@ def _sweep(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, 
             in_p += b[k] * R_stage[k, m]
         p1[m] = p[m] + h * in_p
     keep_predicted(w, q1)
-    code = dependent_positions(f, w, t + h, q1, options[INNER_TOL])
+    code = dependent_positions(f, w, t + h, q1, v1, options[INNER_TOL])
     if code == DONE:
         w.notes[DEPARTURE] = max(w.notes[DEPARTURE], departure(w, tolerances, h, q, v0, q1))
         code = _tangents(f, w, t + h, q1, tangent, reduced, u)
@@ -336,7 +324,7 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         for j in range(s):
             copy(v, v_trial[j])
             copy(rate, r_trial[j])
-    code = _sweep(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1)
+    code = _iterate(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -347,13 +335,13 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 * c[j], r_trial, weights, r_half[j])
         w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
-        code = _sweep(f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid)
+        code = _iterate(f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid)
         if code != DONE:
             return code, np.inf
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 + 0.5 * c[j], r_trial, weights, r_half[j])
-        code = _sweep(
+        code = _iterate(
             f, w, options, memory, tolerances, t + 0.5 * h, 0.5 * h, q_mid, v_mid, p_mid, v_half, r_half, q1, p1, v1
         )
         if code != DONE:

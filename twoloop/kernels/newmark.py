@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from twoloop.kernels.calls import evaluate_state, rounding_floor
 from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, kernel
-from twoloop.kernels.inner import evaluate, rounding_floor
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure
 
-MAX_SWEEPS = 60
+MAX_ITERATIONS = 60
 TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
 
 # places in `memory` before the new accelerations; the first is advance()'s
@@ -57,12 +57,12 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
         a1[m] = a[m]
         q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: where Newton starts
     before = np.inf
-    for _ in range(MAX_SWEEPS):
+    for _ in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for m in w.independent:
             q1[m] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
             v1[m] = v[m] + h * ((1.0 - gamma) * a[m] + gamma * a1[m])
-        code = evaluate(f, w, t + h, q1, v1, options[INNER_TOL], a_new, lam1)
+        code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a_new, lam1)
         if code != DONE:
             return code, np.inf
         change = 0.0

@@ -1,6 +1,6 @@
 """Implicit Runge-Kutta steps whose outer loop is Newton's method, for stiff problems.
 
-The unknowns are the stage accelerations a_j of the independent coordinates, as in `sweep_accelerations`:
+The unknowns are the stage accelerations a_j of the independent coordinates, as in `iterate_accelerations`:
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
@@ -17,22 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels import newton_banded, newton_dense
+from twoloop.kernels.calls import accelerations, evaluate, multipliers
 from twoloop.kernels.common import (
     ATOL,
     BANDWIDTH,
     DEPARTURE,
     DONE,
     ESTIMATE,
+    GENERATION,
     LEAST,
     N_OUTER,
-    N_PARTITIONS,
     OUTER_DIVERGED,
     RTOL,
     STEP,
     compiled,
     kernel,
 )
-from twoloop.kernels.inner import accelerations, evaluate
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.newton_memory import (
     A_MID,
@@ -119,7 +119,7 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
 @compiled
 def _derivatives(f, w, options, memory, s, t, q, v, a):
     """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
-    if f.flags[BANDWIDTH] >= 0:
+    if f.callbacks.flags[BANDWIDTH] >= 0:
         return newton_banded.derivatives(f, w, memory, s, t, q, v)
     return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
 
@@ -127,7 +127,7 @@ def _derivatives(f, w, options, memory, s, t, q, v, a):
 @compiled
 def _factor(f, w, options, memory, s, h):
     """Factors for steps of h, for every eigenvalue and for gamma0."""
-    if f.flags[BANDWIDTH] >= 0:
+    if f.callbacks.flags[BANDWIDTH] >= 0:
         code = newton_banded.factor(f, w, options, memory, s, h)
     else:
         code = newton_dense.factor(w, options, memory, s, h)
@@ -156,7 +156,7 @@ def _correct(f, w, options, memory, s, residual, A_stage):
             for j in range(s):
                 total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
             x[i] = total
-        if f.flags[BANDWIDTH] >= 0:
+        if f.callbacks.flags[BANDWIDTH] >= 0:
             newton_banded.solve(f, w, options, memory, s, k, x)
         else:
             newton_dense.solve(w, options, memory, s, k, x[:m])
@@ -195,7 +195,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                     Q_stage[j, m] += in_q * A_stage[k, m]
                     V_stage[j, m] += in_v * A_stage[k, m]
         for j in range(s):
-            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], options[INNER_TOL], a_new, w.lam)
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], options[INNER_TOL], a_new)
             if code != DONE:
                 return code
             for m in range(n):
@@ -263,7 +263,7 @@ def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
             in_v += e[k] * A_stage[k, j]
         e_q[i] = h * in_q
         e_v[i] = h * in_v
-    if f.flags[BANDWIDTH] >= 0:
+    if f.callbacks.flags[BANDWIDTH] >= 0:
         newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
     else:
         newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
@@ -294,9 +294,9 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             memory[H_PREVIOUS] = memory[H_TRIAL]
             memory[HAS_PREVIOUS] = 1.0
     memory[HAS_TRIAL] = 0.0
-    if memory[PARTITION_NUMBER] != w.counters[N_PARTITIONS]:
+    if memory[PARTITION_NUMBER] != w.notes[GENERATION]:
         memory[HAS_JACOBIAN] = 0.0
-        memory[PARTITION_NUMBER] = w.counters[N_PARTITIONS]
+        memory[PARTITION_NUMBER] = w.notes[GENERATION]
     if memory[FRESH] == 0.0 and memory[CONTRACTION] > SLOW:
         memory[HAS_JACOBIAN] = 0.0
     while True:
@@ -305,9 +305,10 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             for m in range(n):
                 q_mid[m] = q[m] + 0.5 * h * (v[m] + 0.25 * h * a[m])
                 v_mid[m] = v[m] + 0.5 * h * a[m]
-            code = evaluate(f, w, t + 0.5 * h, q_mid, v_mid, options[INNER_TOL], a_mid, w.lam)
+            code = evaluate(f, w, t + 0.5 * h, q_mid, v_mid, options[INNER_TOL], a_mid)
             if code != DONE:
                 return code, np.inf
+            multipliers(f, w, t + 0.5 * h, q_mid, v_mid, a_mid, w.lam)
             code = _derivatives(f, w, options, memory, s, t + 0.5 * h, q_mid, v_mid, a_mid)
             if code != DONE:
                 return code, np.inf

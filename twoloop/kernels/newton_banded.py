@@ -19,6 +19,7 @@ every n_q (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 import numpy as np
 
 from twoloop.kernels.banded import add_banded_mass_times, factor_bordered, lu_band, solve_bordered
+from twoloop.kernels.calls import find_tangents
 from twoloop.kernels.common import (
     BANDWIDTH,
     DONE,
@@ -31,8 +32,10 @@ from twoloop.kernels.common import (
     compiled,
     inlined,
 )
+from twoloop.kernels.constraints import constraint_rows
+from twoloop.kernels.factors import columns_of
 from twoloop.kernels.lapack import DGBTRF, DGBTRS, ZGBTRF, ZGBTRS
-from twoloop.kernels.linalg import copy, lu_solve
+from twoloop.kernels.linalg import copy, copy_matrix
 from twoloop.kernels.newton_memory import (
     A_NEW,
     BY_Q,
@@ -63,28 +66,28 @@ def _band(numbers, n, b):
 
 
 @inlined
-def _constraints(memory, s, n, n_c, b):
-    """What stands behind K: Cq, the LU of Cqd and its pivots, where the derivatives were taken."""
+def _constraints(memory, s, n, r, b):
+    """What stands behind K: the rows of C_q that count, w.D and the columns of its entries, where K was taken."""
     numbers = space(memory, s, n, BY_Q)
     start = n * (2 * b + 1)
-    Cq = numbers[start : start + n_c * n].reshape((n_c, n))
-    start += n_c * n
-    Cqd = numbers[start : start + n_c * n_c].reshape((n_c, n_c))
-    start += n_c * n_c
-    return Cq, Cqd, numbers[start : start + n_c].view(np.int64)
+    Cq = numbers[start : start + r * n].reshape((r, n))
+    start += r * n
+    D = numbers[start : start + r * (n - r + 1)].reshape((n - r + 1, r))
+    start += r * (n - r + 1)
+    return Cq, D, numbers[start : start + r].view(np.int64)
 
 
 @compiled
 def _unbalanced(f, w, t, q, v):
-    """Q - Cq^T lam into w.Q, with the multipliers in w.lam."""
+    """Q - C_q^T lam into w.Q, with the multipliers in w.lam."""
     w.counters[N_EVALUATIONS] += 1
     w.Q[:] = 0.0
-    f.force(t, q, v, f.p, w.Q)
-    w.Cqx[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.Cqx)
+    f.callbacks.force(t, q, v, f.callbacks.p, w.Q)
+    w.Gx[:, :] = 0.0
+    constraint_rows(f.callbacks, w, t, q, w.Gx)
     for i in range(w.lam.size):
         for j in range(q.size):
-            w.Q[j] -= w.Cqx[i, j] * w.lam[i]
+            w.Q[j] -= w.Gx[i, j] * w.lam[i]
 
 
 @compiled
@@ -125,7 +128,7 @@ def _from_tangents(f, w, memory, s, t, q, v, b):
     if code != DONE:
         return code
     _copy_band(K, b, _band(space(memory, s, n, BY_Q), n, b))
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    memory[DAMPED] = f.callbacks.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, b, K)
     if memory[DAMPED] == 1.0:
         _copy_band(K, b, _band(space(memory, s, n, BY_V), n, b))
@@ -136,15 +139,17 @@ def _from_tangents(f, w, memory, s, t, q, v, b):
 def derivatives(f, w, memory, s, t, q, v):
     """K and D at a state that was evaluated just before."""
     n = q.size
-    n_c = w.C.size
-    b = f.flags[BANDWIDTH]
+    b = f.callbacks.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
-    Cq, Cqd, pivots = _constraints(memory, s, n, n_c, b)
-    for i in range(n_c):
-        copy(w.Cq[i], Cq[i])
-        copy(w.Cqd[i], Cqd[i])
-    copy(w.pivots, pivots)
-    if f.flags[FORCE_BY_Q_GIVEN] == 1:
+    Cq, D, columns = _constraints(memory, s, n, w.rows.size, b)
+    for i in range(w.rows.size):
+        copy(w.G[w.rows[i]], Cq[i])
+    code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
+    copy_matrix(w.D, D)
+    copy(columns_of(w.index), columns)
+    if f.callbacks.flags[FORCE_BY_Q_GIVEN] == 1:
         return _from_tangents(f, w, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _unbalanced(f, w, t, q, v)
@@ -184,11 +189,11 @@ def _fill(w, memory, s, b, z, numbers):
 def factor(f, w, options, memory, s, h):
     """Factors of the bordered systems of gamma0, real, and of the eigenvalues, complex."""
     n = w.Q.size
-    b = f.flags[BANDWIDTH]
+    b = f.callbacks.flags[BANDWIDTH]
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + N_REAL])
-    Cq, _, _ = _constraints(memory, s, n, w.C.size, b)
+    Cq, _, _ = _constraints(memory, s, n, w.rows.size, b)
     numbers = space(memory, s, n, FILTER)
     _fill(w, memory, s, b, h * options[place + GAMMA0], numbers)
     w.counters[N_FACTORIZATIONS] += 1
@@ -210,23 +215,19 @@ def factor(f, w, options, memory, s, h):
 def _all_coordinates(w, memory, s, b, x, X):
     """X = T x; of x (n_q) the first n_dof numbers count, the others are scratch."""
     n_dof = w.independent.size
-    Cq, Cqd, pivots = _constraints(memory, s, n_dof + w.C.size, w.C.size, b)
+    _, D, columns = _constraints(memory, s, w.Q.size, w.rows.size, b)
+    for i in columns:
+        X[i] = 0.0
     for k in range(n_dof):
         X[w.independent[k]] = x[k]
-    dependents = x[n_dof:]
-    for i in range(dependents.size):
-        dependents[i] = 0.0
-        for j in w.independent:
-            dependents[i] -= Cq[i, j] * X[j]
-    lu_solve(Cqd, pivots, dependents)
-    for k in range(dependents.size):
-        X[w.dependent[k]] = dependents[k]
+        for i in range(columns.size):
+            X[columns[i]] += D[k, i] * x[k]
 
 
 @compiled
 def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
     """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independents of the solution."""
-    Cq, _, _ = _constraints(memory, s, x.size, w.C.size, b)
+    Cq, _, _ = _constraints(memory, s, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn
         x[k] = x[w.independent[k]]
@@ -236,7 +237,7 @@ def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
 def solve(f, w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
     n = w.Q.size
-    b = f.flags[BANDWIDTH]
+    b = f.callbacks.flags[BANDWIDTH]
     n_eigen = count_eigenvalues(options, s)
     pivots = pivots_of(memory, s, n, n_eigen, 1 + k)
     if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
@@ -245,7 +246,7 @@ def solve(f, w, options, memory, s, k, x):
             real[i] = x[i].real
         _all_coordinates(w, memory, s, b, real, X)
         real[:] = 0.0
-        add_banded_mass_times(f, w, X, real)
+        add_banded_mass_times(f.callbacks, w, X, real)
         pivots = pivots_of(memory, s, n, n_eigen, 0)
         _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, real)
         for i in range(n):
@@ -254,7 +255,7 @@ def solve(f, w, options, memory, s, k, x):
         X = complex_vector(memory, s, n, n_eigen, 1)
         _all_coordinates(w, memory, s, b, x, X)
         x[:] = 0.0
-        add_banded_mass_times(f, w, X, x)
+        add_banded_mass_times(f.callbacks, w, X, x)
         _solve_for_independents(w, memory, s, b, system_space(memory, s, n, k), pivots, ZGBTRS, x)
 
 
@@ -262,12 +263,12 @@ def solve(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
     n = w.Q.size
-    b = f.flags[BANDWIDTH]
+    b = f.callbacks.flags[BANDWIDTH]
     z = h * options[eigen_place(options, s) + GAMMA0]
     K, X = _band(space(memory, s, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
     _all_coordinates(w, memory, s, b, e_v, X)
     e_v[:] = 0.0
-    add_banded_mass_times(f, w, X, e_v)
+    add_banded_mass_times(f.callbacks, w, X, e_v)
     _all_coordinates(w, memory, s, b, e_q, X)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):

@@ -7,6 +7,7 @@ in which a body turns by some 0.4 rad on its constraints may then fail where dif
 converge.
 """
 
+from twoloop.kernels.calls import evaluate, find_tangents
 from twoloop.kernels.common import (
     DONE,
     FORCE_BY_Q_GIVEN,
@@ -17,7 +18,7 @@ from twoloop.kernels.common import (
     compiled,
     inlined,
 )
-from twoloop.kernels.inner import evaluate
+from twoloop.kernels.factors import columns_of
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.newton_memory import (
     A_NEW,
@@ -48,23 +49,24 @@ def _square(numbers, m):
 
 
 @compiled
-def _sandwich(w, X, A, AT, B):
-    """B = T^T A T with T = [I; X]; AT (n_q, n_dof) is scratch."""
+def _reduce(w, A, AT, B):
+    """B = T^T A T with T = [I; w.D^T]; AT (n_q, n_dof) is scratch."""
     n, m = AT.shape
+    columns = columns_of(w.index)
     for i in range(n):
         for k in range(m):
             AT[i, k] = A[i, w.independent[k]]
-        for c in range(w.C.size):
-            factor = A[i, w.dependent[c]]
+        for c in range(columns.size):
+            factor = A[i, columns[c]]
             if factor != 0.0:
                 for k in range(m):
-                    AT[i, k] += factor * X[c, k]
+                    AT[i, k] += factor * w.D[k, c]
     for l in range(m):
         copy(AT[w.independent[l]], B[l])
-        for c in range(w.C.size):
-            factor = X[c, l]
+        for c in range(columns.size):
+            factor = w.D[l, c]
             if factor != 0.0:
-                row = AT[w.dependent[c]]
+                row = AT[columns[c]]
                 for k in range(m):
                     B[l, k] += factor * row[k]
 
@@ -73,33 +75,28 @@ def _sandwich(w, X, A, AT, B):
 def _from_tangents(f, w, memory, s, t, q, v):
     """J_q and J_v from the tangents that the system gives, at a state that was evaluated just before."""
     n = q.size
-    m, n_c = w.independent.size, w.C.size
+    m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    # factors are not needed any more: their spaces hold K or D, then T^T M T, X and T^T A
+    # factors are not needed any more: their spaces hold K or D, then T^T M T and T^T A
     K, R = _square(space(memory, s, n, FILTER), n), _square(space(memory, s, n, SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
-    numbers = space(memory, s, n, SYSTEMS + 1)
-    X, AT = numbers[: n_c * m].reshape((n_c, m)), numbers[n_c * m : (n_c + n) * m].reshape((n, m))
-    column = vector(memory, s, n, V_MOVED)[:n_c]
-    for k in range(m):
-        for c in range(n_c):
-            column[c] = -w.Cq[c, w.independent[k]]
-        lu_solve(w.Cqd, w.pivots, column)
-        for c in range(n_c):
-            X[c, k] = column[c]
+    AT = space(memory, s, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
     Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
     N = _square(space(memory, s, n, SYSTEMS), m)
-    _sandwich(w, X, w.M, AT, N)
+    _reduce(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
-    _sandwich(w, X, K, AT, Jq)
+    _reduce(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    memory[DAMPED] = f.callbacks.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code == DONE and memory[DAMPED] == 1.0:
-        _sandwich(w, X, K, AT, Jv)
+        _reduce(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
 
@@ -107,7 +104,7 @@ def _from_tangents(f, w, memory, s, t, q, v):
 @compiled
 def derivatives(f, w, options, memory, s, t, q, v, a):
     """J_q and J_v at (t, q, v), where the value of the two-loop right-hand side, evaluated just before, is a."""
-    if f.flags[FORCE_BY_Q_GIVEN] == 1:
+    if f.callbacks.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
@@ -121,7 +118,7 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
         copy(v, v_moved)
         q_moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
         size = q_moved[j] - q[j]
-        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new, w.lam)
+        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
         if code != DONE:
             return code
         for row in range(m):
@@ -132,7 +129,7 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
     for column in range(m):
         j = w.independent[column]
         v_moved[j] = v[j] + DIFFERENCE * max(1.0, abs(v[j])) * (1.0 + 0.37 * (column % 7))
-    code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new, w.lam)
+    code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
     if code != DONE:
         return code
     memory[DAMPED] = 0.0
@@ -147,7 +144,7 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
         copy(v, v_moved)
         v_moved[j] += DIFFERENCE * max(1.0, abs(v[j]))
         size = v_moved[j] - v[j]
-        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new, w.lam)
+        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
         if code != DONE:
             return code
         for row in range(m):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twoloop.kernels.common import inlined
+from twoloop.kernels.common import inlined, merged
 from twoloop.kernels.stages import N_SCALARS
 
 # `options` is that of stages.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
@@ -37,13 +37,13 @@ def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
     return N_MEMORY_SCALARS + vectors * n_q + matrices * n_q * n_q + s
 
 
-@inlined
+@merged
 def eigen_place(options, s):
     """First place of the eigenvalue scalars."""
     return N_SCALARS + 2 * s * s + 3 * s
 
 
-@inlined
+@merged
 def count_eigenvalues(options, s):
     """Number of systems: one for each real eigenvalue and one for each pair."""
     place = eigen_place(options, s)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from twoloop.kernels.common import DONE, FORCE_BY_V_GIVEN, NOT_FINITE, REACTION_BY_Q_GIVEN, compiled
+from twoloop.kernels.constraints import constraint_rows
 from twoloop.kernels.linalg import copy
 
 DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
@@ -26,12 +27,12 @@ def _finite(A, b):
 
 @compiled
 def _bent(f, w, t, q):
-    """Whether C_q at q, left in w.Cqx, differs from w.Cq."""
-    w.Cqx[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.Cqx)
+    """Whether C_q at q, left in w.Gx, differs from w.G."""
+    w.Gx[:, :] = 0.0
+    constraint_rows(f.callbacks, w, t, q, w.Gx)
     for i in range(w.C.size):
         for j in range(q.size):
-            if w.Cqx[i, j] != w.Cq[i, j]:
+            if w.Gx[i, j] != w.G[i, j]:
                 return True
     return False
 
@@ -55,17 +56,17 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
             size = moved[j] - q[j]
             for i in range(max(0, j - b), min(n, j + b + 1)):
                 for k in range(w.C.size):
-                    K[i, j] -= (w.Cqx[k, i] - w.Cq[k, i]) * w.lam[k] / size
+                    K[i, j] -= (w.Gx[k, i] - w.G[k, i]) * w.lam[k] / size
 
 
 @compiled
 def tangent_by_q(f, w, t, q, v, b, moved, K, R):
     """K (n_q, n_q), of which only the band |i - j| <= b counts, at a state that was evaluated just before."""
     _clear(K, b)
-    f.force_by_q(t, q, v, f.p, K)
-    if f.flags[REACTION_BY_Q_GIVEN] == 1:
+    f.callbacks.force_by_q(t, q, v, f.callbacks.p, K)
+    if f.callbacks.flags[REACTION_BY_Q_GIVEN] == 1:
         _clear(R, b)
-        f.reaction_by_q(t, q, w.lam, f.p, R)
+        f.callbacks.reaction_by_q(t, q, w.lam, f.callbacks.p, R)
         for i in range(q.size):
             for j in range(max(0, i - b), min(q.size, i + b + 1)):
                 K[i, j] -= R[i, j]
@@ -77,8 +78,8 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 @compiled
 def tangent_by_v(f, t, q, v, b, D):
     """D (n_q, n_q), of which only the band counts; left alone where the force does not depend on v."""
-    if f.flags[FORCE_BY_V_GIVEN] == 0:
+    if f.callbacks.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear(D, b)
-    f.force_by_v(t, q, v, f.p, D)
+    f.callbacks.force_by_v(t, q, v, f.callbacks.p, D)
     return _finite(D, b)

@@ -1,62 +1,110 @@
-"""LU coordinate partitioning: which coordinates are independent."""
+"""LU coordinate partitioning: which coordinates are independent, and which rows count."""
+
+import numpy as np
 
 from twoloop.kernels.common import (
     DONE,
+    GENERATION,
     N_FACTORIZATIONS,
     N_PARTITIONS,
     ORIENTATION,
+    PIVOT,
+    RANK,
+    RANK_DIFFERS,
+    RANK_V,
     SENSITIVITY,
     SINGULAR,
     compiled,
     inlined,
+    merged,
 )
-from twoloop.kernels.linalg import lu_solve
+from twoloop.kernels.constraints import constraint_rows
+from twoloop.kernels.factors import factor, make_program, sign_of
+from twoloop.kernels.linalg import copy_matrix
 
-RANK_TOLERANCE = 1e-11  # a pivot below this fraction of the largest one counts as zero
+RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1
 CHANGED = -1  # returned beside DONE: there is another partition now
 WORSE = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
 
 
 @compiled
-def full_pivoting(A, order):
-    """Gauss elimination of A (n_c, n_q) with full pivoting, in place.
+def scale_rows(A):
+    """Divide each row by a power of two, so that its largest entry is about 1."""
+    for i in range(A.shape[0]):
+        top = 0.0
+        for j in range(A.shape[1]):
+            top = max(top, abs(A[i, j]))
+        if top > 0.0 and top < np.inf:
+            scale = 2.0 ** -np.round(np.log2(top))
+            for j in range(A.shape[1]):
+                A[i, j] *= scale
 
-    `order` becomes the column order: the first n_c are the dependent coordinates. Returns the numerical rank.
+
+@compiled
+def full_pivoting(A, order, row_order, first, last, most):
+    """Gauss elimination of A with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
+
+    At most until there are `most` pivots. `order` and `row_order` become the order of columns and rows. Returns the
+    number of pivots there are then, the numerical rank.
     """
-    n_c, n_q = A.shape
-    for j in range(n_q):
-        order[j] = j
-    largest = 0.0
-    for k in range(n_c):
+    n_q = A.shape[1]
+    k = first
+    while k < min(last, n_q) and k < most:
         top = 0.0
         r = k
         s = k
-        for i in range(k, n_c):
+        for i in range(k, last):
             for j in range(k, n_q):
                 if abs(A[i, j]) > top:
                     top = abs(A[i, j])
                     r = i
                     s = j
-        if k == 0:
-            largest = top
-        if not top > RANK_TOLERANCE * largest:
+        if not top > RANK_TOLERANCE:
             return k
         if r != k:
+            row_order[k], row_order[r] = row_order[r], row_order[k]
             for j in range(n_q):
                 A[k, j], A[r, j] = A[r, j], A[k, j]
         if s != k:
             order[k], order[s] = order[s], order[k]
-            for i in range(n_c):
+            for i in range(A.shape[0]):
                 A[i, k], A[i, s] = A[i, s], A[i, k]
-        for i in range(k + 1, n_c):
+        for i in range(k + 1, A.shape[0]):
             factor = A[i, k] / A[k, k]
             if factor != 0.0:
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
-    return n_c
+        k += 1
+    return k
 
 
-@inlined
+@compiled
+def _eliminate(w, most, most_v):
+    """Order rows and columns of w.Gx: first what the constraints C need, then what the rows A add to it.
+
+    Returns the rank of C_q and that of C_q and A together, neither counted beyond what is asked for.
+    """
+    G, order, row_order = w.Gx, w.order, w.row_order
+    n_c, n_rows = w.C.size, w.Rate.size
+    scale_rows(G)
+    for j in range(order.size):
+        order[j] = j
+    for i in range(n_rows):
+        row_order[i] = i
+    rank = full_pivoting(G, order, row_order, 0, n_c, most)
+    w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
+    if n_rows == n_c:
+        return rank, rank
+    last = rank  # rows of A come next, in the place of what is redundant in C
+    for i in range(n_c, n_rows):
+        row_order[last], row_order[i] = row_order[i], row_order[last]
+        for j in range(G.shape[1]):
+            G[last, j], G[i, j] = G[i, j], G[last, j]
+        last += 1
+    return rank, full_pivoting(G, order, row_order, rank, last, most_v)
+
+
+@merged
 def _insert_sorted(source, target):
     for k in range(source.size):
         i = k
@@ -66,29 +114,78 @@ def _insert_sorted(source, target):
         target[i] = source[k]
 
 
-@inlined
+@compiled
 def _take_order(w):
-    n_c = w.C.size
+    """Make what `_eliminate` found the partition; False: C_qd is singular by its pattern."""
+    rank, rank_v = w.rows.size, w.rows_v.size
     # ascending, so that the same set is always the same partition
-    _insert_sorted(w.order[:n_c], w.dependent)
-    _insert_sorted(w.order[n_c:], w.independent)
+    _insert_sorted(w.row_order[:rank], w.rows)
+    _insert_sorted(w.order[:rank], w.dependent)
+    _insert_sorted(w.order[rank:], w.independent)
+    if w.Rate.size > w.C.size:
+        _insert_sorted(w.row_order[:rank_v], w.rows_v)
+        _insert_sorted(w.order[:rank_v], w.dependent_v)
+        _insert_sorted(w.order[rank_v:], w.independent_v)
     w.notes[SENSITIVITY] = 0.0
     w.notes[ORIENTATION] = 0.0
+    w.notes[GENERATION] += 1.0
+    if w.G_of_S.size > 0:
+        w.G_of_S[0, 0] = np.nan
+    return write_programs(w)
+
+
+@compiled
+def write_programs(w):
+    """Choose the order of elimination for the numbers in w.G; False: singular."""
+    r = w.rows.size
+    A, used = _square(w.Gx, r), _square(w.S, r)
+    done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values, A, used)
+    if done and w.Rate.size > w.C.size:
+        r = w.rows_v.size
+        A, used = _square(w.Gx, r), _square(w.S, r)
+        done = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v, A, used)
+    return done
+
+
+@inlined
+def _square(A, r):
+    return A.reshape(A.size)[: r * r].reshape((r, r))
+
+
+@compiled
+def note_pattern(G, pattern):
+    """Note the entries of G that are not zero; whether there are new ones."""
+    new = False
+    for i in range(pattern.shape[0]):
+        for j in range(pattern.shape[1]):
+            if G[i, j] != 0.0 and pattern[i, j] == 0.0:
+                pattern[i, j] = 1.0
+                new = True
+    return new
 
 
 @compiled
 def partition(f, w, t, q):
-    """Choose dependent and independent coordinates at (t, q); SINGULAR where C_q has not full rank."""
-    w.Cqx[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.Cqx)
-    n_c = w.C.size
-    rank = full_pivoting(w.Cqx, w.order)
+    """Choose dependent and independent coordinates at (t, q), and the rows that count.
+
+    SINGULAR where the rank is less than that of the partition before; RANK_DIFFERS, with the ranks in w.notes, where
+    the workspace is made for others and this is the first partition.
+    """
+    w.entries[:] = 0.0
+    constraint_rows(f, w, t, q, w.G)
+    note_pattern(w.G, w.pattern)
+    copy_matrix(w.G, w.Gx)
     w.counters[N_FACTORIZATIONS] += 1
     w.counters[N_PARTITIONS] += 1
-    if rank < n_c:
+    first = w.notes[GENERATION] == 0.0
+    most, most_v = (w.C.size, w.Rate.size) if first else (w.rows.size, w.rows_v.size)
+    rank, rank_v = _eliminate(w, most, most_v)
+    if first and (rank != w.rows.size or rank_v != w.rows_v.size):
+        w.notes[RANK], w.notes[RANK_V] = rank, rank_v
+        return RANK_DIFFERS
+    if rank < w.rows.size or rank_v < w.rows_v.size:
         return SINGULAR
-    _take_order(w)
-    return DONE
+    return DONE if _take_order(w) else SINGULAR
 
 
 @compiled
@@ -105,39 +202,64 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     n = w.Q.size
     for j in range(n):
         w.x[j] = 0.5 * (state[j] + new_state[j])
-    w.Cqx[:, :] = 0.0
-    f.jacobian(t_mid, w.x, f.p, w.Cqx)
-    n_c = w.C.size
+    w.entries[:] = 0.0
+    constraint_rows(f, w, t_mid, w.x, w.G)
+    note_pattern(w.G, w.pattern)
+    copy_matrix(w.G, w.Gx)
+    rank, rank_v = w.rows.size, w.rows_v.size
     w.counters[N_FACTORIZATIONS] += 1
-    if full_pivoting(w.Cqx, w.order) < n_c:
+    found, found_v = _eliminate(w, rank, rank_v)
+    if found < rank or found_v < rank_v:
         return SINGULAR
-    same = True
-    for m in w.independent:
-        found = False
-        for k in range(n_c, n):
-            found = found or w.order[k] == m
-        same = same and found
-    if same:
+    same = _same_set(w.independent, w.order[rank:])
+    if same and _same_set(w.independent_v, w.order[rank_v:]):
         return DONE
     w.counters[N_PARTITIONS] += 1
-    _take_order(w)
-    return CHANGED
+    return CHANGED if _take_order(w) else SINGULAR
+
+
+@merged
+def _same_set(a, b):
+    same = True
+    for m in a:
+        found = False
+        for k in b:
+            found = found or k == m
+        same = same and found
+    return same
 
 
 @compiled
-def partition_is_worn(w):
+def renew(f, w, t, q):
+    """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
+    code = partition(f, w, t, q)
+    w.notes[ORIENTATION] = 0.0
+    if code != DONE:
+        return code
+    ratio = min(factor(w.entries, w.index, w.values), factor(w.entries, w.index_v, w.values_v))
+    if not ratio > RANK_TOLERANCE:
+        return SINGULAR
+    w.notes[ORIENTATION] = sign_of(w.index, w.values)
+    return DONE
+
+
+@compiled
+def _largest(D, n_dof):
+    largest = 0.0
+    for j in range(n_dof):
+        for k in range(D.shape[1]):
+            largest = max(largest, abs(D[j, k]))
+    return largest
+
+
+@merged
+def partition_is_poor(w):
     """Whether dependents move much faster per independent than when the partition was chosen.
 
-    Measures max|C_qd^-1 C_qi| with C_q and the factors of C_qd as they stand after an accepted step. Full pivoting
-    leaves it near 1; it grows without bound where the independent coordinates stop being valid.
+    Measures max|C_qd^-1 C_qi|, which is in w.D. Full pivoting leaves it near 1; it grows without bound where the
+    independent coordinates stop being valid.
     """
-    largest = 0.0
-    for m in w.independent:
-        for i in range(w.g.size):
-            w.g[i] = w.Cq[i, m]
-        lu_solve(w.Cqd, w.pivots, w.g)
-        for i in range(w.g.size):
-            largest = max(largest, abs(w.g[i]))
+    largest = _largest(w.D, w.independent_v.size)
     if w.notes[SENSITIVITY] == 0.0:  # first look at a new partition
         w.notes[SENSITIVITY] = max(largest, 1.0)
     return not largest <= WORSE * w.notes[SENSITIVITY]

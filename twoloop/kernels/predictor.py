@@ -7,34 +7,23 @@ difference; it has then passed a zero of det C_qd, which a motion does only thro
 this sign needs a prediction that is nearly exact, as short steps through a singular position have it.
 """
 
-from twoloop.kernels.common import (
-    ATOL,
-    DEPARTURE,
-    DONE,
-    ESTIMATE,
-    ORIENTATION,
-    ORIENTATION_NEW,
-    RTOL,
-    compiled,
-    inlined,
-)
-from twoloop.kernels.inner import factor_dependent, restore
-from twoloop.kernels.linalg import lu_sign
-from twoloop.kernels.partition import partition
+from twoloop.kernels.calls import restore
+from twoloop.kernels.common import ATOL, DEPARTURE, DONE, ESTIMATE, ORIENTATION, ORIENTATION_NEW, RTOL, merged
+from twoloop.kernels.factors import sign_of
 
 SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
 SHARE_THROUGH_ZERO = 1e-6  # ... and where the sign of det C_qd changes
 FLOOR = 0.01  # of the tolerances, below which SHARE_OF_MOTION does not matter
 
 
-@inlined
+@merged
 def keep_predicted(w, q1):
     """Keep the dependent positions of q1 before the constraints change them."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
 
-@compiled
+@merged
 def departure(w, tolerances, h, q, v, q1):
     """Largest distance of the kept prediction from q1, over the tolerances or over a share of the motion.
 
@@ -42,7 +31,7 @@ def departure(w, tolerances, h, q, v, q1):
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
-    w.notes[ORIENTATION_NEW] = lu_sign(w.Cqd, w.pivots)
+    w.notes[ORIENTATION_NEW] = sign_of(w.index, w.values)
     motion = 0.0
     for m in range(q.size):
         motion = max(motion, h * abs(v[m]), abs(q1[m] - q[m]))
@@ -59,7 +48,7 @@ def departure(w, tolerances, h, q, v, q1):
     return largest
 
 
-@compiled
+@merged
 def restore_predicted(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
     """Put the prediction (q1, v1) of a step of h from (q, v) on the constraints, as `restore` does.
 
@@ -69,14 +58,4 @@ def restore_predicted(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
     code = restore(f, w, t, q1, v1, inner_tol)
     if code == DONE:
         w.notes[DEPARTURE] = max(w.notes[DEPARTURE], departure(w, tolerances, h, q, v, q1))
-    return code
-
-
-@compiled
-def renew_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
-    code = partition(f, w, t, q)
-    if code == DONE:
-        code = factor_dependent(f, w, t, q)
-    w.notes[ORIENTATION] = lu_sign(w.Cqd, w.pivots) if code == DONE else 0.0
     return code

@@ -1,11 +1,12 @@
 """Implicit Runge-Kutta steps: the outer loop by fixed point, and Richardson's error estimate around it.
 
-Two outer loops are available: `sweep_accelerations` iterates on the stage accelerations alone (the tableau applied
-twice to q'' = a), `sweep_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
+Two outer loops are available: `iterate_accelerations` iterates on the stage accelerations alone (the tableau applied
+twice to q'' = a), `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
 """
 
 import numpy as np
 
+from twoloop.kernels.calls import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.common import (
     ATOL,
     DEPARTURE,
@@ -18,14 +19,14 @@ from twoloop.kernels.common import (
     compiled,
     inlined,
     kernel,
+    merged,
 )
-from twoloop.kernels.inner import accelerations, evaluate, restore, rounding_floor
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import restore_predicted
 from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TEST, OUTER_TOL, interpolate, tableau_of
 
-MAX_SWEEPS = 60
-MAX_SWEEPS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
+MAX_ITERATIONS = 60
+MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
 GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
 PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
@@ -53,7 +54,7 @@ def _vector(memory, s, n, which):
 
 
 @compiled
-def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
+def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
     """One step of size h from (q, v), a fixed-point iteration on the stage accelerations.
 
     A_stage holds their prediction on entry.
@@ -73,7 +74,7 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
     first = 0.0
     before = 0.0
     converged = False
-    for sweep in range(MAX_SWEEPS):
+    for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         # all stages are set before any is evaluated: Gauss-Seidel would converge for smaller h only
         for j in range(s):
@@ -87,7 +88,7 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
                 V_stage[j, m] = v[m] + h * in_v
         change = 0.0
         for j in range(s):
-            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1, w.lam)
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1)
             if code != DONE:
                 return code
             for m in w.independent:
@@ -98,7 +99,7 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
         if change <= options[OUTER_TOL]:
             converged = True
             break
-        if sweep == 0:
+        if iteration == 0:
             first = change
         elif not change <= GROWTH * first:
             return OUTER_DIVERGED
@@ -106,7 +107,7 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
             if change <= rounding_floor(q):
                 converged = True
                 break
-            if sweep >= PATIENCE:
+            if iteration >= PATIENCE:
                 return OUTER_DIVERGED
         before = change
     if not converged:
@@ -122,7 +123,7 @@ def sweep_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage,
     return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
-@inlined
+@merged
 def _largest_change(coordinates, q, v, q_old, v_old):
     change = 0.0
     for m in coordinates:
@@ -132,7 +133,7 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 
 
 @compiled
-def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
+def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
     """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
 
     `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration goes from
@@ -145,7 +146,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
     for m in range(n):
         q1[m] = q[m] + h * v[m]
         v1[m] = v[m] + h * a[m]
-    code = evaluate(f, w, t + h, q1, v1, tolerance, A_stage[0], w.lam)
+    code = evaluate(f, w, t + h, q1, v1, tolerance, A_stage[0])
     if code != DONE:
         return code
     for j in range(s):
@@ -153,7 +154,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
         copy(v1, V_stage[j])
         copy(q1, Q_stage[j])
     norm_before = np.inf
-    for _ in range(MAX_SWEEPS_PAPER):
+    for _ in range(MAX_ITERATIONS_PAPER):
         w.counters[N_OUTER] += 1
         for j in range(s):
             for m in w.independent:
@@ -164,7 +165,7 @@ def sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q
                     in_v += A[j, k] * A_stage[k, m]
                 Q_stage[j, m] = q[m] + h * in_q
                 V_stage[j, m] = v[m] + h * in_v
-            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j], w.lam)
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j])
             if code != DONE:
                 return code
         copy(q1, q_old)
@@ -258,7 +259,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code = sweep_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
+    code = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -269,12 +270,12 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
         w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
         g = 0.5 * h
-        code = sweep_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid)
+        code = iterate_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid)
         if code != DONE:
             return code, np.inf
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
-        code = sweep_accelerations(f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
+        code = iterate_accelerations(f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
         if code != DONE:
             return code, np.inf
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
@@ -299,7 +300,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
     q_mid, v_mid, a_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID), _vector(memory, s, n, A_MID)
     q_old, v_old = _vector(memory, s, n, Q_OLD), _vector(memory, s, n, V_OLD)
-    code = sweep_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
+    code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -307,12 +308,12 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(q1, q_full)
         copy(v1, v_full)
         g = 0.5 * h
-        code = sweep_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
+        code = iterate_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
         if code == DONE:
             code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
         if code != DONE:
             return code, np.inf
-        code = sweep_first_order(
+        code = iterate_first_order(
             f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
         )
         if code != DONE:

@@ -86,6 +86,37 @@ def gamma(t, q, v, p, Qd):
         Qd[7] -= ddx
 
 
+@callback("kinematics")
+def kinematics(t, q, v, p, C, Cq, Ct, Qd):
+    x = 0.0
+    y = 0.0
+    for k in range(3):
+        dx = p[k] * math.cos(q[3 * k + 2])
+        dy = p[k] * math.sin(q[3 * k + 2])
+        C[2 * k] = q[3 * k] - x - 0.5 * dx
+        C[2 * k + 1] = q[3 * k + 1] - y - 0.5 * dy
+        x += dx
+        y += dy
+        w2 = v[3 * k + 2] ** 2
+        Cq[2 * k, 3 * k] = 1.0
+        Cq[2 * k + 1, 3 * k + 1] = 1.0
+        Cq[2 * k, 3 * k + 2] = 0.5 * dy
+        Cq[2 * k + 1, 3 * k + 2] = -0.5 * dx
+        Qd[2 * k] -= 0.5 * dx * w2
+        Qd[2 * k + 1] -= 0.5 * dy * w2
+        for i in range(k + 1, 3):
+            Cq[2 * i, 3 * k + 2] = dy
+            Cq[2 * i + 1, 3 * k + 2] = -dx
+            Qd[2 * i] -= dx * w2
+            Qd[2 * i + 1] -= dy * w2
+        Cq[6, 3 * k + 2] = dx
+        Cq[7, 3 * k + 2] = -dy
+        Qd[6] += dy * w2
+        Qd[7] += dx * w2
+    C[6] = y
+    C[7] = x - p[3]
+
+
 @dataclass(frozen=True, eq=False)
 class Energy:
     """Kinetic plus potential energy of the rods, J, as a function of t, q and v."""
@@ -154,6 +185,7 @@ def four_bar(
         constraint=constraint,
         jacobian=jacobian,
         gamma=gamma,
+        kinematics=kinematics,
         parameters=[L1, L2, L3, ground],
         constant_mass=True,
         name="four-bar",

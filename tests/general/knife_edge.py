@@ -1,0 +1,121 @@
+"""A knife edge on an inclined plane: one non-holonomic row, closed form (Bloch, Nonholonomic Mechanics, Sect. 1.6).
+
+x points down the slope, phi is the angle of the blade. The blade turns with a constant angular velocity; it starts at
+rest at the origin, pointing down. Two variations of our own: the plane as a holonomic row of a point in space, and a
+blade that is pushed sideways at a known speed, so that the non-holonomic row has a rate b(t, q).
+"""
+
+import numpy as np
+
+from tests.general.mechanism import G, Mechanism
+
+M, INERTIA, SLOPE, SPIN = 1.3, 0.2, 0.4, 1.7
+PULL = G * np.sin(SLOPE)
+PUSH = 0.6  # amplitude of the sideways speed, m/s
+END = 2.0
+
+
+def nonholonomic(t, q):
+    return np.array([[np.sin(q[2]), -np.cos(q[2]), 0.0]])
+
+
+def nonholonomic_gamma(t, q, v):
+    return np.array([-v[2] * (v[0] * np.cos(q[2]) + v[1] * np.sin(q[2]))])
+
+
+def state(t):
+    s, c = np.sin(SPIN * t), np.cos(SPIN * t)
+    scale = PULL / (2.0 * SPIN**2)
+    q = np.array([scale * s * s, scale * (SPIN * t - s * c), SPIN * t])
+    return q, np.array([PULL / SPIN * s * c, PULL / SPIN * s * s, SPIN])
+
+
+def multiplier(t):
+    """Of A = (sin phi, -cos phi, 0)."""
+    return 2.0 * M * PULL * np.sin(SPIN * t)
+
+
+FUNCTIONS = {
+    "mass": np.diag([M, M, INERTIA]),
+    "force": lambda t, q, v: np.array([M * PULL, 0.0, 0.0]),
+    "nonholonomic": nonholonomic,
+    "nonholonomic_gamma": nonholonomic_gamma,
+}
+
+
+def knife_edge():
+    """No holonomic row at all."""
+    return Mechanism(
+        name="knife edge",
+        sizes={"n_q": 3, "n_c": 0, "n_a": 1},
+        functions={**FUNCTIONS, "constraint": None, "jacobian": None},
+        end=END,
+        state=state,
+        rank=1,
+        energy=lambda q, v: 0.5 * v @ (np.array([M, M, INERTIA]) * v) - M * PULL * q[0],
+    )
+
+
+def knife_edge_in_space():
+    """X, Y, Z, phi: Y and the plane's slope along X; the plane is a holonomic row."""
+    tangent, cosine = np.tan(SLOPE), np.cos(SLOPE)
+
+    def rows(t, q):
+        return np.array([[np.sin(q[3]) / cosine, -np.cos(q[3]), 0.0, 0.0]])
+
+    def rows_gamma(t, q, v):
+        return np.array([-v[3] * (v[0] * np.cos(q[3]) / cosine + v[1] * np.sin(q[3]))])
+
+    def lifted(t):
+        q, v = state(t)
+        lift = np.array([[cosine, 0.0, 0.0], [0.0, 1.0, 0.0], [-np.sin(SLOPE), 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return lift @ q, lift @ v
+
+    return Mechanism(
+        name="knife edge in space",
+        sizes={"n_q": 4, "n_c": 1, "n_a": 1},
+        functions={
+            "mass": np.diag([M, M, M, INERTIA]),
+            "force": lambda t, q, v: np.array([0.0, 0.0, -M * G, 0.0]),
+            "constraint": lambda t, q: np.array([q[2] + tangent * q[0]]),
+            "jacobian": lambda t, q: np.array([[tangent, 0.0, 1.0, 0.0]]),
+            "gamma": lambda t, q, v: np.zeros(1),
+            "nonholonomic": rows,
+            "nonholonomic_gamma": rows_gamma,
+        },
+        end=END,
+        state=lifted,
+        rank=2,
+        energy=lambda q, v: 0.5 * v @ (np.array([M, M, M, INERTIA]) * v) + M * G * q[2],
+    )
+
+
+def pushed_knife_edge():
+    """The blade slides to its right at PUSH sin(2 SPIN t): A v + b = 0 with b = -PUSH sin(2 SPIN t).
+
+    Along the blade u' = PULL cos(phi) - SPIN w, across it w is given; both integrate in closed form.
+    """
+
+    def pushed(t):
+        s, c = np.sin(SPIN * t), np.cos(SPIN * t)
+        q, v = state(t)
+        along, across = -PUSH * s * s, 2.0 * PUSH * s * c
+        q = q + PUSH / SPIN * np.array([s**3 / 3.0, c + c**3 / 3.0 - 4.0 / 3.0, 0.0])
+        return q, v + np.array([along * c + across * s, along * s - across * c, 0.0])
+
+    return Mechanism(
+        name="pushed knife edge",
+        sizes={"n_q": 3, "n_c": 0, "n_a": 1},
+        functions={
+            **FUNCTIONS,
+            "constraint": None,
+            "jacobian": None,
+            "nonholonomic_rate": lambda t, q: np.array([-PUSH * np.sin(2.0 * SPIN * t)]),
+            "nonholonomic_gamma": lambda t, q, v: (
+                nonholonomic_gamma(t, q, v) + 2.0 * PUSH * SPIN * np.cos(2.0 * SPIN * t)
+            ),
+        },
+        end=END,
+        state=pushed,
+        rank=1,
+    )

@@ -1,0 +1,52 @@
+"""All mechanisms with a known motion, by name, each made once."""
+
+from functools import cache, partial
+
+from tests.general import (
+    bricard,
+    chain,
+    dead_points,
+    disc,
+    driven_pendulum,
+    faulty,
+    heavy_top,
+    knife_edge,
+    slider_crank,
+    windows,
+)
+
+WINDOWS = (1, 2, 40)
+
+# name -> how it is made; motion that never comes near a point where C_q loses rank
+REGULAR = {
+    "redundant slider-crank": slider_crank.redundant_slider_crank,
+    "Bricard": bricard.bricard,
+    "top of Euler parameters": heavy_top.top_of_euler_parameters,
+    "top with its centre": heavy_top.top_with_centre,
+    "knife edge": knife_edge.knife_edge,
+    "knife edge in space": knife_edge.knife_edge_in_space,
+    "pushed knife edge": knife_edge.pushed_knife_edge,
+    "steady disc": disc.steady_disc,
+    "wobbling disc": disc.wobbling_disc,
+    "wobbling disc, redundant": partial(disc.wobbling_disc, True),
+    "driven slider-crank": partial(slider_crank.driven_slider_crank, False),
+    "driven slider-crank, redundant": partial(slider_crank.driven_slider_crank, True),
+    "pendulum on a driven crank": driven_pendulum.driven_pendulum,
+    "massless coordinate": faulty.massless_coordinate,
+    "planet": chain.kepler,
+    "chain of 5": partial(chain.chain, 5),
+}
+# rank is lost on the way, and the motion goes on
+SINGULAR = {
+    **{f"A02, N = {n}": partial(windows.windows, n) for n in WINDOWS},
+    **{f"A02 of bodies, N = {n}": partial(windows.windows_of_bodies, n) for n in (1, 2)},
+    "isosceles slider-crank": dead_points.isosceles_slider_crank,
+    "crossing lines": dead_points.crossing_lines,
+}
+ALL = {**REGULAR, **SINGULAR}
+REDUNDANT = [name for name in REGULAR if "redundant" in name or name == "Bricard"]
+
+
+@cache
+def mechanism(name):
+    return ALL[name]()

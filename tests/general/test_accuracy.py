@@ -1,0 +1,78 @@
+"""Every mechanism to nine digits at a tolerance of 1e-10, against motions that share nothing with the integrator."""
+
+import numpy as np
+import pytest
+
+from tests.general.knife_edge import multiplier
+from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism
+from tests.general.runs import error, relative_error, run
+
+METHODS = ("Gauss12", "DOP853")
+CONSERVATIVE = [name for name in REGULAR if mechanism.__wrapped__(name).energy is not None]
+both = pytest.mark.parametrize("method", METHODS)
+
+
+@both
+@pytest.mark.parametrize("name", REGULAR)
+def test_nine_digits(name, method):
+    m, (result, _) = mechanism(name), run(name, method)
+    assert result.success, result.message
+    assert result.t[-1] == m.end
+    assert error(m, result) < 1e-9
+
+
+@both
+@pytest.mark.parametrize("name", REGULAR)
+def test_every_state_is_on_all_rows(name, method):
+    """Redundant rows too, though they are left out of the solution."""
+    m, (result, _) = mechanism(name), run(name, method)
+    for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True):
+        assert np.abs(m.call("constraint", t, q)).max(initial=0.0) < 1e-10
+        assert np.abs(m.velocity_residual(t, q, v)).max(initial=0.0) < 1e-9 * max(1.0, np.abs(v).max())
+
+
+@both
+@pytest.mark.parametrize("name", CONSERVATIVE)
+def test_energy(name, method):
+    m, (result, _) = mechanism(name), run(name, method)
+    energies = np.array([m.energy(q, v) for q, v in zip(result.q.T, result.v.T, strict=True)])
+    kinetic = 0.5 * max(v @ m.call("mass", t, q) @ v for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True))
+    assert np.ptp(energies) < 4e-9 * max(1.0, kinetic)
+
+
+@both
+@pytest.mark.parametrize("name", REGULAR)
+def test_accelerations_and_multipliers_of_minimum_norm(name, method):
+    """Against the pseudoinverse of the whole matrix at the known state; lam is [lam; mu]."""
+    m, (result, _) = mechanism(name), run(name, method)
+    assert result.lam.shape == (m.n_rows, result.t.size)
+    known = [m.solution(t, *m.state(t)) for t in result.t]
+    assert relative_error(result.a, np.array([a for a, _ in known]).T) < 1e-7
+    if m.n_rows:
+        assert relative_error(result.lam, np.array([lam for _, lam in known]).T) < 1e-7
+
+
+@both
+@pytest.mark.parametrize("name", REGULAR)
+def test_rank_and_redundant_rows(name, method):
+    """What remains without the rows named must be independent, and as many as the rank."""
+    m, (result, warned) = mechanism(name), run(name, method)
+    assert result.rank == m.rank
+    assert len(result.redundant) == m.n_rows - m.rank
+    kept = np.delete(m.rows(0.0, m.start[0]), result.redundant, axis=0)
+    assert np.linalg.matrix_rank(kept, tol=1e-9) == m.rank == len(kept)
+    assert len(warned) == (1 if name in REDUNDANT else 0)
+    for row in result.redundant:
+        assert str(row) in warned[0]
+
+
+def test_a_row_of_velocities_does_not_replace_one_of_positions():
+    """The last non-holonomic row of the disc is the derivative of its holonomic one, which must be kept."""
+    result, _ = run("wobbling disc, redundant", "DOP853")
+    assert list(result.redundant) == [3]
+
+
+@both
+def test_multiplier_of_the_knife_edge(method):
+    result, _ = run("knife edge", method)
+    assert result.lam[0] == pytest.approx(multiplier(result.t), abs=1e-8)

@@ -1,0 +1,63 @@
+"""The cost of an evaluation grows like the length of a chain, up to 1000 rows."""
+
+import time
+
+import numpy as np
+import pytest
+
+from tests.general.chain import slack_chain
+from twoloop import solve_dae
+
+
+def run_chain(n, steps=10):
+    """A few steps of constant size, far below the shortest period, which is of the order of 1/n."""
+    system, q, v = slack_chain(n)
+    h = 0.02 / n
+    options = {"method": "DOP853", "step_size": h, "check_derivatives": False}
+    return solve_dae(system, (0.0, steps * h), q, v, **options)
+
+
+def time_of_an_evaluation(n):
+    """The least of three runs, s."""
+    results = [run_chain(n) for _ in range(3)]
+    assert all(result.success for result in results), results[0].message
+    return min(result.stats.cpu_time / result.stats.n_evaluations for result in results)
+
+
+def time_to_fill(n):
+    """The time to write one dense C_q (n, 2n), as the callback does: the least of three, s."""
+    array, times = np.ones((n, 2 * n)), []
+    for _ in range(3):
+        start = time.process_time()
+        for _ in range(20):
+            array[:] = 0.0
+        times.append((time.process_time() - start) / 20)
+    return min(times)
+
+
+@pytest.mark.slow
+def test_an_evaluation_is_linear_in_the_length():
+    """A ratio, not a time: eight times the length may cost 16 times as much, where dense algebra costs 512 times.
+
+    The dense C_q that the callback fills is quadratic; four passes over it are allowed.
+    """
+    short, long = time_of_an_evaluation(125), time_of_an_evaluation(1000)
+    assert long < 16.0 * short + 4.0 * time_to_fill(1000)
+
+
+@pytest.mark.parametrize("n", [50, 200])
+def test_a_chain_keeps_its_links_and_its_energy(n):
+    result = run_chain(n, steps=20)
+    assert result.success, result.message
+    x, y, v = result.q[0::2], result.q[1::2], result.v
+    links = np.hypot(np.diff(x, axis=0, prepend=0.0), np.diff(y, axis=0, prepend=0.0))
+    assert np.abs(n * links - 1.0).max() < 1e-11
+    energies = (0.5 * (v * v).sum(axis=0) + 9.81 * y.sum(axis=0)) / n
+    assert np.ptp(energies) < 1e-11
+
+
+def test_as_many_evaluations_whatever_the_length():
+    """Same steps, same loops: what is counted does not depend on the length."""
+    short, long = run_chain(50).stats, run_chain(200).stats
+    assert long.n_evaluations == short.n_evaluations
+    assert long.n_factorizations <= short.n_factorizations + 5

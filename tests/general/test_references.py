@@ -1,0 +1,113 @@
+"""Mechanism and reference agree without an integrator: the known motion keeps all rows and the equations of motion."""
+
+import numpy as np
+import pytest
+
+from tests.general import dead_points, heavy_top, windows
+from tests.general.mechanisms import ALL, mechanism
+
+STEP = 1e-3
+
+
+def slope(f, e=STEP):
+    """df(s)/ds at s = 0, central differences of order 6."""
+    return (45.0 * (f(e) - f(-e)) - 9.0 * (f(2 * e) - f(-2 * e)) + f(3 * e) - f(-3 * e)) / (60.0 * e)
+
+
+def times(m):
+    return np.linspace(0.03, 0.97, 6) * m.end
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_known_motion_keeps_all_rows(name):
+    m = mechanism(name)
+    for t in times(m):
+        q, v = m.state(t)
+        assert np.abs(m.call("constraint", t, q)).max(initial=0.0) < 1e-11
+        assert np.abs(m.velocity_residual(t, q, v)).max(initial=0.0) < 1e-11
+        assert np.abs(slope(lambda s, t=t: m.state(t + s)[0]) - v).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_known_motion_obeys_the_equations(name):
+    """What is left of M a - Q must lie in the rows; a is that of the reference, by differences."""
+    m = mechanism(name)
+    for t in times(m):
+        q, v = m.state(t)
+        a = slope(lambda s, t=t: m.state(t + s)[1])
+        known, lam = m.solution(t, q, v)
+        residual = m.call("mass", t, q) @ known + m.rows(t, q).T @ lam - m.call("force", t, q, v)
+        assert np.abs(residual).max() < 1e-8 * max(1.0, np.abs(lam).max(initial=0.0))
+        assert np.abs(known - a).max() < 1e-7 * max(1.0, np.abs(a).max())
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_derivatives(name):
+    """C_q, C_t and Q_d (and those of the non-holonomic rows) against differences, off the motion."""
+    m, rng = mechanism(name), np.random.default_rng(7)
+    for t in times(m)[::3]:
+        q, v = m.state(t)
+        _check_derivatives(m, t, q + 0.05 * rng.normal(size=q.size), v + rng.normal(size=q.size))
+
+
+def _check_derivatives(m, t, q, v):
+    by_q = slope(lambda s: m.call("constraint", t, q + s * v))
+    assert by_q == pytest.approx(m.call("jacobian", t, q) @ v, rel=1e-9, abs=1e-9)
+    by_t = slope(lambda s: m.call("constraint", t + s, q))
+    assert by_t == pytest.approx(m.call("constraint_rate", t, q), rel=1e-9, abs=1e-9)
+    bend = slope(lambda s: m.velocity_residual(t + s, q + s * v, v))
+    gamma = np.concatenate([m.call("gamma", t, q, v), m.call("nonholonomic_gamma", t, q, v)])
+    assert -bend == pytest.approx(gamma, rel=1e-7, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if mechanism.__wrapped__(name).energy is not None])
+def test_energy_of_the_known_motion(name):
+    m = mechanism(name)
+    energies = [m.energy(*m.state(t)) for t in times(m)]
+    assert np.ptp(energies) < 1e-11 * max(1.0, np.abs(energies).max())
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_rank_at_the_start(name):
+    m = mechanism(name)
+    assert np.linalg.matrix_rank(m.rows(0.0, m.start[0]), tol=1e-9) == m.rank
+
+
+# --- what is published
+
+
+def test_the_top_is_the_published_one():
+    e, _ = mechanism("top of Euler parameters").state(0.2)
+    assert e == pytest.approx(heavy_top.PRINTED, abs=5e-6)
+
+
+def test_height_of_the_top_by_elliptic_functions():
+    m = mechanism("top with its centre")
+    t = np.linspace(0.0, heavy_top.KNOWN, 31)
+    assert m.states(t)[0][2] == pytest.approx(heavy_top.height(t), abs=1e-11)
+
+
+def test_two_windows_are_the_published_ones():
+    """Exudyn's values at two step sizes, extrapolated: its method is of order 2."""
+    tip = mechanism("A02, N = 2").state(10.0)[0][:2]
+    coarse, fine = windows.PRINTED_TIP
+    assert tip == pytest.approx(fine + (fine - coarse) / 3.0, abs=5e-8)
+
+
+@pytest.mark.parametrize("n", [1, 2, 40])
+def test_windows_lose_a_rank_each(n):
+    t = windows.first_singular_time(n)
+    m = mechanism(f"A02, N = {n}")
+    singular = np.linalg.svd(m.rows(t, m.state(t)[0]), compute_uv=False)
+    assert (singular < 1e-12).sum() == n
+    assert 0.6 < t < 0.8
+
+
+def test_the_cusp_is_reached_at_unit_speed():
+    m = dead_points.cusp()
+    assert m.state(0.0)[0] == pytest.approx([1.0, 1.0])
+    assert m.state(dead_points.CUSP_TIME)[0] == pytest.approx([0.0, 0.0], abs=1e-12)
+    for t in (0.3, 1.2):
+        _, v = m.state(t)
+        assert np.hypot(*v) == pytest.approx(1.0)
+        assert slope(lambda s, t=t: m.state(t + s)[0]) == pytest.approx(v, abs=1e-9)

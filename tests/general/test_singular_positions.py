@@ -1,0 +1,81 @@
+"""Where C_q loses rank on the way: the motion goes on where it is smooth, on the same branch, by every method."""
+
+import numpy as np
+import pytest
+
+from tests.general.dead_points import CUSP_TIME, cusp
+from tests.general.mechanisms import SINGULAR, WINDOWS, mechanism
+from tests.general.runs import error, run
+from tests.general.windows import first_singular_time
+from twoloop import Status, solve_dae
+
+METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_five_digits_across_the_singular_positions(n, method="DOP853"):
+    """After 10 s, in which the cranks pass the ground line some ten times."""
+    m, (result, _) = mechanism(f"A02, N = {n}"), run(f"A02, N = {n}", method)
+    assert result.success, result.message
+    assert error(m, result) < 1e-5
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "RadauIIA5", "BDF"])
+@pytest.mark.parametrize("n", [1, 2])
+def test_every_method_crosses(n, method):
+    """Four digits at a tolerance of 1e-8: on another branch not one would be right."""
+    m, (result, _) = mechanism(f"A02, N = {n}"), run(f"A02, N = {n}", method, 1e-8)
+    assert result.success, result.message
+    assert error(m, result) < 1e-4
+
+
+@pytest.mark.parametrize("method", ["DOP853"])
+@pytest.mark.parametrize("name", [name for name in SINGULAR if name not in {f"A02, N = {n}" for n in WINDOWS}])
+def test_other_dead_points(name, method):
+    m, (result, _) = mechanism(name), run(name, method)
+    assert result.success, result.message
+    assert error(m, result) < 1e-5
+
+
+@pytest.mark.parametrize("name", SINGULAR)
+def test_no_row_is_redundant_at_the_start(name):
+    result, warned = run(name, "DOP853")
+    assert result.rank == mechanism(name).rank
+    assert len(result.redundant) == 0
+    assert not any("start" in words for words in warned)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("step_size", [0.01, 0.0173])
+def test_one_window_by_steps_of_constant_size(method, step_size):
+    """Steps of more than the width of the singular position; only the branch is asked for."""
+    m = mechanism("A02, N = 1")
+    result = solve_dae(m.system(), (0.0, 173 * step_size), *m.start, method=method, step_size=step_size)
+    assert result.success, result.message
+    couplers = result.q[2:] - result.q[:2] - np.array([[1.0], [0.0]])
+    assert np.abs(couplers).max() < 1e-3  # on the other branch the coupler turns
+
+
+@pytest.mark.parametrize("method", ["DOP853"])
+def test_a_run_that_ends_on_a_singular_position(method):
+    """The last instant is the singular one, but for rounding."""
+    m, t = mechanism("A02, N = 1"), first_singular_time(1)
+    result = solve_dae(m.system(), (0.0, t), *m.start, method=method, rtol=1e-10, atol=1e-10)
+    assert result.success, result.message
+    q, v = m.state(t)
+    assert np.abs(q[1::2]).max() < 1e-13
+    assert result.q[:, -1] == pytest.approx(q, abs=1e-7)
+    assert result.v[:, -1] == pytest.approx(v, abs=1e-7)
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "DOP853"])
+def test_a_cusp_ends_the_run_and_is_named(method):
+    """Where the motion cannot go on, the run says so: the time, the row, and nothing beyond."""
+    m = cusp()
+    result = solve_dae(m.system(), (0.0, m.end), *m.start, method=method, max_steps=20_000)
+    assert result.status in (Status.RANK_LOST, Status.STEP_TOO_SMALL), result.message
+    assert CUSP_TIME - 0.05 < result.t[-1] < CUSP_TIME + 1e-6
+    assert f"{result.t[-1]:.10g}" in result.message
+    before = result.t < 0.95 * CUSP_TIME
+    q, _ = m.states(result.t[before])
+    assert np.abs(result.q[:, before] - q).max() < 1e-6
