@@ -53,6 +53,9 @@ def solve_dae(
 ) -> Result:
     """Integrate a constrained mechanical system by a two-loop procedure.
 
+    Constraints that depend on others at the start are left out, named by a `ConstraintWarning` and checked at every step.
+    Near a position where the constraints lose rank, steps of any method may give way to explicit ones across it.
+
     Parameters
     ----------
     system : ConstrainedSystem
