@@ -87,3 +87,12 @@ def test_newmark_without_an_error_estimate_wants_a_fixed_step(beta, gamma):
     with pytest.raises(ValueError, match=r"Newmark with beta.*no error estimate.*step_size"):
         swing(method=Newmark(beta, gamma))
     assert swing(method=Newmark(beta, gamma), step_size=0.01, end=0.1).success
+
+
+def test_one_step_over_a_span_that_is_rounded(default_four_bar):
+    """0.2 + 0.02 - 0.2 is less than 0.02 in floating-point numbers."""
+    problem = default_four_bar
+    result = solve_dae(problem.system, (0.2, 0.2 + 0.02), problem.q0, problem.v0, "Gauss6", step_size=0.02)
+    assert 0.2 + 0.02 - 0.2 < 0.02
+    assert result.success
+    assert len(result.h) == 1

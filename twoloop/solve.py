@@ -29,6 +29,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-15
+SAME = 1e-9  # relative: a step and a span that differ by less are one, however they were rounded
 
 
 def solve_dae(
@@ -53,7 +54,7 @@ def solve_dae(
 ) -> Result:
     """Integrate a constrained mechanical system by a two-loop procedure.
 
-    Constraints that depend on others at the start are left out, named by a `ConstraintWarning` and checked at every step.
+    Constraints that depend on others at the start are left out, named by a `ConstraintWarning`, checked at every step.
     Near a position where the constraints lose rank, steps of any method may give way to explicit ones across it.
 
     Parameters
@@ -137,7 +138,7 @@ def solve_dae(
     check_positive("max_step", max_step, infinite=True)
     if step_size is not None:
         check_positive("step_size", step_size)
-        if step_size > t1 - t0:
+        if step_size > (t1 - t0) * (1.0 + SAME):
             raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
         if first_step is not None or max_step != np.inf:
             raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
