@@ -118,7 +118,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.callbacks.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -291,7 +291,7 @@ def advance(
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
         if control[SYMMETRIC] == 0.0:
-            if f.callbacks.flags[REDUCED] == 0:
+            if f.flags[REDUCED] == 0:
                 find_tangents(f, w, clock[T], state[:n])
             if partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
                 return RANK_LOST

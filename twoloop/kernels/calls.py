@@ -87,73 +87,73 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
     Velocities and accelerations are those of a Jacobian whose position is off by w.notes[REUSE] at most.
     """
-    return f.inner(f.callbacks, w, EVALUATE, t, q, v, tolerance, a, w.lam)
+    return f.inner(f, w, EVALUATE, t, q, v, tolerance, a, w.lam)
 
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
     """The same for a state that may be accepted: exact to rounding, with multipliers."""
-    return f.inner(f.callbacks, w, EVALUATE_STATE, t, q, v, tolerance, a, lam)
+    return f.inner(f, w, EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
 @merged
 def restore(f, w, t, q, v, tolerance):
     """Dependents of q and v from their independents; leaves w ready for `accelerations` at this state."""
-    return f.inner(f.callbacks, w, RESTORE, t, q, v, tolerance, w.x, w.lam)
+    return f.inner(f, w, RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def dependent_positions(f, w, t, q, v, tolerance):
     """Dependents of q from its independents; rows and factors in w are those at q."""
-    return f.inner(f.callbacks, w, POSITIONS, t, q, v, tolerance, w.x, w.lam)
+    return f.inner(f, w, POSITIONS, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
     """Eqs. (6)-(8) at a state that was restored just before: accelerations and multipliers."""
-    return f.inner(f.callbacks, w, ACCELERATIONS, t, q, v, 0.0, a, lam)
+    return f.inner(f, w, ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
     """Those that belong to the accelerations found just before."""
-    return f.inner(f.callbacks, w, MULTIPLIERS, t, q, v, 0.0, a, lam)
+    return f.inner(f, w, MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def find_tangents(f, w, t, q):
     """Rows and factors at a position on the constraints, and the velocities that they allow, in w.D."""
-    return f.inner(f.callbacks, w, TANGENTS, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, TANGENTS, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def find_gamma(f, w, t, q, v):
     """The right-hand side of the acceleration constraints, in w.Gamma."""
-    return f.inner(f.callbacks, w, GAMMA, t, q, v, 0.0, w.x, w.lam)
+    return f.inner(f, w, GAMMA, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
     """M(t, q) and its factors, where they are needed."""
-    return f.inner(f.callbacks, w, MASS, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, MASS, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def renew_partition(f, w, t, q):
     """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
-    return f.inner(f.callbacks, w, RENEW, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, RENEW, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def take_midpoint(f, w, t_mid, state, new_state):
     """The partition of the middle of a step, see partition_of_midpoint."""
-    return f.inner(f.callbacks, w, MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
+    return f.inner(f, w, MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
 @merged
 def check_redundant(f, w, t, q, v):
     """Whether the rows that were left out hold at an accepted state."""
-    return f.inner(f.callbacks, w, REDUNDANT, t, q, v, 0.0, w.x, w.lam)
+    return f.inner(f, w, REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged

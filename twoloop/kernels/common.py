@@ -19,28 +19,14 @@ from numba.extending import typeof_impl
 
 from twoloop.caches import compile_kept
 from twoloop.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
+from twoloop.kernels.reference import Reference
+from twoloop.linking import HelperCompiler, KernelCompiler
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
 
-# the callbacks of a mechanism, its parameters and its flags, as the kernels see them
+# the callbacks of a mechanism, its parameters and its flags
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore[misc]
-FUNCTIONS = types.NamedTuple(
-    [*(types.FunctionType(kind.signature) for kind in KINDS.values()), VECTOR, INTEGERS], Functions
-)
-
-
-@typeof_impl.register(Functions)
-def _type_of_functions(value: Any, context: Any) -> Any:
-    """Types any `Functions` alike; otherwise numba would compile the kernels again for the callbacks of each system."""
-    return FUNCTIONS
-
-
-class Kit(NamedTuple):
-    """What a step gets: the callbacks, and the inner loop, which is compiled once and not again in every step."""
-
-    callbacks: Any
-    inner: Any
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense; REDUCED: accelerations from T^T M T
@@ -103,15 +89,25 @@ class Work(NamedTuple):
     notes: Any  # (N_NOTES) see below
 
 
+    address: Any = 0  # of the table by which kernels find these arrays
+    table: Any = None
+
+
 _INTEGER_FIELDS = {
     *("rows", "dependent", "independent", "index", "rows_v", "dependent_v", "independent_v", "index_v"),
     *("order", "row_order", "counters", "lapack"),
 }
 _MATRIX_FIELDS = {"M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "Gamma_tried"}
-WORK = types.NamedTuple(
-    [MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields],
-    Work,
+WORK = Reference(
+    "Work",
+    {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-2]},
 )
+
+
+@typeof_impl.register(Work)
+def _type_of_work(value: Any, context: Any) -> Any:
+    return WORK
+
 
 # places in Work.counters
 (
@@ -163,9 +159,25 @@ WORK = types.NamedTuple(
     ROWS_CONTRADICT,
 ) = range(9)
 
-# (callbacks, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
-INNER = i8(FUNCTIONS, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
-KIT = types.NamedTuple([FUNCTIONS, types.FunctionType(INNER)], Kit)
+
+class Kit:
+    """What a step gets of a system, one reference: the callbacks, and the inner loop, which no step compiles again."""
+
+    def __init__(self, functions: Any, inner: Any):
+        self.functions, self.inner = functions, inner
+        self.table = KIT.table(self)
+        self.address = self.table.ctypes.data
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.functions, name)
+
+
+KIT = Reference("Kit", {"p": VECTOR, "flags": INTEGERS})
+for _name, _kind in KINDS.items():
+    KIT.add_function(_name, _kind.signature)
+# (kit, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
+INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
+KIT.add_function("inner", INNER)
 
 
 @typeof_impl.register(Kit)
@@ -203,7 +215,7 @@ def _stamp(module: str) -> str:
     while found:
         known |= found
         found = {name for each in found for name in _imports(_text(each)) if name not in known}
-    digest = hashlib.sha256(repr((FUNCTIONS, GIVEN)).encode())
+    digest = hashlib.sha256(repr((KIT.functions, GIVEN)).encode())
     for each in sorted(known):
         digest.update(_text(each).encode())
     return digest.hexdigest()
@@ -221,6 +233,7 @@ def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
             signature,
             (_stamp(Path(inspect.getfile(function)).stem), ""),
             announcement=_ANNOUNCEMENT,
+            pipeline_class=KernelCompiler,
             **_OPTIONS,
         )
 
@@ -238,18 +251,10 @@ _OPTIONS: dict[str, Any] = {
 
 
 def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """A decorator for what kernels call.
-
-    Functions of `f` and `w` get no code to take arguments from Python, which would be long; they must not be called
-    from there.
-    """
-
-    def decorate(function: Callable[..., Any]) -> Dispatcher:
-        code = function.__code__
-        internal = not {"f", "w"}.isdisjoint(code.co_varnames[: code.co_argcount])
-        return njit(**{**_OPTIONS, "no_cpython_wrapper": internal, "no_cfunc_wrapper": internal, **options})(function)
-
-    return decorate
+    """A decorator for what kernels call; such a function must not be called from Python."""
+    return njit(
+        **_OPTIONS | options, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=HelperCompiler
+    )
 
 
 # a helper whose floating-point operations keep their order; said outright, because a callee inherits its caller's flags

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.kernels.common import N_COUNTERS, N_NOTES, Work
+from twoloop.kernels.common import N_COUNTERS, N_NOTES, WORK, Work
 from twoloop.kernels.factors import index_size
 from twoloop.kernels.lapack import N_ROUTINES
 
@@ -29,7 +29,7 @@ def make_work(
     positions = sets(r)
     velocities = positions if n_a == 0 else sets(r_v)
     names = ("rows", "dependent", "independent", "index", "values")
-    return Work(
+    work = Work(
         M=np.zeros((n_q, n_q)),
         L=np.zeros((n_q, n_q)),
         G=G,
@@ -62,3 +62,5 @@ def make_work(
         predicted=np.zeros(r),
         notes=np.zeros(N_NOTES),
     )
+    table = WORK.table(work)
+    return work._replace(table=table, address=table.ctypes.data)

@@ -82,9 +82,9 @@ def _tangents(f, w, t, q, tangent, reduced, u):
         tangent[k, w.independent[k]] = 1.0
         for i in range(columns.size):
             tangent[k, columns[i]] = w.D[k, i]
-    if f.callbacks.flags[CONSTANT_MASS] == 0:
+    if f.flags[CONSTANT_MASS] == 0:
         w.M[:, :] = 0.0
-        f.callbacks.mass(t, q, f.callbacks.p, w.M)
+        f.mass(t, q, f.p, w.M)
     for k in range(w.independent.size):
         _times_mass(w, tangent[k], w.x)
         for m in range(k, w.independent.size):
@@ -144,7 +144,7 @@ def _mass_rate(f, w, t, q, v, shifted, y):
         for j in range(q.size):
             shifted[j] = q[j] + shift * v[j]
         w.L[:, :] = 0.0
-        f.callbacks.mass(t + shift, shifted, f.callbacks.p, w.L)
+        f.mass(t + shift, shifted, f.p, w.L)
         for i in range(q.size):
             for j in range(q.size):
                 y[i] += weight * w.L[i, j] * v[j]
@@ -157,8 +157,8 @@ def _momentum_rates(f, w, t, q, v, tangent, Mv, shifted, rate):
     n_q = v.size
     rows, columns = rows_of(w.index), columns_of(w.index)
     w.Q[:] = 0.0
-    f.callbacks.force(t, q, v, f.callbacks.p, w.Q)
-    if f.callbacks.flags[CONSTANT_MASS] == 0:
+    f.force(t, q, v, f.p, w.Q)
+    if f.flags[CONSTANT_MASS] == 0:
         _mass_rate(f, w, t, q, v, shifted, w.Q)
     _times_mass(w, v, Mv)
     for k in range(w.independent.size):

@@ -119,7 +119,7 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
 @compiled
 def _derivatives(f, w, options, memory, s, t, q, v, a):
     """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
-    if f.callbacks.flags[BANDWIDTH] >= 0:
+    if f.flags[BANDWIDTH] >= 0:
         return newton_banded.derivatives(f, w, memory, s, t, q, v)
     return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
 
@@ -127,7 +127,7 @@ def _derivatives(f, w, options, memory, s, t, q, v, a):
 @compiled
 def _factor(f, w, options, memory, s, h):
     """Factors for steps of h, for every eigenvalue and for gamma0."""
-    if f.callbacks.flags[BANDWIDTH] >= 0:
+    if f.flags[BANDWIDTH] >= 0:
         code = newton_banded.factor(f, w, options, memory, s, h)
     else:
         code = newton_dense.factor(w, options, memory, s, h)
@@ -156,7 +156,7 @@ def _correct(f, w, options, memory, s, residual, A_stage):
             for j in range(s):
                 total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
             x[i] = total
-        if f.callbacks.flags[BANDWIDTH] >= 0:
+        if f.flags[BANDWIDTH] >= 0:
             newton_banded.solve(f, w, options, memory, s, k, x)
         else:
             newton_dense.solve(w, options, memory, s, k, x[:m])
@@ -263,7 +263,7 @@ def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
             in_v += e[k] * A_stage[k, j]
         e_q[i] = h * in_q
         e_v[i] = h * in_v
-    if f.callbacks.flags[BANDWIDTH] >= 0:
+    if f.flags[BANDWIDTH] >= 0:
         newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
     else:
         newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])

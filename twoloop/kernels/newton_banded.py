@@ -82,9 +82,9 @@ def _unbalanced(f, w, t, q, v):
     """Q - C_q^T lam into w.Q, with the multipliers in w.lam."""
     w.counters[N_EVALUATIONS] += 1
     w.Q[:] = 0.0
-    f.callbacks.force(t, q, v, f.callbacks.p, w.Q)
+    f.force(t, q, v, f.p, w.Q)
     w.Gx[:, :] = 0.0
-    constraint_rows(f.callbacks, w, t, q, w.Gx)
+    constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.lam.size):
         for j in range(q.size):
             w.Q[j] -= w.Gx[i, j] * w.lam[i]
@@ -128,7 +128,7 @@ def _from_tangents(f, w, memory, s, t, q, v, b):
     if code != DONE:
         return code
     _copy_band(K, b, _band(space(memory, s, n, BY_Q), n, b))
-    memory[DAMPED] = f.callbacks.flags[FORCE_BY_V_GIVEN]
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, b, K)
     if memory[DAMPED] == 1.0:
         _copy_band(K, b, _band(space(memory, s, n, BY_V), n, b))
@@ -139,7 +139,7 @@ def _from_tangents(f, w, memory, s, t, q, v, b):
 def derivatives(f, w, memory, s, t, q, v):
     """K and D at a state that was evaluated just before."""
     n = q.size
-    b = f.callbacks.flags[BANDWIDTH]
+    b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
     Cq, D, columns = _constraints(memory, s, n, w.rows.size, b)
     for i in range(w.rows.size):
@@ -149,7 +149,7 @@ def derivatives(f, w, memory, s, t, q, v):
         return code
     copy_matrix(w.D, D)
     copy(columns_of(w.index), columns)
-    if f.callbacks.flags[FORCE_BY_Q_GIVEN] == 1:
+    if f.flags[FORCE_BY_Q_GIVEN] == 1:
         return _from_tangents(f, w, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _unbalanced(f, w, t, q, v)
@@ -189,7 +189,7 @@ def _fill(w, memory, s, b, z, numbers):
 def factor(f, w, options, memory, s, h):
     """Factors of the bordered systems of gamma0, real, and of the eigenvalues, complex."""
     n = w.Q.size
-    b = f.callbacks.flags[BANDWIDTH]
+    b = f.flags[BANDWIDTH]
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + N_REAL])
@@ -237,7 +237,7 @@ def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
 def solve(f, w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
     n = w.Q.size
-    b = f.callbacks.flags[BANDWIDTH]
+    b = f.flags[BANDWIDTH]
     n_eigen = count_eigenvalues(options, s)
     pivots = pivots_of(memory, s, n, n_eigen, 1 + k)
     if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
@@ -246,7 +246,7 @@ def solve(f, w, options, memory, s, k, x):
             real[i] = x[i].real
         _all_coordinates(w, memory, s, b, real, X)
         real[:] = 0.0
-        add_banded_mass_times(f.callbacks, w, X, real)
+        add_banded_mass_times(f, w, X, real)
         pivots = pivots_of(memory, s, n, n_eigen, 0)
         _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, real)
         for i in range(n):
@@ -255,7 +255,7 @@ def solve(f, w, options, memory, s, k, x):
         X = complex_vector(memory, s, n, n_eigen, 1)
         _all_coordinates(w, memory, s, b, x, X)
         x[:] = 0.0
-        add_banded_mass_times(f.callbacks, w, X, x)
+        add_banded_mass_times(f, w, X, x)
         _solve_for_independents(w, memory, s, b, system_space(memory, s, n, k), pivots, ZGBTRS, x)
 
 
@@ -263,12 +263,12 @@ def solve(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
     n = w.Q.size
-    b = f.callbacks.flags[BANDWIDTH]
+    b = f.flags[BANDWIDTH]
     z = h * options[eigen_place(options, s) + GAMMA0]
     K, X = _band(space(memory, s, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
     _all_coordinates(w, memory, s, b, e_v, X)
     e_v[:] = 0.0
-    add_banded_mass_times(f.callbacks, w, X, e_v)
+    add_banded_mass_times(f, w, X, e_v)
     _all_coordinates(w, memory, s, b, e_q, X)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):

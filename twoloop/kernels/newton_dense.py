@@ -93,7 +93,7 @@ def _from_tangents(f, w, memory, s, t, q, v):
         return SINGULAR
     _reduce(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
-    memory[DAMPED] = f.callbacks.flags[FORCE_BY_V_GIVEN]
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code == DONE and memory[DAMPED] == 1.0:
         _reduce(w, K, AT, Jv)
@@ -104,7 +104,7 @@ def _from_tangents(f, w, memory, s, t, q, v):
 @compiled
 def derivatives(f, w, options, memory, s, t, q, v, a):
     """J_q and J_v at (t, q, v), where the value of the two-loop right-hand side, evaluated just before, is a."""
-    if f.callbacks.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
+    if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size

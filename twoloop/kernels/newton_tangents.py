@@ -29,7 +29,7 @@ def _finite(A, b):
 def _bent(f, w, t, q):
     """Whether C_q at q, left in w.Gx, differs from w.G."""
     w.Gx[:, :] = 0.0
-    constraint_rows(f.callbacks, w, t, q, w.Gx)
+    constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
         for j in range(q.size):
             if w.Gx[i, j] != w.G[i, j]:
@@ -63,10 +63,10 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
 def tangent_by_q(f, w, t, q, v, b, moved, K, R):
     """K (n_q, n_q), of which only the band |i - j| <= b counts, at a state that was evaluated just before."""
     _clear(K, b)
-    f.callbacks.force_by_q(t, q, v, f.callbacks.p, K)
-    if f.callbacks.flags[REACTION_BY_Q_GIVEN] == 1:
+    f.force_by_q(t, q, v, f.p, K)
+    if f.flags[REACTION_BY_Q_GIVEN] == 1:
         _clear(R, b)
-        f.callbacks.reaction_by_q(t, q, w.lam, f.callbacks.p, R)
+        f.reaction_by_q(t, q, w.lam, f.p, R)
         for i in range(q.size):
             for j in range(max(0, i - b), min(q.size, i + b + 1)):
                 K[i, j] -= R[i, j]
@@ -78,8 +78,8 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 @compiled
 def tangent_by_v(f, t, q, v, b, D):
     """D (n_q, n_q), of which only the band counts; left alone where the force does not depend on v."""
-    if f.callbacks.flags[FORCE_BY_V_GIVEN] == 0:
+    if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear(D, b)
-    f.callbacks.force_by_v(t, q, v, f.callbacks.p, D)
+    f.force_by_v(t, q, v, f.p, D)
     return _finite(D, b)

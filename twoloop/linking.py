@@ -1,0 +1,76 @@
+"""How the kernels are compiled: helpers not on their own, but within the kernels that call them.
+
+Numba optimises each function together with all that it calls and makes machine code of it, so that a helper at depth
+five is optimised six times, and its machine code is made without ever being called. Here helpers are handed on as
+LLVM's intermediate code, and the kernel at the top is optimised once. Loops are neither unrolled nor vectorised: those
+of a mechanism are short, and the code that tests whether they are costs more than it gains.
+"""
+
+from typing import Any
+
+from llvmlite import binding
+from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.dispatcher import Dispatcher
+
+
+class _WithoutEnvironment:
+    """The code generator for code that is not loaded: there is no place for the address of its environment."""
+
+    def __init__(self, codegen: Any):
+        self._codegen = codegen
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._codegen, name)
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Nothing to set."""
+
+
+class _Linked(CPUCodeLibrary):
+    """The code of a helper, to be linked into its callers."""
+
+    @property
+    def codegen(self) -> Any:
+        return _WithoutEnvironment(self._codegen)
+
+    def get_pointer_to_function(self, name: str) -> int:
+        return 0
+
+    def _optimize_final_module(self) -> None:
+        pass  # its callers do
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class _Whole(JITCodeLibrary):
+    """The code of a kernel and of all that it calls."""
+
+    def _optimize_final_module(self) -> None:
+        options = binding.create_pipeline_tuning_options(speed_level=2)
+        options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
+        builder = binding.create_pass_builder(self._codegen._tm, options)
+        builder.getModulePassManager().run(self._final_module, builder)
+
+
+class HelperCompiler(Compiler):
+    """Numba's compiler, but for a function that is called by compiled ones only; from Python the call would crash."""
+
+    def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
+        super().__init__(typing_context, target_context, _Linked(target_context.codegen(), "helper"), *others)
+
+
+class KernelCompiler(Compiler):
+    """Numba's compiler, but for a function that is optimised together with its helpers, once."""
+
+    def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
+        library = _Whole(target_context.codegen(), "kernel")
+        library.enable_object_caching()
+        super().__init__(typing_context, target_context, library, *others)
+
+
+def machine_code(function: Dispatcher, signature: Any) -> int:
+    """The address of a compiled function; it takes arguments and reports errors as numba's functions do."""
+    compiled = function.get_compile_result(signature)
+    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))
