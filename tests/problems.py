@@ -10,6 +10,7 @@ from scipy.special import ellipj, ellipk
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.calls import inner_loop
 from twoloop.kernels.common import FORCE_BY_Q_GIVEN, Kit
+from twoloop.kernels.explicit import explicit_step
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -52,7 +53,7 @@ def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
 
 def kit_of(system):
     """What the steps of the integrator get of a system."""
-    return Kit(system.functions, inner_loop)
+    return Kit(system.functions, inner_loop, explicit_step)
 
 
 def called(helper, *arguments):

@@ -3,15 +3,19 @@
 Numba optimises each function together with all that it calls and makes machine code of it, so that a helper at depth
 five is optimised six times, and its machine code is made without ever being called. Here helpers are handed on as
 LLVM's intermediate code, and the kernel at the top is optimised once. Loops are neither unrolled nor vectorised: those
-of a mechanism are short, and the code that tests whether they are costs more than it gains.
+of a mechanism are short, and the code that tests whether they are costs more than it gains. Nor does an index of a
+kernel count from the end where it is negative, as none is: the code that asks for it would hide from LLVM that elements
+lie side by side.
 """
 
 from typing import Any
 
 from llvmlite import binding
+from numba import types
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
+from numba.np import arrayobj
 
 
 class _WithoutEnvironment:
@@ -47,11 +51,31 @@ class _Linked(CPUCodeLibrary):
 class _Whole(JITCodeLibrary):
     """The code of a kernel and of all that it calls."""
 
+    vectorized = False
+
     def _optimize_final_module(self) -> None:
-        options = binding.create_pipeline_tuning_options(speed_level=2)
-        options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
+        options = binding.create_pipeline_tuning_options(speed_level=3 if self.vectorized else 2)
+        options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = self.vectorized
         builder = binding.create_pass_builder(self._codegen._tm, options)
         builder.getModulePassManager().run(self._final_module, builder)
+
+
+class _Vectorized(_Whole):
+    """The same, of loops that are worth it."""
+
+    vectorized = True
+
+
+_index_from_either_end = arrayobj.fix_integer_index
+
+
+def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    if kind.signed and isinstance(context.active_code_library, (_Linked, _Whole)):
+        return context.cast(builder, index, kind, types.intp)
+    return _index_from_either_end(context, builder, kind, index, size)
+
+
+arrayobj.fix_integer_index = _index
 
 
 class HelperCompiler(Compiler):
@@ -64,10 +88,18 @@ class HelperCompiler(Compiler):
 class KernelCompiler(Compiler):
     """Numba's compiler, but for a function that is optimised together with its helpers, once."""
 
+    library: type[_Whole] = _Whole
+
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
-        library = _Whole(target_context.codegen(), "kernel")
+        library = self.library(target_context.codegen(), "kernel")
         library.enable_object_caching()
         super().__init__(typing_context, target_context, library, *others)
+
+
+class VectorizingCompiler(KernelCompiler):
+    """The same for loops long enough to be unrolled and vectorised."""
+
+    library = _Vectorized
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:

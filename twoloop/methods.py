@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from twoloop.adams import Adams
 from twoloop.bdf import BDF
 from twoloop.checks import check_choice, check_number, shown
 from twoloop.dop853 import DOP853
@@ -303,6 +304,7 @@ PRESETS: dict[str, Method] = {
     "Newmark": Newmark(),
     "BDF": BDF(),
     "DOP853": DOP853(),
+    "Adams": Adams(),
     "PaperIRK": paper_irk(),
     "PaperNewmark": paper_newmark(),
 }

@@ -82,7 +82,7 @@ class Run:
         if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
             flags[common.BANDWIDTH], flags[common.REDUCED] = bandwidth, 0
         self.functions = system.functions._replace(flags=flags)
-        self.kit = common.Kit(self.functions, inner_loop)
+        self.kit = common.Kit(self.functions, inner_loop, plan.step)
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         self.pattern = pattern_of(system, t0, q0)
         self.work = self._workspace()
@@ -224,15 +224,14 @@ class Run:
         pace = _Pace(self.t0)
         cpu = 0.0
         code = a.PAUSED
-        plan, control = self.plan, self.control
+        plan, control, kit = self.plan, self.control, self.kit
         while code == a.PAUSED:
             filled[:] = 0
             began = time.process_time()
             try:
                 code = a.advance(
-                    self.kit,
+                    kit,
                     self.work,
-                    plan.step,
                     plan.options,
                     plan.memory,
                     self.tolerances,
@@ -262,9 +261,11 @@ class Run:
                 code = OUT_OF_TIME
             if code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
+                kit = common.Kit(self.functions, self.kit.inner, plan.step)
                 code = a.PAUSED
             elif plan is not self.plan and code != a.ALL_OUTPUT_DONE:
                 plan, control, code = self._beyond(plan, control, code, int(filled[1]))
+                kit = self.kit if plan is self.plan else kit
             report(self.clock[a.T])
         t = np.concatenate(t_parts)
         table = np.concatenate(rows)

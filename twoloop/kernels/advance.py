@@ -1,6 +1,6 @@
 """Many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` knows nothing of the method: a step is a first-class function with its options and its memory.
+`advance` knows nothing of the method: the step is the kit's, with its options and its memory.
 """
 
 import numpy as np
@@ -34,7 +34,6 @@ from twoloop.kernels.common import (
     SINGULAR,
     VECTOR,
     WORK,
-    StepFunction,
     f8,
     i8,
     kernel,
@@ -132,7 +131,6 @@ def _near_singular(w, control, clock):
 _ADVANCE = i8(
     KIT,
     WORK,
-    StepFunction,
     *(VECTOR,) * 9,
     MATRIX,
     MATRIX,
@@ -144,7 +142,6 @@ _ADVANCE = i8(
 def advance(
     f,
     w,
-    step,
     options,
     memory,
     tolerances,
@@ -209,13 +206,13 @@ def advance(
         w.notes[DEPARTURE] = 0.0
         w.notes[ORIENTATION_NEW] = 0.0
         w.notes[FAULT_KIND] = -1.0
-        code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
+        code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
             code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
             if code == CHANGED:
                 memory[0] = 0.0  # what the step keeps is of one that is not taken
                 w.notes[DEPARTURE] = 0.0
-                code, error = step(f, w, options, memory, t, size, tolerances, state, new_state)
+                code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and not np.isfinite(error):
             code = NOT_FINITE
         accepted = code == DONE and error <= 1.0

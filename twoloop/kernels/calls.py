@@ -17,6 +17,7 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
+from twoloop.kernels.projection import accelerate_there, to_constraints
 from twoloop.kernels.partition import note_pattern, partition_of_midpoint, renew, write_programs
 
 (
@@ -26,13 +27,15 @@ from twoloop.kernels.partition import note_pattern, partition_of_midpoint, renew
     POSITIONS,
     ACCELERATIONS,
     MULTIPLIERS,
+    EVALUATE_THERE,
+    PROJECT,
     TANGENTS,
     GAMMA,
     MASS,
     RENEW,
     MIDPOINT,
     REDUNDANT,
-) = range(12)
+) = range(14)
 
 ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
 ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
@@ -57,18 +60,36 @@ def _other_task(f, w, task, t, q, v):
     return redundant_rows_hold(f, w, t, q, v)
 
 
+@merged
+def _verify_pattern(w):
+    """Where the Jacobian has an entry for the first time, what was evaluated on the way is wrong."""
+    if not note_pattern(w.G, w.pattern):
+        return DONE
+    return INNER_DIVERGED if write_programs(w) else SINGULAR
+
+
+@merged
+def _all_coordinates(f, w, task, t, q, v, tolerance, a, lam):
+    """Tasks of methods that integrate all coordinates."""
+    if task == EVALUATE_THERE:
+        return accelerate_there(f, w, t, q, v, a)
+    code = to_constraints(f, w, t, q, v, tolerance, a, lam)
+    return _verify_pattern(w) if code == DONE else code
+
+
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """What the names of the tasks say, at (t, q, v); see the helpers below."""
     if task >= TANGENTS:
         return _other_task(f, w, task, t, q, v)
+    if task >= EVALUATE_THERE:
+        return _all_coordinates(f, w, task, t, q, v, tolerance, a, lam)
     code = DONE
     if task <= POSITIONS:
         reuse = w.notes[REUSE] if task == EVALUATE else w.notes[ROUNDED]
         code = positions(f, w, t, q, v, tolerance, reuse)
-        if code == DONE and task != EVALUATE and note_pattern(w.G, w.pattern):
-            # there is an entry of the Jacobian where there was none before: what was evaluated on the way is wrong
-            return INNER_DIVERGED if write_programs(w) else SINGULAR
+        if code == DONE and task != EVALUATE:
+            code = _verify_pattern(w)
         if code != DONE or task == POSITIONS:
             return code
         velocities(f, w, t, q, v, reuse)
@@ -94,6 +115,23 @@ def evaluate(f, w, t, q, v, tolerance, a):
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
     """The same for a state that may be accepted: exact to rounding, with multipliers."""
     return f.inner(f, w, EVALUATE_STATE, t, q, v, tolerance, a, lam)
+
+
+@merged
+def evaluate_there(f, w, t, q, v, a):
+    """Accelerations at (q, v) as they stand, which need not be on the constraints."""
+    return f.inner(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
+
+
+@merged
+def project(f, w, t, q, v, theta, a, lam):
+    """(q, v) moved to the constraints, with a and lam; the last move of a position is at most theta.
+
+    Rows of A leave positions free: with them the dependents are restored from the independents.
+    """
+    if w.Rate.size > w.C.size:
+        return evaluate_state(f, w, t, q, v, theta, a, lam)
+    return f.inner(f, w, PROJECT, t, q, v, theta, a, lam)
 
 
 @merged

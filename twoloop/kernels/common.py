@@ -20,7 +20,7 @@ from numba.extending import typeof_impl
 from twoloop.caches import compile_kept
 from twoloop.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
 from twoloop.kernels.reference import Reference
-from twoloop.linking import HelperCompiler, KernelCompiler
+from twoloop.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
@@ -161,10 +161,13 @@ def _type_of_work(value: Any, context: Any) -> Any:
 
 
 class Kit:
-    """What a step gets of a system, one reference: the callbacks, and the inner loop, which no step compiles again."""
+    """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
-    def __init__(self, functions: Any, inner: Any):
-        self.functions, self.inner = functions, inner
+    The latter two are compiled once, and not again in what calls them.
+    """
+
+    def __init__(self, functions: Any, inner: Any, step: Any):
+        self.functions, self.inner, self.step = functions, inner, step
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -178,16 +181,15 @@ for _name, _kind in KINDS.items():
 # (kit, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
 INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
 KIT.add_function("inner", INNER)
+# (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
+STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
+KIT.add_function("step", STEP)
 
 
 @typeof_impl.register(Kit)
 def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
-
-# (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
-STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-StepFunction = types.FunctionType(STEP)
 
 # places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance; from
 # ATOL on stands the absolute tolerance of each coordinate and its velocity
@@ -224,7 +226,7 @@ def _stamp(module: str) -> str:
 _ANNOUNCEMENT = "twoloop: compiling the integrator, two or three minutes; later processes read it from the disk"
 
 
-def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., Any]], Dispatcher]:
     """Compile a function of the integrator, and keep the machine code until a file that it needs changes."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
@@ -233,7 +235,7 @@ def kernel(signature: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
             signature,
             (_stamp(Path(inspect.getfile(function)).stem), ""),
             announcement=_ANNOUNCEMENT,
-            pipeline_class=KernelCompiler,
+            pipeline_class=VectorizingCompiler if vectorized else KernelCompiler,
             **_OPTIONS,
         )
 

@@ -45,7 +45,7 @@ def _factor_anew(w, t, q):
 
 
 @merged
-def _factor_rows(w, t, q):
+def factor_rows(w, t, q):
     """The factors of the dependent columns of w.G."""
     ratio = factor(w.entries, w.index, w.values)
     w.counters[N_FACTORIZATIONS] += 1
@@ -62,7 +62,7 @@ def factor_dependent(f, w, t, q):
     w.notes[KNOWN] = 0.0
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
-    return _factor_rows(w, t, q)
+    return factor_rows(w, t, q)
 
 
 @merged
@@ -78,7 +78,7 @@ def positions(f, w, t, q, v, tolerance, reuse):
     for _ in range(MAX_INNER):
         if fused:
             kinematics(f, w, t, q, v)
-            code = _factor_rows(w, t, q)
+            code = factor_rows(w, t, q)
         else:
             code = factor_dependent(f, w, t, q)
         if code != DONE or converged:

@@ -155,6 +155,16 @@ def _square(A, r):
 @compiled
 def note_pattern(G, pattern):
     """Note the entries of G that are not zero; whether there are new ones."""
+    unseen, odd = 0.0, 0.0  # two sums without a branch: there is nothing new at nearly every look
+    n = pattern.shape[1] // 2 * 2
+    for i in range(pattern.shape[0]):
+        for j in range(0, n, 2):
+            unseen += abs(G[i, j]) * (1.0 - pattern[i, j])
+            odd += abs(G[i, j + 1]) * (1.0 - pattern[i, j + 1])
+        if n < pattern.shape[1]:
+            unseen += abs(G[i, n]) * (1.0 - pattern[i, n])
+    if unseen + odd == 0.0:
+        return False
     new = False
     for i in range(pattern.shape[0]):
         for j in range(pattern.shape[1]):

@@ -1,0 +1,167 @@
+"""One pass over a state of all coordinates: its accelerations, and the way back to the constraints.
+
+Where a step integrates all coordinates, a state is off the constraints by the error of the formula. The pass finds the
+accelerations there and moves positions and velocities to the nearest that the constraints allow, nearest in the metric
+of M, which does not depend on the partition. Positions are then good to the square of their correction, velocities and
+accelerations to the correction itself: a larger one than asked for is followed by another pass.
+"""
+
+import numpy as np
+
+from twoloop.kernels.accelerations import accelerate, equilibrate
+from twoloop.kernels.common import (
+    DIAGONAL_MASS,
+    DONE,
+    INNER_DIVERGED,
+    KINEMATICS_GIVEN,
+    KNOWN,
+    N_INNER,
+    REDUCED,
+    compiled,
+    merged,
+)
+from twoloop.kernels.constraints import constraint_rates, kinematics
+from twoloop.kernels.factors import columns_of, rows_of, solve
+from twoloop.kernels.finite import CONSTRAINT, not_finite
+from twoloop.kernels.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_rows, factor_dependent, tangents
+from twoloop.kernels.linalg import ldl_solve
+
+
+@merged
+def accelerate_there(f, w, t, q, v, a):
+    """Accelerations at (q, v), which need not be on the constraints; leaves rows, factors and tangents there in w."""
+    if f.flags[KINEMATICS_GIVEN] == 1:
+        kinematics(f, w, t, q, v)
+        w.notes[KNOWN] = 1.0
+        code = factor_rows(w, t, q)
+    else:
+        code = factor_dependent(f, w, t, q)
+    if code == DONE and f.flags[REDUCED] == 1:
+        tangents(f, w, t, q)
+    return accelerate(f, w, t, q, v, a) if code == DONE else code
+
+
+@compiled
+def _mass_times(f, w, x, y):
+    if f.flags[DIAGONAL_MASS] == 1:
+        for i in range(x.size):
+            y[i] = w.M[i, i] * x[i]
+        return
+    for i in range(x.size):
+        total = 0.0
+        for j in range(x.size):
+            total += w.M[i, j] * x[j]
+        y[i] = total
+
+
+@merged
+def _along_tangents(w, columns, y, x):
+    """x = (T^T M T)^-1 T^T y."""
+    for j in range(w.independent_v.size):
+        total = y[w.independent_v[j]]
+        for k in range(columns.size):
+            total += w.D[j, k] * y[columns[k]]
+        x[j] = total
+    ldl_solve(w.A, x)
+
+
+@compiled
+def _to_constraints(f, w, q, v):
+    """Correct q and v by T and the factors of T^T M T; the largest correction of a position."""
+    rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
+    n_dof, x, y = independent.size, w.x, w.y
+    for k in range(rows.size):
+        w.z[k] = w.C[rows[k]]
+    solve(w.index_v, w.values_v, w.z)
+    for j in range(n_dof):
+        x[independent[j]] = 0.0
+    for k in range(rows.size):
+        x[columns[k]] = w.z[k]
+    _mass_times(f, w, x, y)
+    _along_tangents(w, columns, y, x)
+    largest = 0.0
+    for j in range(n_dof):
+        q[independent[j]] += x[j]
+        largest = max(largest, abs(x[j]))
+    for k in range(rows.size):
+        change = -w.z[k]
+        for j in range(n_dof):
+            change += w.D[j, k] * x[j]
+        q[columns[k]] += change
+        largest = max(largest, abs(change))
+        if not np.isfinite(change):
+            return np.inf
+    for j in range(n_dof):
+        x[independent[j]] = v[independent[j]]
+    for k in range(rows.size):
+        x[columns[k]] = v[columns[k]] - w.D[n_dof, k]
+    _mass_times(f, w, x, y)
+    _along_tangents(w, columns, y, x)
+    for j in range(n_dof):
+        v[independent[j]] = x[j]
+    for k in range(rows.size):
+        total = w.D[n_dof, k]
+        for j in range(n_dof):
+            total += w.D[j, k] * x[j]
+        v[columns[k]] = total
+    return largest
+
+
+@compiled
+def _by_multipliers(w, q, v):
+    """The same by the factors of G M^-1 G^T."""
+    rows, solved, g = w.rows_v, w.W, w.g[: w.rows_v.size]
+    for i in range(rows.size):
+        g[i] = w.C[rows[i]]
+    ldl_solve(w.S, g)
+    largest = 0.0
+    for j in range(q.size):
+        change = 0.0
+        for i in range(rows.size):
+            change += solved[i, j] * g[i]
+        q[j] -= change
+        largest = max(largest, abs(change))
+        if not np.isfinite(change):
+            return np.inf
+    for i in range(rows.size):
+        total = w.Rate[rows[i]]
+        for j in range(v.size):
+            total += w.G[rows[i], j] * v[j]
+        g[i] = total
+    ldl_solve(w.S, g)
+    for i in range(rows.size):
+        for j in range(v.size):
+            v[j] -= solved[i, j] * g[i]
+    return largest
+
+
+@merged
+def to_constraints(f, w, t, q, v, theta, a, lam):
+    """Accelerations and multipliers at (q, v), and q and v put on the constraints; without rows of A only."""
+    before = np.inf
+    for _ in range(MAX_INNER):
+        code = accelerate_there(f, w, t, q, v, a)
+        if code != DONE:
+            return code
+        if f.flags[KINEMATICS_GIVEN] == 0:
+            w.C[:] = 0.0
+            f.constraint(t, q, f.p, w.C)
+        w.counters[N_INNER] += 1
+        equilibrate(f, w, a, lam)
+        if f.flags[REDUCED] == 1:
+            correction = _to_constraints(f, w, q, v)
+        else:
+            if f.flags[KINEMATICS_GIVEN] == 0:
+                constraint_rates(f, w, t, q, w.Rate)
+            correction = _by_multipliers(w, q, v)
+        if not np.isfinite(correction):
+            return not_finite(w.notes, CONSTRAINT, t, q)
+        if correction <= theta:
+            return DONE
+        if correction > CONTRACTION * before:
+            largest = 0.0
+            for j in range(q.size):
+                largest = max(largest, abs(q[j]))
+            return DONE if correction <= ROUNDING * largest else INNER_DIVERGED
+        before = correction
+    return INNER_DIVERGED
