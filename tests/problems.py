@@ -56,14 +56,20 @@ def kit_of(system):
     return Kit(system.functions, inner_loop, explicit_step)
 
 
-def called(helper, *arguments):
-    """Call a helper of the kernels, which has no entry from Python, from a compiled function."""
+@cache
+def entry(helper):
+    """A helper of the kernels, which has no entry from Python, as a function of Python's."""
 
     @njit
     def call(arguments):
         return helper(*arguments)
 
-    return call(arguments)
+    return lambda *arguments: call(arguments)
+
+
+def called(helper, *arguments):
+    """Call a helper of the kernels once."""
+    return entry(helper)(*arguments)
 
 
 def pendulum_state(t, angle=-0.5 * np.pi):

@@ -11,7 +11,7 @@ import pytest
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.callbacks import KINDS, OPTIONAL
-from twoloop.kernels.common import FUNCTIONS, GIVEN, Functions
+from twoloop.kernels.common import GIVEN, KIT, Functions
 
 SOURCE = """
 import numpy as np
@@ -147,8 +147,8 @@ def test_a_kind_is_known_everywhere(kind):
     entry = KINDS[kind]
     assert f'"{kind}" ({", ".join(entry.arguments)})' in callback.__doc__
     assert (kind in GIVEN) == (kind in OPTIONAL)
-    place = Functions._fields.index(kind)
-    assert FUNCTIONS.types[place].signature == entry.signature
+    assert kind in Functions._fields
+    assert KIT.functions[kind] == entry.signature
     for name, maker in MAKERS.items():
         assert f"{kind} : " in maker.__doc__, name
         parameter = inspect.signature(maker).parameters[kind]

@@ -4,14 +4,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twoloop.plan import Plan, least_tolerance
-
-LARGEST_MOVE = 3e-7  # of a position in the projection that ends a step; its square, 1e-13, is what C is then off by
+from twoloop.plan import Plan, largest_move
 
 
 @dataclass(frozen=True)
 class Adams:
-    """Adams methods of orders 1 to 12 in the second-order form, with two evaluations a step."""
+    """Adams methods of orders 1 to 12, predict-evaluate-correct-evaluate, for smooth motion that is not stiff.
+
+    Two evaluations a step: the cheapest method here wherever steps follow the motion rather than a stiff force. All
+    coordinates are integrated alike from their accelerations, by the second-order form: positions by the double
+    integral of the polynomial through the last accelerations, velocities by the single one. The end of every step is
+    moved to the nearest state on the constraints, in the metric of M; with nonholonomic rows, to that with the same
+    independent coordinates. So the method departs from the paper, whose outer loop knows independent coordinates only,
+    and a new partition does not interrupt it.
+
+    Starts by itself, with order 1 and a short step. Where it takes many steps that are rejected or tiny, a stiff force
+    or a discontinuity may be the reason: see `RungeKutta(..., outer="newton")`.
+
+    Notes
+    -----
+    Modified divided differences: F. T. Krogh, Changing stepsize in the integration of differential equations using
+    modified divided differences, Lecture Notes in Mathematics 362 (1974), 22-71. The rules for the order are those of
+    STEP: L. F. Shampine and M. K. Gordon, Computer Solution of Ordinary Differential Equations (1975). The step is not
+    halved or doubled as there: it is multiplied by 0.8 e^(-1/(k+1)), e the estimated error over the tolerance, but at
+    most by 1.2 (2 while the order still rises with every step) and, when it is refused, at least by 0.5. The integrals
+    of the polynomials are found by Gauss quadrature with eight nodes, which is exact for them.
+    """
 
     @property
     def name(self) -> str:
@@ -19,15 +37,23 @@ class Adams:
         return "Adams"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Make the method ready for a run of n_q coordinates.
+
+        Raises
+        ------
+        ValueError
+            If the step is to be constant: order and accuracy of the first steps need a step that varies.
+        """
         from twoloop.kernels import adams as kernels
 
         if fixed:
-            raise ValueError("method 'Adams' varies its steps: leave step_size out, or take another method")
-        theta = min(LARGEST_MOVE, max(least_tolerance(rtol, atol), 1e-13))
+            raise ValueError(
+                "method='Adams' begins with short steps of low order and cannot keep a constant one: leave step_size "
+                "out, or take another method"
+            )
         return Plan(
             kernels.adams_step,
-            np.array([theta]),
+            np.array([largest_move(rtol, atol, fixed)]),
             np.zeros(kernels.memory_size(n_q)),
             exponent=1.0,  # the step returns the root of its error that belongs to its order
             safety=kernels.SAFETY,

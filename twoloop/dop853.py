@@ -1,10 +1,12 @@
 """DOP853(...): an explicit method in the two-loop procedure."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from twoloop.plan import INNER_TOL, Plan, check_tolerances, least_tolerance
+from twoloop.checks import check_choice
+from twoloop.plan import INNER_TOL, Plan, check_tolerances, largest_move, least_tolerance
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
@@ -13,10 +15,10 @@ SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it
 
 @dataclass(frozen=True)
 class DOP853:
-    """Two-loop procedure with an explicit Runge-Kutta method: Dormand and Prince's, of order 8, with 12 stages.
+    """An explicit Runge-Kutta method, Dormand and Prince's, of order 8, with 12 stages.
 
-    No outer loop: every stage is one evaluation, with the inner loop within it, so that a step costs 12 (one that is
-    refused 11) and never drifts off the constraints. For smooth motion that is not stiff. Stability, not accuracy,
+    No outer loop: every stage is one evaluation, so that a step costs 12 (one that is refused 11). Accepted states are
+    on the constraints. For smooth motion that is not stiff. Stability, not accuracy,
     limits h where the motion is slower than what could vibrate or decay: h w_max to 5.96 for undamped vibrations, and
     h times the largest rate of decay to 6.39. What little of a vibration such steps do not resolve they damp: of the
     amplitude 0.15 % a step at h w_max = 3. Then take `RungeKutta(..., outer="newton")`.
@@ -26,13 +28,20 @@ class DOP853:
 
     Parameters
     ----------
+    stages : {"free", "restored"}
+        "free": all coordinates are integrated alike, stages are off the constraints by the error of the formula, and
+        the end of the step is moved to the nearest state on them, in the metric of M. This departs from the paper.
+        "restored": the paper's procedure with this tableau. The independent coordinates are integrated, and the inner
+        loop restores the dependent ones at every stage. Rows of nonholonomic constraints are always treated so at the
+        end of a step.
     inner_tol : float, optional
-        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
+        With "restored", Newton on the positions stops when its largest correction, just made, is at most this (unit of
+        q). None: 1e-8.
 
     Raises
     ------
     TypeError, ValueError
-        If inner_tol is not a positive number.
+        If stages is not one of these, or inner_tol not a positive number.
 
     Notes
     -----
@@ -42,15 +51,17 @@ class DOP853:
     |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
     """
 
+    stages: Literal["free", "restored"] = "free"
     inner_tol: float | None = None
 
     def __post_init__(self) -> None:
+        check_choice("stages", self.stages, ("free", "restored"))
         check_tolerances(self, "inner_tol")
 
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        return "DOP853"
+        return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -69,6 +80,8 @@ class DOP853:
                 source.E5[:s],  # the last weight, of the slope at the end, is 0 in both
                 COARSE_SHARE * source.E3[:s],
                 INNER_TOL if self.inner_tol is None else self.inner_tol,
+                self.stages == "free",
+                largest_move(rtol, atol, fixed),
             ),
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,

@@ -5,15 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twoloop.kernels.linalg import (
-    copy,
-    invert_definite,
-    ldl_factor,
-    ldl_solve,
-    ldl_solve_rows,
-    lu_factor,
-    lu_solve,
-)
+from tests.problems import entry
+from twoloop.kernels import linalg
+
+copy, lu_factor, lu_solve = (entry(helper) for helper in (linalg.copy, linalg.lu_factor, linalg.lu_solve))
+ldl_factor, ldl_solve = entry(linalg.ldl_factor), entry(linalg.ldl_solve)
+ldl_solve_rows, invert_definite = entry(linalg.ldl_solve_rows), entry(linalg.invert_definite)
 
 sizes = st.integers(1, 12)
 seeds = st.integers(0, 2**32 - 1)

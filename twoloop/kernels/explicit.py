@@ -1,27 +1,36 @@
 """A step of an explicit Runge-Kutta method for (q_i, v_i): every stage is one evaluation, and there is no outer loop.
 
 The tableau is any whose first stage is the state itself and that estimates its error by two embedded formulas. The
-inner loop restores the dependents of every stage, so that the step never leaves the constraints.
+inner loop restores the dependents of every stage, so that the step never leaves the constraints. Or, which departs from
+the paper's procedure, all coordinates are integrated alike, stages stand where the formula puts them, off the
+constraints by its error, and the end of the step alone is put back on them.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.calls import evaluate, evaluate_state
+from twoloop.kernels.calls import evaluate, evaluate_state, evaluate_there, project
 from twoloop.kernels.common import ATOL, DEPARTURE, DONE, ESTIMATE, N_OUTER, RTOL, STEP, compiled, inlined, kernel
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure, keep_predicted
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
-STAGES, INNER_TOL, N_SCALARS = range(3)
+STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
 # vectors (n_q) in `memory` after memory[0], which is advance()'s; then V and A of the stages (s, n_q each)
 Q_STAGE, ESTIMATED, N_VECTORS = range(3)
 
 
 def options_array(
-    A: ArrayLike, b: ArrayLike, c: ArrayLike, fine: ArrayLike, coarse: ArrayLike, inner_tol: float
+    A: ArrayLike,
+    b: ArrayLike,
+    c: ArrayLike,
+    fine: ArrayLike,
+    coarse: ArrayLike,
+    inner_tol: float,
+    free: bool = False,
+    theta: float = 0.0,
 ) -> NDArray[np.float64]:
-    """The parameter block that the step reads; see `_error` for `fine` and `coarse`."""
+    """The parameter block that the step reads; see `_error` for `fine` and `coarse`, `project` for theta."""
     A, b, c, fine, coarse = (np.asarray(x, dtype=float) for x in (A, b, c, fine, coarse))
     s = b.size
     if A.shape != (s, s) or not c.size == fine.size == coarse.size == s:
@@ -29,7 +38,7 @@ def options_array(
         raise ValueError(f"A, b, c, fine and coarse must be (s, s), (s,), (s,), (s,), (s,); given {shapes}")
     if np.triu(A).any() or c[0] != 0.0:
         raise ValueError("A must be strictly lower triangular and c[0] = 0: the first stage is the state itself")
-    return np.concatenate([[float(s), inner_tol], A.ravel(), b, c, fine, coarse])
+    return np.concatenate([[float(s), inner_tol, float(free), theta], A.ravel(), b, c, fine, coarse])
 
 
 def memory_size(s: int, n_q: int) -> int:
@@ -121,7 +130,10 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         # dependents too: where Newton starts
         _move(q, h, A[j, :j], V_stage, q_stage)
         _move(v, h, A[j, :j], A_stage, V_stage[j])
-        code = evaluate(f, w, t + c[j] * h, q_stage, V_stage[j], options[INNER_TOL], A_stage[j])
+        if options[FREE] == 1.0:
+            code = evaluate_there(f, w, t + c[j] * h, q_stage, V_stage[j], A_stage[j])
+        else:
+            code = evaluate(f, w, t + c[j] * h, q_stage, V_stage[j], options[INNER_TOL], A_stage[j])
         if code != DONE:
             return code, np.inf
     _move(q, h, b, V_stage, q1)
@@ -132,7 +144,10 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return DONE, error
     keep_predicted(w, q1)
-    code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
+    if options[FREE] == 1.0:
+        code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    else:
+        code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
         w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
     return code, max(error, w.notes[DEPARTURE])
