@@ -84,7 +84,7 @@ def _ida(problem: Problem, t_end: float, tolerance: float) -> Result:
 
 
 def check_published(problem: Problem, motion: ReferenceMotion, t_end: float) -> float | None:
-    """Largest difference of the positions from the problem's published state; None where there is none by t_end."""
+    """Largest difference of the positions from the state that the problem gives; None where there is none by t_end."""
     known = problem.reference
     if known is None or known.t > t_end:
         return None

@@ -4,19 +4,20 @@ from itertools import pairwise
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, integrate
-from tests.general.quadratic import Rows, distance
+from tests.general.mechanism import G, Mechanism, integrate, plain
 from twoloop import ConstrainedSystem, callback
+from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 
 
 def chain(n, end=1.0):
     """q = x, y of each mass, from rest on a bent line; n rows. The motion is known by the angles of the links."""
-    rows, length, m = Rows(2 * n), 1.0 / n, 1.0 / n
-    joints = [[{}, {}]] + [[{2 * i: 1.0}, {2 * i + 1: 1.0}] for i in range(n)]
-    for upper, lower in pairwise(joints):
-        distance(rows, lower, upper, length)
+    length, m = 1.0 / n, 1.0 / n
     weight = np.zeros(2 * n)
     weight[1::2] = -m * G
+    rows = QuadraticSystem(m * np.eye(2 * n), weight)
+    for upper, lower in pairwise([fixed(0.0, 0.0), *[point(2 * i) for i in range(n)]]):
+        rows.distance(lower, upper, length)
+    system = rows.system(f"chain of {n}")
     below = n - np.arange(n)  # masses below a joint, that joint's own among them
     shared = np.minimum.outer(below, below) * m * length**2
 
@@ -30,12 +31,12 @@ def chain(n, end=1.0):
     return Mechanism(
         name=f"chain of {n}",
         sizes={"n_q": 2 * n, "n_c": n},
-        functions={"mass": m * np.eye(2 * n), "force": lambda t, q, v: weight.copy(), **rows.functions()},
+        functions=plain(system),
         end=end,
         state=lambda t: _points(*np.split(solution(t), 2)),
         rank=n,
         energy=lambda q, v: 0.5 * m * v @ v - weight @ q,
-        compile=True,
+        ready=system,
     )
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, one_coordinate
-from tests.general.quadratic import Rows, distance
+from tests.general.mechanism import G, Mechanism, one_coordinate, plain
+from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 
 
 def isosceles_slider_crank():
@@ -11,10 +11,10 @@ def isosceles_slider_crank():
 
     q = x, y of the pin, x of the slider; masses of 1 kg at both.
     """
-    rows = Rows(3)
-    pin = [{0: 1.0}, {1: 1.0}]
-    distance(rows, pin, [{}, {}], 1.0)
-    distance(rows, pin, [{2: 1.0}, {}], 1.0)
+    rows = QuadraticSystem(np.eye(3), np.array([0.0, -G, 0.0]))
+    rows.distance(point(0), fixed(0.0, 0.0), 1.0)
+    rows.distance(point(0), [{2: 1.0}, {}], 1.0)
+    system = rows.system("isosceles slider-crank")
 
     def kinematics(angle):
         s, c = np.sin(angle), np.cos(angle)
@@ -24,7 +24,8 @@ def isosceles_slider_crank():
     return Mechanism(
         name="isosceles slider-crank",
         sizes={"n_q": 3, "n_c": 2},
-        functions={"mass": np.eye(3), "force": lambda t, q, v: np.array([0.0, -G, 0.0]), **rows.functions()},
+        functions=plain(system),
+        ready=system,
         end=2.0,
         state=one_coordinate(kinematics, np.ones(3), weight, (0.3, 5.0), 2.0),
         rank=2,
@@ -34,8 +35,9 @@ def isosceles_slider_crank():
 
 def crossing_lines():
     """A bead on x^2 = y^2, thrown up along x = y through the crossing, where C_q = 0. Closed form."""
-    rows = Rows(2)
-    rows.add((0.5, {0: 1.0}, {0: 1.0}), (-0.5, {1: 1.0}, {1: 1.0}))
+    rows = QuadraticSystem(np.eye(2), np.array([0.0, -G]))
+    rows.row((0.5, {0: 1.0}, {0: 1.0}), (-0.5, {1: 1.0}, {1: 1.0}))
+    system = rows.system("crossing lines")
 
     def state(t):
         s, speed = -1.0 + 4.0 * t - 0.25 * G * t * t, 4.0 - 0.5 * G * t
@@ -44,7 +46,8 @@ def crossing_lines():
     return Mechanism(
         name="crossing lines",
         sizes={"n_q": 2, "n_c": 1},
-        functions={"mass": np.eye(2), "force": lambda t, q, v: np.array([0.0, -G]), **rows.functions()},
+        functions=plain(system),
+        ready=system,
         end=1.0,
         state=state,
         rank=1,

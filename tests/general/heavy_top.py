@@ -7,7 +7,9 @@ Zlatar 2016): 15 kg, the centre of mass at (0, 1, 0) from the fixed point, axis 
 import numpy as np
 from scipy.special import ellipj, ellipkinc
 
-from tests.general.mechanism import G, Mechanism, integrate
+from tests.general.mechanism import G, Mechanism, known, of_problem
+from tests.mechanisms.motions import spatial
+from twoloop.mechanisms import heavy_top
 
 M, LENGTH, ACROSS, AXIAL = 15.0, 1.0, 0.234375, 0.46875  # about the centre of mass
 ABOUT_POINT = np.array([ACROSS + M * LENGTH**2, AXIAL, ACROSS + M * LENGTH**2])
@@ -74,73 +76,18 @@ def top_of_euler_parameters():
 
 
 def top_with_centre():
-    """q = (r, e) (7,): the centre of mass and Euler parameters; three rows for the fixed point, one for the norm."""
-    turning, turning_force = _rotation([ACROSS, AXIAL, ACROSS])
-    weight = np.array([0.0, 0.0, -M * G])
-
-    def mass(t, q):
-        matrix = np.zeros((7, 7))
-        matrix[:3, :3] = M * np.eye(3)
-        matrix[3:, 3:] = turning(q[3:])
-        return matrix
-
-    def jacobian(t, q):
-        Cq = np.zeros((4, 7))
-        Cq[:3, :3] = np.eye(3)
-        Cq[:3, 3:] = -LENGTH * _axis_by_e(q[3:])
-        Cq[3, 3:] = q[3:]
-        return Cq
-
-    motion = _motion()
-
-    def state(t):
-        e, v = motion(t)
-        return np.concatenate([LENGTH * _axis(e), e]), np.concatenate([LENGTH * _axis_by_e(e) @ v, v])
-
-    return Mechanism(
-        name="top with its centre",
-        sizes={"n_q": 7, "n_c": 4},
-        functions={
-            "mass": mass,
-            "force": lambda t, q, v: np.concatenate([weight, turning_force(q[3:], v[3:])]),
-            "constraint": lambda t, q: np.append(q[:3] - LENGTH * _axis(q[3:]), 0.5 * (q[3:] @ q[3:] - 1.0)),
-            "jacobian": jacobian,
-            "gamma": lambda t, q, v: np.append(LENGTH * _axis_by_e(v[3:]) @ v[3:], -(v[3:] @ v[3:])),
-        },
-        end=END,
-        state=state,
-        rank=4,
-        energy=lambda q, v: 0.5 * v @ mass(0.0, q) @ v - weight @ q[:3],
-    )
-
-
-# --- the motion, by Euler's equations of the rigid body about its fixed point
+    """The ready mechanism: q = (r, e) (7,)."""
+    return of_problem(heavy_top(), known(spatial.heavy_top(), KNOWN), END)
 
 
 def _motion():
-    a, c = ABOUT_POINT[0], ABOUT_POINT[1]
+    state = known(spatial.heavy_top(), KNOWN)
 
-    def rate(t, y):
-        e, (x, s, z) = y[:4], y[4:]
-        up = np.array([2.0 * (e[1] * e[3] - e[0] * e[2]), 0.0, 1.0 - 2.0 * (e[1] ** 2 + e[2] ** 2)])  # z in body axes
-        moment = M * G * LENGTH * np.array([-up[2], 0.0, up[0]])  # (0, LENGTH, 0) x (-M G up)
-        turn = 0.5 * np.array(
-            [
-                -e[1] * x - e[2] * s - e[3] * z,
-                e[0] * x + e[2] * z - e[3] * s,
-                e[0] * s - e[1] * z + e[3] * x,
-                e[0] * z + e[1] * s - e[2] * x,
-            ]
-        )
-        return [*turn, (moment[0] - (a - c) * s * z) / a, 0.0, (moment[2] + (a - c) * s * x) / a]
+    def of_parameters(t):
+        q, v = state(t)
+        return q[3:], v[3:]
 
-    solution = integrate(rate, (1.0, 0.0, 0.0, 0.0, *SPIN), KNOWN)
-
-    def state(t):
-        y = solution(t)
-        return y[:4], np.array(rate(t, y)[:4])
-
-    return state
+    return of_parameters
 
 
 def height(t):

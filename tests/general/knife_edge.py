@@ -44,7 +44,7 @@ FUNCTIONS = {
 
 
 def knife_edge():
-    """No holonomic row at all."""
+    """No holonomic row at all; the ready mechanism is this one in compiled functions."""
     return Mechanism(
         name="knife edge",
         sizes={"n_q": 3, "n_c": 0, "n_a": 1},

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from twoloop import ConstrainedSystem
+from twoloop.callbacks import KINDS
 
 G = 9.81
 TIGHT = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
@@ -34,6 +35,10 @@ class Mechanism:
         energy(q, v); None where it is not conserved.
     compile : bool
         Whether numba is to compile the functions.
+    ready : ConstrainedSystem, optional
+        The system, where it is a ready one whose callbacks are compiled.
+    given : tuple of ndarray, optional
+        Its start q, v (n_q,), where the system comes with one. None: that of `state`.
     """
 
     name: str
@@ -44,6 +49,8 @@ class Mechanism:
     rank: int
     energy: Callable[[np.ndarray, np.ndarray], float] | None = None
     compile: bool = False
+    ready: ConstrainedSystem | None = None
+    given: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def n_rows(self):
@@ -51,9 +58,11 @@ class Mechanism:
 
     @property
     def start(self):
-        return self.state(0.0)
+        return self.state(0.0) if self.given is None else self.given
 
     def system(self, **changed):
+        if self.ready is not None and not changed:
+            return self.ready
         options = {**self.sizes, **self.functions, "compile": self.compile, "name": self.name, **changed}
         return ConstrainedSystem.from_python(**options)
 
@@ -100,9 +109,47 @@ class Mechanism:
         return both[:n_q], both[n_q:]
 
 
+def plain(system):
+    """The callbacks of a ready system as functions that return arrays."""
+
+    def returning(kind):
+        if len(KINDS[kind].state) == 1:
+            return lambda t, q: system.evaluate(kind, t, q)
+        return lambda t, q, v: system.evaluate(kind, t, q, v)
+
+    return {kind: returning(kind) for kind in system.given if kind != "kinematics"}
+
+
+def of_problem(problem, state, end, rank=None):
+    """A ready problem beside a motion that shares nothing with it; rank=None: all rows count."""
+    system = problem.system
+    return Mechanism(
+        name=problem.name,
+        sizes={"n_q": system.n_q, "n_c": system.n_c, "n_a": system.n_a},
+        functions=plain(system),
+        end=end,
+        state=state,
+        rank=system.n_c + system.n_a if rank is None else rank,
+        energy=(lambda q, v: problem.energy(0.0, q, v)) if problem.conserved else None,
+        ready=system,
+        given=(problem.q0, problem.v0),
+    )
+
+
+def known(motion, end):
+    """The state by equations of `tests.mechanisms.motions`, as a function of t."""
+    rate, start, to_state = motion
+    solution = integrate(lambda t, y: np.array(rate(t, y), dtype=float), np.array(start, dtype=float), end)
+
+    def state(t):
+        return tuple(np.array(each, dtype=float) for each in to_state(t, solution(t)))
+
+    return state
+
+
 def integrate(rate, start, end):
     """The solution of y' = rate(t, y) as a function of t, by scipy at a tolerance of 1e-13."""
-    solution = solve_ivp(rate, (0.0, end), start, max_step=0.02, **TIGHT)
+    solution = solve_ivp(rate, (0.0, end), start, max_step=min(0.02, end / 100.0), **TIGHT)
     assert solution.success, solution.message
     return solution.sol
 

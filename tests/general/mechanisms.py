@@ -3,7 +3,6 @@
 from functools import cache, partial
 
 from tests.general import (
-    bricard,
     chain,
     dead_points,
     disc,
@@ -14,13 +13,14 @@ from tests.general import (
     slider_crank,
     windows,
 )
+from tests.general.mechanism import known, of_problem
+from tests.mechanisms.motions import known_motions
 
 WINDOWS = (1, 2, 40)
 
 # name -> how it is made; motion that never comes near a point where C_q loses rank
 REGULAR = {
     "redundant slider-crank": slider_crank.redundant_slider_crank,
-    "Bricard": bricard.bricard,
     "top of Euler parameters": heavy_top.top_of_euler_parameters,
     "top with its centre": heavy_top.top_with_centre,
     "knife edge": knife_edge.knife_edge,
@@ -36,6 +36,17 @@ REGULAR = {
     "planet": chain.kepler,
     "chain of 5": partial(chain.chain, 5),
 }
+# the ready mechanisms that have no other place above; of Bricard's 60 rows, one is redundant
+ELSEWHERE = ("redundant slider-crank", "heavy top", "rolling disc", "closed chain of 10", "closed chain of 20")
+RANKS = {"A04 Bricard": 59}
+
+
+def _ready(name):
+    problem, motion, end = known_motions()[name]
+    return of_problem(problem, known(motion, end), end, RANKS.get(name))
+
+
+REGULAR |= {name: partial(_ready, name) for name in known_motions() if name not in ELSEWHERE}
 # rank is lost on the way, and the motion goes on
 SINGULAR = {
     **{f"A02, N = {n}": partial(windows.windows, n) for n in WINDOWS},
@@ -44,7 +55,7 @@ SINGULAR = {
     "crossing lines": dead_points.crossing_lines,
 }
 ALL = {**REGULAR, **SINGULAR}
-REDUNDANT = [name for name in REGULAR if "redundant" in name or name == "Bricard"]
+REDUNDANT = [name for name in REGULAR if "redundant" in name or name in RANKS]
 
 
 @cache

@@ -209,6 +209,15 @@ def ancf_beam(
         energy=Energy(M, p),
         parameters={"n_elements": n_elements, "start": start, **parameters},
         note=f"start assumed, the paper's text does not tell it: straight along x, gravity across it, {STARTS[start]}",
+        source="L. Zhang and Zhang, Nonlinear Dynamics (2016), Sect. 4.2; Hussein, Negrut and Shabana (2008)",
+        tags=("open chain", "flexible", "planar", "driven", "stiff"),
+        purpose="A flexible body on a driven base: frequencies from those wanted to those that only cost steps.",
+        conserved=False,
+        coordinates=tuple(
+            f"{part} of node {node}"
+            for node in range(n_elements + 1)
+            for part in ("x (m)", "y (m)", "x slope", "y slope", "x director", "y director")
+        ),
     )
 
 

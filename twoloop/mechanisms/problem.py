@@ -1,6 +1,6 @@
 """What every ready problem offers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +10,21 @@ from numpy.typing import NDArray
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
+
+TAGS = (
+    "open chain",
+    "closed chain",
+    "rigid",
+    "flexible",
+    "planar",
+    "spatial",
+    "driven",
+    "redundant",
+    "singular",
+    "non-holonomic",
+    "stiff",
+    "dissipative",
+)
 
 
 @dataclass(frozen=True)
@@ -21,11 +36,17 @@ class Reference:
     t : float
         Time, s.
     q, v : ndarray (n_q,)
-        Coordinates and velocities.
+        Coordinates and velocities; NaN where none is known.
     source : str
         Where the numbers come from, and how far they were checked.
     period : float or None
         Period of the motion, s, where it is periodic.
+    lam : ndarray (n_c + n_a,) or None
+        Multipliers, where known.
+    digits : mapping
+        "q", "v", "lam": how many decimals of the values over max(1, largest of them) hold.
+    verified : str
+        The second route by which they were checked, and how far it agrees.
     """
 
     t: float
@@ -33,6 +54,47 @@ class Reference:
     v: Array
     source: str
     period: float | None = None
+    lam: Array | None = None
+    digits: Mapping[str, float] = field(default_factory=dict)
+    verified: str = ""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """When a benchmark's authors take a run for right.
+
+    The error is the root mean square, over outputs and quantities, of |difference| / max(|reference|, threshold).
+
+    Attributes
+    ----------
+    t_end : float
+        Length of the run, s.
+    n_outputs : int
+        Outputs, evenly spaced.
+    coordinates, velocities : tuple of int
+        Which quantities count.
+    threshold : float
+        Least magnitude by which a difference is divided.
+    low, high : float
+        Largest error allowed at low and at high precision.
+    source : str
+    """
+
+    t_end: float
+    n_outputs: int
+    coordinates: tuple[int, ...]
+    velocities: tuple[int, ...]
+    threshold: float
+    low: float
+    high: float
+    source: str
+
+    def error(self, q: Array, v: Array, q_known: Array, v_known: Array) -> float:
+        """Error of the states q, v (n_q, n_outputs) against the known ones."""
+        rows, speeds = list(self.coordinates), list(self.velocities)
+        given, known = np.vstack([q[rows], v[speeds]]), np.vstack([q_known[rows], v_known[speeds]])
+        relative = np.abs(given - known) / np.maximum(np.abs(known), self.threshold)
+        return float(np.sqrt(np.mean(relative**2)))
 
 
 @dataclass(frozen=True)
@@ -54,6 +116,25 @@ class Problem:
     note : str
         What is assumed; shown wherever the problem is.
     reference : Reference or None
+        The most accurate state known.
+    published : Reference or None
+        Values that others printed, with the digits that they hold.
+    motion : callable or None
+        motion(t) -> q, v (n_q,), where a closed form is known.
+    source : str
+        Who posed the problem, and where.
+    tags : tuple of str
+        Its kinds, of `TAGS`.
+    purpose : str
+        What it tests, in plain words.
+    conserved : bool
+        Whether the energy is an invariant.
+    invariants : mapping
+        Further ones: name to invariant(t, q, v), as `energy`.
+    condition : Condition or None
+        The pass rule of the benchmark's authors, where they have one.
+    coordinates : tuple of str
+        Names of the coordinates with their units.
     """
 
     name: str
@@ -65,3 +146,17 @@ class Problem:
     parameters: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     reference: Reference | None = None
+    published: Reference | None = None
+    motion: Callable[[float], tuple[Array, Array]] | None = None
+    source: str = ""
+    tags: tuple[str, ...] = ()
+    purpose: str = ""
+    conserved: bool = True
+    invariants: Mapping[str, Callable[[Any, Array, Array], Any]] = field(default_factory=dict)
+    condition: Condition | None = None
+    coordinates: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        unknown = [tag for tag in self.tags if tag not in TAGS]
+        if unknown:
+            raise ValueError(f"tags must be of {', '.join(TAGS)}; given {unknown[0]!r}")

@@ -1,0 +1,95 @@
+"""IFToMM's A04, Bricard's mechanism, with all 60 rows: five bars of 1 m and 1 kg on the edges of a cube, six hinges.
+
+Each bar has the coordinates of its centre and the three columns of its rotation matrix, hence a constant mass matrix;
+six rows keep these orthonormal, five make a hinge. The sixth bar is the ground. Geometry and inertia as in the Exudyn
+model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity along -y.
+"""
+
+import numpy as np
+
+from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.problem import Array, Problem
+from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
+
+GRAVITY = 9.81
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float)
+AXES = np.eye(3)[[1, 2, 0, 1, 2, 0]]  # of the hinges at the corners
+BARS = np.roll(CORNERS, -1, axis=0) - CORNERS
+# columns: along the bar, along the hinge at its start, and across both
+FRAMES = np.array([np.array([bar, axis, np.cross(bar, axis)]).T for bar, axis in zip(BARS, AXES, strict=True)])[:5]
+MASSES = np.tile(np.repeat([1.0, 1.0 / 12.0, 0.01 / 12.0, 0.01 / 12.0], 3), 5)  # kg, and the second moments of a bar
+Vector = list[Scalar]
+
+
+def _vector(bar: int, k: int) -> Vector:
+    """The centre (k = 0) or column k of the rotation matrix of a bar."""
+    return [{12 * bar + 3 * k + i: 1.0} for i in range(3)]
+
+
+def _end(bar: int, s: float) -> Vector:
+    """The point at s, from -0.5 to 0.5, along a bar."""
+    return [{12 * bar + i: 1.0, 12 * bar + 3 + i: s} for i in range(3)]
+
+
+def _carried(bar: int, direction: Array) -> Vector:
+    """A direction of the start, carried along by a bar."""
+    parts = FRAMES[bar].T @ direction
+    return [{12 * bar + 3 * k + i: float(parts[k - 1]) for k in (1, 2, 3)} for i in range(3)]
+
+
+def _dot(a: Vector, b: Vector) -> list[tuple[float, Scalar, Scalar]]:
+    return [(1.0, x, y) for x, y in zip(a, b, strict=True)]
+
+
+def _rows() -> QuadraticSystem:
+    weight = np.tile([0.0, -GRAVITY, *[0.0] * 10], 5)
+    rows = QuadraticSystem(np.diag(MASSES), weight)
+    for bar in range(5):
+        d = [_vector(bar, k) for k in (1, 2, 3)]
+        for column in d:
+            rows.row(*[(0.5, x, x) for x in column], (-0.5, ONE, ONE))
+        for j, k in ((0, 1), (1, 2), (2, 0)):
+            rows.row(*_dot(d[j], d[k]))
+    for hinge, axis in enumerate(AXES):
+        start = _end(hinge, -0.5) if hinge < 5 else fixed(*CORNERS[5])
+        end = _end(hinge - 1, 0.5) if hinge > 0 else fixed(*CORNERS[0])
+        for a, b in zip(start, end, strict=True):
+            rows.row((1.0, difference(a, b), ONE))
+        of_one = _carried(hinge - 1, axis) if hinge > 0 else fixed(*axis)
+        for across in np.roll(np.eye(3), 1, axis=0):
+            if across @ axis == 0.0:
+                rows.row(*_dot(of_one, _carried(hinge, across) if hinge < 5 else fixed(*across)))
+    return rows
+
+
+def bricard() -> Problem:
+    """The mechanism from rest, on the edges of a cube: 60 rows of rank 59, one degree of freedom."""
+    rows = _rows()
+    centres = 0.5 * (CORNERS[:5] + CORNERS[1:])
+    q0 = np.concatenate([[*centre, *frame.T.ravel()] for centre, frame in zip(centres, FRAMES, strict=True)])
+    return Problem(
+        name="A04 Bricard",
+        system=rows.system("A04 Bricard"),
+        q0=q0,
+        v0=np.zeros(60),
+        t_span=(0.0, 2.0),
+        energy=rows.energy,
+        parameters={"length": 1.0, "width": 0.1, "mass": 1.0, "gravity": GRAVITY},
+        note="The run of the benchmark is 10 s long.",
+        reference=computed("A04 Bricard"),
+        source=(
+            "IFToMM library of benchmarks, A04; RehabEngGroup/MBSbenchmarksInOpenSim, A04_BricardsMechanism.rst; "
+            "jgerstmayr/EXUDYN, TestModels/bricardMechanism.py"
+        ),
+        tags=("closed chain", "rigid", "spatial", "redundant"),
+        purpose=(
+            "A loop that moves only because its geometry is special: counted by rows it is rigid, and one of the 60 "
+            "follows from the others at every position, though not from any fixed choice of them."
+        ),
+        coordinates=tuple(
+            f"{axis} of {what} of bar {bar + 1} ({unit})"
+            for bar in range(5)
+            for what, unit in (("centre", "m"), ("column 1", "-"), ("column 2", "-"), ("column 3", "-"))
+            for axis in "xyz"
+        ),
+    )

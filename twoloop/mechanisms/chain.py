@@ -1,0 +1,111 @@
+"""Planar chains of equal masses on massless links, in Cartesian coordinates: the double pendulum and a closed chain."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import brentq
+
+from twoloop.checks import check_size
+from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.problem import Array, Problem
+from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+
+GRAVITY = 9.81
+N_MOST = 20
+SLACK = 0.8  # distance of the pins of a closed chain over the length of its links
+
+
+def _masses(n: int) -> QuadraticSystem:
+    """n masses of 1 / n kg, no row yet."""
+    weight = np.zeros(2 * n)
+    weight[1::2] = -GRAVITY / n
+    return QuadraticSystem(np.eye(2 * n) / n, weight)
+
+
+def _names(n: int) -> tuple[str, ...]:
+    return tuple(f"{axis}{i + 1} (m)" for i in range(n) for axis in "xy")
+
+
+def double_pendulum() -> Problem:
+    """Two masses of 1/2 kg on two links of 1 m, released from rest with both links level.
+
+    The motion is chaotic, which over the 3 s of the usual run costs about a digit.
+    """
+    rows = _masses(2)
+    rows.distance(point(0), fixed(0.0, 0.0), 1.0)
+    rows.distance(point(2), point(0), 1.0)
+    return Problem(
+        name="double pendulum",
+        system=rows.system("double pendulum"),
+        q0=np.array([1.0, 0.0, 2.0, 0.0]),
+        v0=np.zeros(4),
+        t_span=(0.0, 3.0),
+        energy=rows.energy,
+        parameters={"n": 2, "length": 1.0, "mass": 0.5, "gravity": GRAVITY},
+        reference=computed("double pendulum"),
+        source="textbook problem; the start was chosen for this project",
+        tags=("open chain", "rigid", "planar"),
+        purpose="Two degrees of freedom without a closed form: errors grow with the motion, which is chaotic.",
+        coordinates=_names(2),
+    )
+
+
+def closed_chain(n: int = 4) -> Problem:
+    """A chain of n equal masses whose both ends are pinned: n + 1 links, n - 1 degrees of freedom.
+
+    The links are together 1 m long, the pins 0.8 m apart. The chain is released at rest from a regular polygon
+    through the pins whose first two links are exchanged, so that the motion has no symmetry.
+
+    Parameters
+    ----------
+    n : int
+        Number of masses, 2 to 20.
+
+    Returns
+    -------
+    Problem
+        With a reference for n = 2, 4, 5, 10 and 20.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If n is not an integer from 2 to 20.
+    """
+    n = check_size("n", n, 2)
+    if n > N_MOST:
+        raise ValueError(f"n must be at most {N_MOST}, as far as the chain was checked; given {n}")
+    rows, length = _masses(n), 1.0 / (n + 1)
+    joints = [fixed(0.0, 0.0), *[point(2 * i) for i in range(n)], fixed(SLACK, 0.0)]
+    for left, right in pairwise(joints):
+        rows.distance(right, left, length)
+    name = f"closed chain of {n}"
+    return Problem(
+        name=name,
+        system=rows.system(name, bandwidth=2),
+        q0=_shape(n)[1:-1].ravel(),
+        v0=np.zeros(2 * n),
+        t_span=(0.0, 1.0),
+        energy=rows.energy,
+        parameters={"n": n, "length": length, "mass": 1.0 / n, "gravity": GRAVITY},
+        note="Masses, lengths and start were chosen for this project.",
+        reference=computed(name),
+        source="a question of users: SolveDAE/solve_dae, issue 46; moorepants/learn-multibody-dynamics, issue 239",
+        tags=("closed chain", "rigid", "planar"),
+        purpose=(
+            "A loop of any length, on which solvers are reported to abort from five links on; the number of degrees of "
+            "freedom grows with n, and so does the chaos."
+        ),
+        coordinates=_names(n),
+    )
+
+
+def _shape(n: int) -> Array:
+    """Pins and masses (n + 2, 2) at the start."""
+    links = n + 1
+    # a regular arc of `links` chords of equal length that together span SLACK: sin(links a) / (links sin(a)) = SLACK
+    a = brentq(lambda a: math.sin(links * a) / (links * math.sin(a)) - SLACK, 1e-6, math.pi / links, xtol=1e-15)
+    angles = (2.0 * np.arange(links) - n) * a
+    angles[:2] = angles[1::-1]
+    steps = np.column_stack([np.cos(angles), np.sin(angles)]) / links
+    return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])

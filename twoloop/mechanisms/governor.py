@@ -1,0 +1,74 @@
+"""IFToMM's A05, Watt's flyball governor whose coupler rods are stiff spring-dampers."""
+
+import math
+
+import numpy as np
+
+from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.problem import Problem
+from twoloop.mechanisms.spatial import GROUND
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
+
+GRAVITY = 9.81  # m/s^2, along -z
+DENSITY = 3000.0  # kg/m^3
+LENGTH, WIDTH, CUBE = 1.0, 0.01, 0.1  # m: shaft and rods; slider
+BALL = 5.0  # kg, at the end of each rod
+ANGLE = math.radians(30.0)  # of the rods below the horizontal at the start
+HEIGHT = 0.5  # m, of the slider at the start
+STIFFNESS, DAMPING, SLACK = 8e5, 4e4, 0.5  # N/m, N s/m, m
+RATE = 2.0 * math.pi  # of the whole at the start, rad/s
+
+
+def box(mass: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Principal moments of a box, kg m^2."""
+    return mass * (y * y + z * z) / 12.0, mass * (x * x + z * z) / 12.0, mass * (x * x + y * y) / 12.0
+
+
+def governor() -> Problem:
+    """The stiff version: springs of 8e5 N/m, dampers of 4e4 N s/m, turning at 2 pi rad/s at the start.
+
+    Two models of Exudyn have springs of 4000 N/m and turn at 0.16 of that: another problem.
+    """
+    z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    spin = RATE * z
+    rows = SpatialBodies(-GRAVITY * z)
+    bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
+    shaft = rows.body("shaft", bar, box(bar, WIDTH, WIDTH, LENGTH), 0.5 * LENGTH * z, np.eye(3), spin=spin)
+    slider = rows.body("slider", cube, box(cube, CUBE, CUBE, CUBE), HEIGHT * z, np.eye(3), spin=spin)
+    rows.revolute(shaft, GROUND, (0.0, 0.0, 0.0), z)
+    rows.prismatic(shaft, slider, HEIGHT * z, z)
+    centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # of rod and ball, from the hinge
+    axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)
+    across += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
+    for name, side in (("rod A", 1.0), ("rod B", -1.0)):
+        along = np.array([side * math.cos(ANGLE), 0.0, -math.sin(ANGLE)])
+        hinge = np.array([side * 0.5 * CUBE, 0.0, LENGTH])
+        position = hinge + centre * along
+        R = np.column_stack([along, side * y, np.cross(along, side * y)])
+        rod = rows.body(name, bar + BALL, (axial, across, across), position, R, np.cross(spin, position), spin)
+        rows.revolute(rod, shaft, hinge, y)
+        end = np.array([side * 0.5 * CUBE, 0.0, HEIGHT])
+        rows.spring(slider, end, rod, hinge + 0.5 * LENGTH * along, STIFFNESS, DAMPING, SLACK)
+    q0, v0 = rows.start
+    return Problem(
+        name="A05 governor",
+        system=rows.system("A05 governor"),
+        q0=q0,
+        v0=v0,
+        t_span=(0.0, 10.0),
+        energy=rows.energy,
+        parameters={"stiffness": STIFFNESS, "damping": DAMPING, "rate": RATE, "gravity": GRAVITY},
+        reference=computed("A05 governor"),
+        source=(
+            "IFToMM library of benchmarks, A05; RehabEngGroup/MBSbenchmarksInOpenSim, A05_FlyballGovernor.rst; "
+            "jgerstmayr/EXUDYN, Examples/stiffFlyballGovernorKT.py"
+        ),
+        tags=("closed chain", "rigid", "spatial", "stiff", "dissipative"),
+        purpose=(
+            "Stiffness by force elements: dampers of time constants of 0.1 ms beside an oscillation of about a second. "
+            "The angular momentum about the shaft is kept, and the energy never grows."
+        ),
+        conserved=False,
+        invariants={"angular momentum about the shaft (kg m^2/s)": rows.momentum((0.0, 0.0, 0.0), z)},
+        coordinates=rows.coordinates,
+    )

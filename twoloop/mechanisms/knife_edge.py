@@ -1,0 +1,95 @@
+"""A knife edge on an inclined plane: one non-holonomic row, closed form.
+
+Bloch, Nonholonomic Mechanics and Control (2003), Sect. 1.6. x points down the slope, phi is the angle of the blade.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from twoloop.callbacks import callback
+from twoloop.mechanisms.problem import Array, Problem, Reference
+from twoloop.system import ConstrainedSystem
+
+GRAVITY = 9.81
+MASS, INERTIA, SLOPE, SPIN = 1.3, 0.2, 0.4, 1.7  # kg, kg m^2, rad, rad/s
+PULL = GRAVITY * math.sin(SLOPE)
+
+# p = [m, J, m g sin(slope)]
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = p[0]
+    M[2, 2] = p[1]
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    Q[0] = p[2]
+
+
+@callback("nonholonomic")
+def nonholonomic(t, q, p, A):
+    A[0, 0], A[0, 1] = math.sin(q[2]), -math.cos(q[2])
+
+
+@callback("nonholonomic_gamma")
+def nonholonomic_gamma(t, q, v, p, Qa):
+    Qa[0] = -v[2] * (v[0] * math.cos(q[2]) + v[1] * math.sin(q[2]))
+
+
+def energy(t: Any, q: Array, v: Array) -> Any:
+    """Kinetic energy and potential on the slope, J, of one state or of many."""
+    return 0.5 * (MASS * (v[0] ** 2 + v[1] ** 2) + INERTIA * v[2] ** 2) - MASS * PULL * q[0]
+
+
+def motion(t: float) -> tuple[Array, Array]:
+    """States q, v (3,) at t: a cycloid across the slope."""
+    s, c = math.sin(SPIN * t), math.cos(SPIN * t)
+    scale = PULL / (2.0 * SPIN**2)
+    q = np.array([scale * s * s, scale * (SPIN * t - s * c), SPIN * t])
+    return q, np.array([PULL / SPIN * s * c, PULL / SPIN * s * s, SPIN])
+
+
+def knife_edge() -> Problem:
+    """The blade pointing down the slope, at rest but for its turn of 1.7 rad/s, which stays constant."""
+    system = ConstrainedSystem(
+        n_q=3,
+        n_c=0,
+        n_a=1,
+        mass=mass,
+        force=force,
+        nonholonomic=nonholonomic,
+        nonholonomic_gamma=nonholonomic_gamma,
+        parameters=[MASS, INERTIA, MASS * PULL],
+        constant_mass=True,
+        name="knife edge",
+    )
+    q0, v0 = motion(0.0)
+    q, v = motion(10.0)
+    return Problem(
+        name="knife edge",
+        system=system,
+        q0=q0,
+        v0=v0,
+        t_span=(0.0, 10.0),
+        energy=energy,
+        parameters={"mass": MASS, "inertia": INERTIA, "slope": SLOPE, "spin": SPIN, "gravity": GRAVITY},
+        note="Mass, inertia, slope and spin were chosen for this project.",
+        reference=Reference(
+            t=10.0,
+            q=q,
+            v=v,
+            lam=np.array([2.0 * MASS * PULL * math.sin(SPIN * 10.0)]),
+            source="closed form (Bloch)",
+            digits={"q": 14.0, "v": 14.0, "lam": 13.0},
+            verified="the equation for the speed along the blade, extrapolated in extended precision: 15 digits",
+        ),
+        motion=motion,
+        source="Bloch, Nonholonomic Mechanics and Control (2003), 1.6; SolveDAE/solve_dae, examples/daes/knife_edge.py",
+        tags=("open chain", "rigid", "planar", "non-holonomic"),
+        purpose="A single non-holonomic row and no holonomic one: nothing holds the positions but the velocities.",
+        coordinates=("x (m)", "y (m)", "phi (rad)"),
+    )

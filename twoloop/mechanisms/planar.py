@@ -1,0 +1,245 @@
+"""What mechanisms of planar bodies share: x, y of the centre of mass and the angle of each; pins, distances, guides.
+
+The callbacks are compiled once for all of them; the parameters hold the joints, which `PlanarBodies` collects::
+
+    p = [number of bodies, of joints, gravity along -y, (m, J)..., (kind, row, i, ax, ay, j, bx, by, value)...]
+
+A joint ties the point (ax, ay) of body i, in the body's axes from its centre, to the point (bx, by) of body j; the
+ground is body -1.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from twoloop.callbacks import callback
+from twoloop.mechanisms.problem import Array
+from twoloop.system import ConstrainedSystem
+
+PIN = 0.0  # both points coincide: two rows
+DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
+COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
+WIDTH = 9  # numbers of a joint
+GROUND = -1
+
+
+@numba.njit(cache=True)
+def place(q, body, a, b):
+    """The point (a, b) of a body, and its derivative by the angle: x, y, dx, dy."""
+    if body < 0:
+        return a, b, 0.0, 0.0
+    s, c = math.sin(q[3 * body + 2]), math.cos(q[3 * body + 2])
+    x, y = c * a - s * b, s * a + c * b
+    return q[3 * body] + x, q[3 * body + 1] + y, -y, x
+
+
+@numba.njit(cache=True)
+def motion(v, body, dx, dy):
+    """Velocity of a point whose derivative by the angle is (dx, dy), and what its acceleration has without v'."""
+    if body < 0:
+        return 0.0, 0.0, 0.0, 0.0
+    w = v[3 * body + 2]
+    return v[3 * body] + w * dx, v[3 * body + 1] + w * dy, -w * w * dy, w * w * dx
+
+
+@numba.njit(cache=True)
+def add_row(Cq, row, body, fx, fy, dx, dy):
+    """Add to a row the derivative of fx x + fy y of a point by the coordinates of its body."""
+    if body >= 0:
+        Cq[row, 3 * body] += fx
+        Cq[row, 3 * body + 1] += fy
+        Cq[row, 3 * body + 2] += fx * dx + fy * dy
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    for body in range(int(p[0])):
+        M[3 * body, 3 * body] = M[3 * body + 1, 3 * body + 1] = p[3 + 2 * body]
+        M[3 * body + 2, 3 * body + 2] = p[4 + 2 * body]
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    for body in range(int(p[0])):
+        Q[3 * body + 1] = -p[2] * p[3 + 2 * body]
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    first = 3 + 2 * int(p[0])
+    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
+        if p[k] == COORDINATE:
+            C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * math.sin(p[k + 7] * t)
+            continue
+        ax, ay, _, _ = place(q, i, p[k + 3], p[k + 4])
+        bx, by, _, _ = place(q, j, p[k + 6], p[k + 7])
+        if p[k] == PIN:
+            C[row], C[row + 1] = ax - bx, ay - by
+        else:
+            C[row] = 0.5 * ((ax - bx) ** 2 + (ay - by) ** 2) - p[k + 8]
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    first = 3 + 2 * int(p[0])
+    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
+        if p[k] == COORDINATE:
+            Cq[row, i] = 1.0
+            continue
+        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        if p[k] == PIN:
+            add_row(Cq, row, i, 1.0, 0.0, adx, ady)
+            add_row(Cq, row, j, -1.0, 0.0, bdx, bdy)
+            add_row(Cq, row + 1, i, 0.0, 1.0, adx, ady)
+            add_row(Cq, row + 1, j, 0.0, -1.0, bdx, bdy)
+        else:
+            add_row(Cq, row, i, ax - bx, ay - by, adx, ady)
+            add_row(Cq, row, j, bx - ax, by - ay, bdx, bdy)
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):
+    first = 3 + 2 * int(p[0])
+    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+        if p[k] == COORDINATE:
+            Ct[int(p[k + 1])] = -p[k + 4] - p[k + 6] * p[k + 7] * math.cos(p[k + 7] * t)
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    first = 3 + 2 * int(p[0])
+    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
+        if p[k] == COORDINATE:
+            Qd[row] = -p[k + 6] * p[k + 7] ** 2 * math.sin(p[k + 7] * t)
+            continue
+        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        au, av, aa, ab = motion(v, i, adx, ady)
+        bu, bv, ba, bb = motion(v, j, bdx, bdy)
+        if p[k] == PIN:
+            Qd[row], Qd[row + 1] = ba - aa, bb - ab
+        else:
+            Qd[row] = (bu - au) * (au - bu) + (bv - av) * (av - bv) + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
+
+
+@callback("kinematics")
+def kinematics(t, q, v, p, C, Cq, Ct, Qd):
+    first = 3 + 2 * int(p[0])
+    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+        row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
+        if p[k] == COORDINATE:
+            s, c, frequency = math.sin(p[k + 7] * t), math.cos(p[k + 7] * t), p[k + 7]
+            C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * s
+            Cq[row, i] = 1.0
+            Ct[row] = -p[k + 4] - p[k + 6] * frequency * c
+            Qd[row] = -p[k + 6] * frequency**2 * s
+            continue
+        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        au, av, aa, ab = motion(v, i, adx, ady)
+        bu, bv, ba, bb = motion(v, j, bdx, bdy)
+        if p[k] == PIN:
+            C[row], C[row + 1] = ax - bx, ay - by
+            add_row(Cq, row, i, 1.0, 0.0, adx, ady)
+            add_row(Cq, row, j, -1.0, 0.0, bdx, bdy)
+            add_row(Cq, row + 1, i, 0.0, 1.0, adx, ady)
+            add_row(Cq, row + 1, j, 0.0, -1.0, bdx, bdy)
+            Qd[row], Qd[row + 1] = ba - aa, bb - ab
+        else:
+            C[row] = 0.5 * ((ax - bx) ** 2 + (ay - by) ** 2) - p[k + 8]
+            add_row(Cq, row, i, ax - bx, ay - by, adx, ady)
+            add_row(Cq, row, j, bx - ax, by - ay, bdx, bdy)
+            Qd[row] = (bu - au) * (au - bu) + (bv - av) * (av - bv) + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Kinetic energy and potential of the weight, J, of one state or of many."""
+
+    masses: Array
+    inertias: Array
+    gravity: float
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = np.asarray(q), np.asarray(v)
+        kinetic = 0.5 * (self.masses @ (v[0::3] ** 2 + v[1::3] ** 2) + self.inertias @ v[2::3] ** 2)
+        return kinetic + self.gravity * (self.masses @ q[1::3])
+
+
+class PlanarBodies:
+    """Collects bodies and their joints.
+
+    Parameters
+    ----------
+    masses, inertias : sequence of float
+        kg, and kg m^2 about the centre of mass.
+    gravity : float
+        m/s^2, along -y.
+    """
+
+    def __init__(self, masses: Any, inertias: Any, gravity: float = 9.81):
+        self.masses, self.inertias = np.asarray(masses, dtype=float), np.asarray(inertias, dtype=float)
+        self.gravity, self.n_c = gravity, 0
+        self._joints: list[list[float]] = []
+
+    def _add(self, kind: float, rows: int, numbers: list[float]) -> int:
+        self._joints.append([kind, float(self.n_c), *numbers])
+        self.n_c += rows
+        return self.n_c - rows
+
+    def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
+        """Two rows: point a of body i is point b of body j (or of the ground); returns the first one's number."""
+        return self._add(PIN, 2, [i, *a, j, *b, 0.0])
+
+    def distance(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float], length: float) -> int:
+        """A row: both points are `length` apart."""
+        return self._add(DISTANCE, 1, [i, *a, j, *b, 0.5 * length**2])
+
+    def drive(
+        self, coordinate: int, start: float, rate: float = 0.0, amplitude: float = 0.0, frequency: float = 0.0
+    ) -> int:
+        """A row: a coordinate is start + rate t + amplitude sin(frequency t); by default it is held."""
+        return self._add(COORDINATE, 1, [coordinate, start, rate, GROUND, amplitude, frequency, 0.0])
+
+    def system(self, name: str) -> ConstrainedSystem:
+        """The system of the joints so far."""
+        bodies = np.column_stack([self.masses, self.inertias])
+        sizes = [len(bodies), len(self._joints), self.gravity]
+        moves = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
+        return ConstrainedSystem(
+            n_q=3 * len(bodies),
+            n_c=self.n_c,
+            mass=mass,
+            force=force,
+            constraint=constraint,
+            jacobian=jacobian,
+            constraint_rate=constraint_rate if moves else None,
+            gamma=gamma,
+            kinematics=kinematics,
+            parameters=np.concatenate([sizes, bodies.ravel(), np.ravel(self._joints)]),
+            constant_mass=True,
+            name=name,
+        )
+
+    @property
+    def energy(self) -> Energy:
+        """Energy as a function of t, q and v."""
+        return Energy(self.masses, self.inertias, self.gravity)
+
+
+def states(*bodies: tuple[complex, float]) -> Array:
+    """Coordinates (3 n,) of bodies, each given as x + i y and an angle; velocities likewise."""
+    return np.array([[z.real, z.imag, angle] for z, angle in bodies]).ravel()
+
+
+def body_names(*bodies: str) -> tuple[str, ...]:
+    """Names of the coordinates of bodies."""
+    return tuple(f"{part} of {body}" for body in bodies for part in ("x (m)", "y (m)", "angle (rad)"))

@@ -1,0 +1,167 @@
+"""What mechanisms share whose mass and force are constant and whose constraints are quadratic.
+
+Points and vectors fixed to bodies as coordinates ("natural" coordinates) give such constraints. The callbacks are
+compiled once for all of them; the parameters hold the terms, which `QuadraticSystem` collects::
+
+    p = [n_c, number of entries of the mass, of linear terms, of quadratic terms,
+         force (n_q,), constants (n_c,), (i, j, m)..., (row, i, c)..., (row, i, j, c)...]
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from twoloop.callbacks import callback
+from twoloop.mechanisms.problem import Array
+from twoloop.system import ConstrainedSystem
+
+Scalar = Mapping[int | None, float]  # coordinate to coefficient; None: a constant
+ONE: Scalar = {None: 1.0}
+
+
+@numba.njit(cache=True)
+def places(n_q, p):
+    """Where the constants, the entries of the mass, the linear and the quadratic terms begin."""
+    constants = 4 + n_q
+    entries = constants + int(p[0])
+    linear = entries + 3 * int(p[1])
+    return constants, entries, linear, linear + 3 * int(p[2])
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    first = places(q.size, p)[1]
+    for k in range(first, first + 3 * int(p[1]), 3):
+        M[int(p[k]), int(p[k + 1])] = p[k + 2]
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    for i in range(q.size):
+        Q[i] = p[4 + i]
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    constants, _, linear, quadratic = places(q.size, p)
+    for row in range(C.size):
+        C[row] = p[constants + row]
+    for k in range(linear, linear + 3 * int(p[2]), 3):
+        C[int(p[k])] += p[k + 2] * q[int(p[k + 1])]
+    for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
+        C[int(p[k])] += p[k + 3] * q[int(p[k + 1])] * q[int(p[k + 2])]
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    _, _, linear, quadratic = places(q.size, p)
+    for k in range(linear, linear + 3 * int(p[2]), 3):
+        Cq[int(p[k]), int(p[k + 1])] += p[k + 2]
+    for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
+        row, i, j, c = int(p[k]), int(p[k + 1]), int(p[k + 2]), p[k + 3]
+        Cq[row, i] += c * q[j]
+        Cq[row, j] += c * q[i]
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    quadratic = places(q.size, p)[3]
+    for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
+        Qd[int(p[k])] -= 2.0 * p[k + 3] * v[int(p[k + 1])] * v[int(p[k + 2])]
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Kinetic energy under a constant mass and potential of a constant force, J, of one state or of many."""
+
+    mass: Array
+    force: Array
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = np.asarray(q), np.asarray(v)
+        return 0.5 * np.einsum("i...,ij,j...->...", v, self.mass, v) - self.force @ q
+
+
+class QuadraticSystem:
+    """Collects the rows of a mechanism.
+
+    Parameters
+    ----------
+    mass : ndarray (n_q, n_q)
+        Constant and symmetric.
+    force : ndarray (n_q,)
+        Constant.
+    """
+
+    def __init__(self, mass: Array, force: Array):
+        self.mass, self.force = np.asarray(mass, dtype=float), np.asarray(force, dtype=float)
+        self._constants: list[float] = []
+        self._linear: list[tuple[float, ...]] = []
+        self._quadratic: list[tuple[float, ...]] = []
+
+    def row(self, *products: tuple[float, Scalar, Scalar]) -> int:
+        """A row: the sum of c a b over the products (c, a, b) of two scalars is zero; returns its number."""
+        number, constant = len(self._constants), 0.0
+        for factor, first, second in products:
+            for i, a in first.items():
+                for j, b in second.items():
+                    c = factor * a * b
+                    if i is not None and j is not None:
+                        self._quadratic.append((number, i, j, c))
+                    elif i is None and j is None:
+                        constant += c
+                    else:
+                        self._linear.append((number, j if i is None else i, c))  # type: ignore[arg-type]
+        self._constants.append(constant)
+        return number
+
+    def distance(self, first: Sequence[Scalar], second: Sequence[Scalar], length: float) -> int:
+        """A row: half the squared distance of two points, each a list of scalars, is half the squared length."""
+        parts = [(0.5, difference(a, b), difference(a, b)) for a, b in zip(first, second, strict=True)]
+        return self.row(*parts, (-0.5 * length**2, ONE, ONE))
+
+    def system(self, name: str, bandwidth: int | None = None) -> ConstrainedSystem:
+        """The system of the rows so far."""
+        entries = [(i, j, self.mass[i, j]) for i, j in np.argwhere(self.mass)]
+        sizes = [len(self._constants), len(entries), len(self._linear), len(self._quadratic)]
+        tables = [np.ravel(table) for table in (entries, self._linear, self._quadratic)]
+        return ConstrainedSystem(
+            n_q=self.force.size,
+            n_c=len(self._constants),
+            mass=mass,
+            force=force,
+            constraint=constraint,
+            jacobian=jacobian,
+            gamma=gamma,
+            parameters=np.concatenate([sizes, self.force, self._constants, *tables]),
+            constant_mass=True,
+            bandwidth=bandwidth,
+            name=name,
+        )
+
+    @property
+    def energy(self) -> Energy:
+        """Energy as a function of t, q and v."""
+        return Energy(self.mass, self.force)
+
+
+def difference(a: Scalar, b: Scalar) -> Scalar:
+    """The scalar a - b."""
+    result = dict(a)
+    for place, value in b.items():
+        result[place] = result.get(place, 0.0) - value
+    return result
+
+
+def point(i: int) -> list[Scalar]:
+    """The planar point whose coordinates are q[i], q[i + 1]."""
+    return [{i: 1.0}, {i + 1: 1.0}]
+
+
+def fixed(*position: float) -> list[Scalar]:
+    """A point or a vector of the ground."""
+    return [{None: float(x)} for x in position]

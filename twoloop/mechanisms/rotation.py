@@ -1,0 +1,106 @@
+"""Rotation by Euler parameters e = (e0, e1, e2, e3): helpers of compiled callbacks, and of the start of a mechanism.
+
+R(e) a = (e0^2 - f.f) a + 2 f (f.a) + 2 e0 f x a with f = (e1, e2, e3) is quadratic in e. So the acceleration of a
+vector that turns with a body is twice R(e') a where e'' = 0. See Nikravesh, Computer-Aided Analysis of Mechanical
+Systems (1988), Sect. 6.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike
+
+from twoloop.mechanisms.problem import Array
+
+
+@numba.njit(cache=True)
+def rotated(e0, e1, e2, e3, x, y, z):
+    """R(e) (x, y, z), homogeneous of degree two in e."""
+    d = e0 * e0 - e1 * e1 - e2 * e2 - e3 * e3
+    s = 2.0 * (e1 * x + e2 * y + e3 * z)
+    return (
+        d * x + s * e1 + 2.0 * e0 * (e2 * z - e3 * y),
+        d * y + s * e2 + 2.0 * e0 * (e3 * x - e1 * z),
+        d * z + s * e3 + 2.0 * e0 * (e1 * y - e2 * x),
+    )
+
+
+@numba.njit(cache=True)
+def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
+    """The derivative of R(e) (x, y, z) where e' = u."""
+    d = 2.0 * (e0 * u0 - e1 * u1 - e2 * u2 - e3 * u3)
+    s = 2.0 * (e1 * x + e2 * y + e3 * z)
+    r = 2.0 * (u1 * x + u2 * y + u3 * z)
+    return (
+        d * x + r * e1 + s * u1 + 2.0 * (e0 * (u2 * z - u3 * y) + u0 * (e2 * z - e3 * y)),
+        d * y + r * e2 + s * u2 + 2.0 * (e0 * (u3 * x - u1 * z) + u0 * (e3 * x - e1 * z)),
+        d * z + r * e3 + s * u3 + 2.0 * (e0 * (u1 * y - u2 * x) + u0 * (e1 * y - e2 * x)),
+    )
+
+
+@numba.njit(cache=True)
+def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
+    """The derivative of f . R(e) (x, y, z) by e: the generalised force of f at that point."""
+    fa = fx * x + fy * y + fz * z
+    s = e1 * x + e2 * y + e3 * z
+    r = e1 * fx + e2 * fy + e3 * fz
+    cx, cy, cz = y * fz - z * fy, z * fx - x * fz, x * fy - y * fx  # a x f
+    return (
+        2.0 * (e0 * fa + e1 * cx + e2 * cy + e3 * cz),
+        2.0 * (s * fx + r * x - fa * e1 + e0 * cx),
+        2.0 * (s * fy + r * y - fa * e2 + e0 * cy),
+        2.0 * (s * fz + r * z - fa * e3 + e0 * cz),
+    )
+
+
+@numba.njit(cache=True)
+def half_spin(e0, e1, e2, e3, u0, u1, u2, u3):
+    """G(e) u: half the angular velocity in the body's axes where e' = u."""
+    return (
+        -e1 * u0 + e0 * u1 + e3 * u2 - e2 * u3,
+        -e2 * u0 - e3 * u1 + e0 * u2 + e1 * u3,
+        -e3 * u0 + e2 * u1 - e1 * u2 + e0 * u3,
+    )
+
+
+def G(e: ArrayLike) -> Array:
+    """The matrix G (3, 4) of e: the angular velocity in the body's axes is 2 G e'."""
+    e0, e1, e2, e3 = np.asarray(e, dtype=float)
+    return np.array([[-e1, e0, e3, -e2], [-e2, -e3, e0, e1], [-e3, e2, -e1, e0]])
+
+
+def rotation_matrix(e: ArrayLike) -> Array:
+    """R (3, 3) of unit Euler parameters: columns are the body's axes."""
+    e = np.asarray(e, dtype=float)
+    f = e[1:]
+    cross = np.array([[0.0, -f[2], f[1]], [f[2], 0.0, -f[0]], [-f[1], f[0], 0.0]])
+    return (e[0] ** 2 - f @ f) * np.eye(3) + 2.0 * np.outer(f, f) + 2.0 * e[0] * cross
+
+
+def euler_parameters(R: ArrayLike) -> Array:
+    """Unit Euler parameters (4,) of a rotation matrix: of both signs that with e0 > 0, or the largest if e0 is zero.
+
+    Raises
+    ------
+    ValueError
+        If `R` is not a rotation matrix.
+    """
+    R = np.asarray(R, dtype=float)
+    if R.shape != (3, 3) or np.abs(R.T @ R - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0.0:
+        raise ValueError(f"R must be a rotation matrix (3, 3), orthonormal and right-handed; given {R!r}")
+    # the symmetric matrix 4 e e^T, whose column with the largest diagonal is free of cancellation
+    d = R[0, 0] + R[1, 1] + R[2, 2]
+    E = np.empty((4, 4))
+    E[0, 0] = 1.0 + d
+    for i in range(3):
+        E[i + 1, i + 1] = 1.0 + 2.0 * R[i, i] - d
+        j, k = (i + 1) % 3, (i + 2) % 3
+        E[0, i + 1] = E[i + 1, 0] = R[k, j] - R[j, k]
+        E[j + 1, k + 1] = E[k + 1, j + 1] = R[j, k] + R[k, j]
+    column = E[:, int(np.argmax(np.diag(E)))]
+    e = column / np.linalg.norm(column)
+    return -e if e[0] < -1e-8 else e
+
+
+def euler_rates(e: ArrayLike, spin: ArrayLike) -> Array:
+    """e' (4,) at an angular velocity (3,) along the axes of space."""
+    return 0.5 * G(e).T @ (rotation_matrix(e).T @ np.asarray(spin, dtype=float))

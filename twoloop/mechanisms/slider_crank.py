@@ -1,0 +1,134 @@
+"""A planar slider-crank of three bodies in absolute coordinates: with a redundant row, and driven.
+
+Bodies x, y, angle of crank, rod and slider. The redundant row says once more, and not linearly, that the crank pin is
+as far from the slider as the rod is long.
+"""
+
+import cmath
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.planar import GROUND, PlanarBodies, body_names, states
+from twoloop.mechanisms.problem import Array, Problem, Reference
+
+GRAVITY = 9.81
+CRANK, ROD = 0.5, 1.2  # m
+MASSES = (1.0, 1.5, 0.8)  # kg
+INERTIAS = (MASSES[0] * CRANK**2 / 12.0, MASSES[1] * ROD**2 / 12.0, 0.02)  # kg m^2
+PARAMETERS = {"crank": CRANK, "rod": ROD, "masses": MASSES, "inertias": INERTIAS, "gravity": GRAVITY}
+NAMES = body_names("crank", "rod", "slider")
+ANGLE, RATE = 0.5, 8.0  # of the free crank at the start, rad and rad/s
+DRIVE = {"start": 0.5, "rate": 4.0, "amplitude": 0.3, "frequency": 3.0}
+SOURCE = "textbook mechanism; dimensions and start were chosen for this project"
+
+
+def _rows(redundant: bool) -> PlanarBodies:
+    rows = PlanarBodies(MASSES, INERTIAS, GRAVITY)
+    rows.pin(0, (-0.5 * CRANK, 0.0), GROUND, (0.0, 0.0))
+    rows.pin(1, (-0.5 * ROD, 0.0), 0, (0.5 * CRANK, 0.0))
+    rows.pin(2, (0.0, 0.0), 1, (0.5 * ROD, 0.0))
+    rows.drive(7, 0.0)
+    rows.drive(8, 0.0)
+    if redundant:
+        rows.distance(2, (0.0, 0.0), 0, (0.5 * CRANK, 0.0), ROD)
+    return rows
+
+
+def positions(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Array, Array, Array]:
+    """Coordinates, velocities and accelerations (9,) at an angle of the crank, from the triangle."""
+    pin = cmath.rect(CRANK, angle)
+    pin_v, pin_a = 1j * rate * pin, (1j * acceleration - rate**2) * pin
+    tilt = -math.asin(pin.imag / ROD)
+    turn = -pin_v.imag / (ROD * math.cos(tilt))
+    turn_a = (turn**2 * math.sin(tilt) - pin_a.imag / ROD) / math.cos(tilt)
+    half = cmath.rect(0.5 * ROD, tilt)
+    half_v, half_a = 1j * turn * half, (1j * turn_a - turn**2) * half
+    return (
+        states((0.5 * pin, angle), (pin + half, tilt), (pin + 2.0 * half, 0.0)),
+        states((0.5 * pin_v, rate), (pin_v + half_v, turn), (pin_v + 2.0 * half_v, 0.0)),
+        states((0.5 * pin_a, acceleration), (pin_a + half_a, turn_a), (pin_a + 2.0 * half_a, 0.0)),
+    )
+
+
+def redundant_slider_crank() -> Problem:
+    """The slider-crank with nine rows of rank eight, turning freely under its weight from 8 rad/s of the crank."""
+    rows = _rows(True)
+    q0, v0, _ = positions(ANGLE, RATE)
+    return Problem(
+        name="redundant slider-crank",
+        system=rows.system("redundant slider-crank"),
+        q0=q0,
+        v0=v0,
+        t_span=(0.0, 2.0),
+        energy=rows.energy,
+        parameters=PARAMETERS,
+        reference=computed("redundant slider-crank"),
+        source=SOURCE,
+        tags=("closed chain", "rigid", "planar", "redundant"),
+        purpose=(
+            "Whether a row that follows from the others is found and left out; the rows are too many for an LU of the "
+            "whole matrix, and the multipliers are those of least norm."
+        ),
+        coordinates=NAMES,
+    )
+
+
+@dataclass(frozen=True)
+class Driven:
+    """The motion of the driven slider-crank, which is that of the drive: no freedom is left."""
+
+    def __call__(self, t: float) -> tuple[Array, Array]:
+        """States q, v (9,) at t."""
+        q, v, _ = self.full(t)
+        return q, v
+
+    def full(self, t: float) -> tuple[Array, Array, Array]:
+        """The same with the accelerations."""
+        start, rate, amplitude, frequency = DRIVE.values()
+        s, c = math.sin(frequency * t), math.cos(frequency * t)
+        return positions(
+            start + rate * t + amplitude * s, rate + amplitude * frequency * c, -amplitude * frequency**2 * s
+        )
+
+
+def driven_slider_crank() -> Problem:
+    """The slider-crank, its crank at the angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates."""
+    rows = _rows(False)
+    rows.drive(2, **DRIVE)
+    motion = Driven()
+    q0, v0 = motion(0.0)
+    q, v, a = motion.full(2.0)
+    system = rows.system("driven slider-crank")
+    force = np.tile([0.0, -GRAVITY, 0.0], 3) * np.repeat(MASSES, 3)
+    inertia = np.column_stack([MASSES, MASSES, INERTIAS]).ravel()
+    lam = np.linalg.solve(system.jacobian(2.0, q).T, force - inertia * a)
+    return Problem(
+        name="driven slider-crank",
+        system=system,
+        q0=q0,
+        v0=v0,
+        t_span=(0.0, 2.0),
+        energy=rows.energy,
+        parameters={**PARAMETERS, "drive": DRIVE},
+        reference=Reference(
+            t=2.0,
+            q=q,
+            v=v,
+            lam=lam,
+            source="closed form, from the triangle; multipliers by a linear solve with it",
+            digits={"q": 14.0, "v": 14.0, "lam": 13.0},
+            verified="positions by the law of cosines, velocities by differences, the drive's torque by its power",
+        ),
+        motion=motion,
+        source=SOURCE,
+        tags=("closed chain", "rigid", "planar", "driven"),
+        purpose=(
+            "Constraints that depend on time and leave no freedom: everything is C_t and Q_d, and the last multiplier "
+            "is the torque of the drive."
+        ),
+        conserved=False,
+        coordinates=NAMES,
+    )

@@ -1,0 +1,232 @@
+"""How a mechanism of spatial bodies is put together: bodies at their start, joints and springs between them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from twoloop.mechanisms import spatial
+from twoloop.mechanisms.problem import Array
+from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
+from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
+from twoloop.system import ConstrainedSystem
+
+NAMES = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
+
+
+class SpatialBodies:
+    """Collects bodies, joints and springs. Points and directions are given in space, at the start.
+
+    Parameters
+    ----------
+    gravity : array_like (3,)
+        m/s^2.
+    """
+
+    def __init__(self, gravity: ArrayLike):
+        self.gravity = np.asarray(gravity, dtype=float)
+        self.n_joint_rows = 0
+        self._bodies: list[tuple[float, ...]] = []
+        self._names: list[str] = []
+        self._q: list[Array] = [np.zeros(0)]
+        self._v: list[Array] = [np.zeros(0)]
+        self._R: list[Array] = []
+        self._joints: list[list[float]] = []
+        self._springs: list[list[float]] = []
+
+    def body(
+        self,
+        name: str,
+        mass: float,
+        inertia: tuple[float, float, float],
+        position: ArrayLike,
+        R: ArrayLike,
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        spin: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> int:
+        """Add a body, and return its number.
+
+        Parameters
+        ----------
+        name : str
+        mass : float
+            kg.
+        inertia : (float, float, float)
+            Principal moments about the centre of mass, kg m^2.
+        position, velocity : array_like (3,)
+            Of the centre of mass, m and m/s.
+        R : array_like (3, 3)
+            Rotation matrix, whose columns are the principal axes.
+        spin : array_like (3,)
+            Angular velocity along the axes of space, rad/s.
+        """
+        e = euler_parameters(R)
+        self._bodies.append((mass, *inertia))
+        self._names.append(name)
+        self._R.append(rotation_matrix(e))
+        self._q.append(np.concatenate([np.asarray(position, dtype=float), e]))
+        self._v.append(np.concatenate([np.asarray(velocity, dtype=float), euler_rates(e, spin)]))
+        return len(self._bodies) - 1
+
+    def _along(self, body: int, direction: ArrayLike) -> Array:
+        """A direction in the axes of a body."""
+        given = np.asarray(direction, dtype=float)
+        return given if body == GROUND else self._R[body].T @ given
+
+    def _from_centre(self, body: int, point: ArrayLike) -> Array:
+        """A point in the axes of a body, from its centre."""
+        given = np.asarray(point, dtype=float)
+        return given if body == GROUND else self._along(body, given - self._q[body + 1][:3])
+
+    def _add(self, kind: float, rows: int, i: int, a: Array, j: int, b: Array, s: Array) -> None:
+        self._joints.append([kind, float(self.n_joint_rows), float(i), *a, float(j), *b, *s])
+        self.n_joint_rows += rows
+
+    def spherical(self, i: int, j: int, point: ArrayLike) -> None:
+        """Three rows: both bodies share a point."""
+        self._add(POINT, 3, i, self._from_centre(i, point), j, self._from_centre(j, point), np.zeros(3))
+
+    def perpendicular(self, i: int, a: ArrayLike, j: int, b: ArrayLike) -> None:
+        """A row: the direction a of body i and b of body j stay perpendicular."""
+        self._add(DIRECTION, 1, i, self._along(i, a), j, self._along(j, b), np.zeros(3))
+
+    def parallel(self, i: int, j: int, axis: ArrayLike) -> None:
+        """Two rows: both bodies keep a common direction."""
+        for across in _across(axis):
+            self.perpendicular(i, across, j, axis)
+
+    def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
+        """Five rows: a hinge at a point."""
+        self.spherical(i, j, point)
+        self.parallel(i, j, axis)
+
+    def universal(self, i: int, j: int, point: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
+        """Four rows: a cross at a point, one axis fixed in body i, the other, perpendicular, in body j."""
+        self.spherical(i, j, point)
+        self.perpendicular(i, a, j, b)
+
+    def prismatic(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
+        """Five rows: body j slides along an axis of body i through a point, and does not turn on it."""
+        first, second = _across(axis)
+        here, there = self._from_centre(i, point), self._from_centre(j, point)
+        for across in (first, second):
+            self._add(PLANE, 1, i, self._along(i, across), j, there, here)
+        self.parallel(i, j, axis)
+        self.perpendicular(i, first, j, second)
+
+    def spring(
+        self, i: int, a: ArrayLike, j: int, b: ArrayLike, stiffness: float, damping: float, length: float
+    ) -> None:
+        """A spring-damper between the point a of body i and b of body j: N/m, N s/m, m."""
+        here, there = self._from_centre(i, a), self._from_centre(j, b)
+        self._springs.append([float(i), *here, float(j), *there, stiffness, damping, length])
+
+    def system(self, name: str) -> ConstrainedSystem:
+        """The system of what was added so far."""
+        n = len(self._bodies)
+        tables = [np.ravel(table) for table in (self._bodies, self._joints_after(n), self._springs)]
+        return ConstrainedSystem(
+            n_q=7 * n,
+            n_c=n + self.n_joint_rows,
+            mass=spatial.mass,
+            force=spatial.force,
+            constraint=spatial.constraint,
+            jacobian=spatial.jacobian,
+            gamma=spatial.gamma,
+            parameters=np.concatenate([[n, len(self._joints), len(self._springs)], self.gravity, *tables]),
+            name=name,
+        )
+
+    def _joints_after(self, n: int) -> list[list[float]]:
+        """The joints, their rows numbered after the n normalisations."""
+        return [[joint[0], joint[1] + n, *joint[2:]] for joint in self._joints]
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """States q, v (n_q,) at the start."""
+        return np.concatenate(self._q), np.concatenate(self._v)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return tuple(f"{coordinate} of {name}" for name in self._names for coordinate in NAMES)
+
+    @property
+    def energy(self) -> "Energy":
+        """Energy as a function of t, q and v."""
+        return Energy(np.array(self._bodies), self.gravity, np.array(self._springs).reshape(-1, spatial.SPRING))
+
+    def momentum(self, point: ArrayLike, axis: ArrayLike) -> "Momentum":
+        """Angular momentum about an axis of space through a point, as a function of t, q and v."""
+        return Momentum(np.array(self._bodies), np.asarray(point, dtype=float), np.asarray(axis, dtype=float))
+
+
+def _across(axis: ArrayLike) -> tuple[Array, Array]:
+    """Two unit directions, perpendicular to an axis and to each other."""
+    axis = np.asarray(axis, dtype=float)
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    second = np.cross(axis, first)
+    return first / np.linalg.norm(first), second / np.linalg.norm(second)
+
+
+def _states(q: Array, v: Array) -> tuple[Array, Array]:
+    """States of the bodies (n, 7) or (n, 7, n_t)."""
+    q, v = np.asarray(q), np.asarray(v)
+    shape = (-1, 7, *q.shape[1:])
+    return q.reshape(shape), v.reshape(shape)
+
+
+def _spins(q: Array, v: Array) -> Array:
+    """Angular velocities along the bodies' axes, (n, 3) or (n, 3, n_t)."""
+    e, u = np.moveaxis(q[:, 3:], 1, 0), np.moveaxis(v[:, 3:], 1, 0)
+    return 2.0 * np.stack(spatial.half_spin.py_func(*e, *u), axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Kinetic energy, potential of the weight and of the springs, J, of one state or of many."""
+
+    bodies: Array
+    gravity: Array
+    springs: Array
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = _states(q, v)
+        masses, inertias = self.bodies[:, 0], self.bodies[:, 1:]
+        kinetic = np.einsum("i,ij...->...", masses, v[:, :3] ** 2)
+        kinetic += np.einsum("ij,ij...->...", inertias, _spins(q, v) ** 2)
+        total = 0.5 * kinetic - np.einsum("i,j,ij...->...", masses, self.gravity, q[:, :3])
+        for spring in self.springs:
+            gap = _place(q, int(spring[4]), spring[5:8]) - _place(q, int(spring[0]), spring[1:4])
+            total = total + 0.5 * spring[8] * (np.sqrt((gap**2).sum(axis=0)) - spring[10]) ** 2
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class Momentum:
+    """Angular momentum about an axis of space through a point, kg m^2/s, of one state or of many."""
+
+    bodies: Array
+    point: Array
+    axis: Array
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = _states(q, v)
+        spins = _spins(q, v)
+        total: Any = 0.0
+        for (mass, *inertia), state, rate, spin in zip(self.bodies, q, v, spins, strict=True):
+            arm = state[:3] - self.point.reshape(3, *(1,) * (state.ndim - 1))
+            own = spatial.rotated.py_func(*state[3:], *(np.array(inertia) * spin.T).T)
+            moment = np.cross(arm, rate[:3], axis=0) * mass + np.array(own)
+            total = total + np.tensordot(self.axis, moment, axes=1)
+        return total
+
+
+def _place(q: Array, body: int, point: Array) -> Array:
+    """The point of a body in space, (3,) or (3, n_t)."""
+    if body == GROUND:
+        return point.reshape(3, *(1,) * (q.ndim - 2))
+    return q[body, :3] + np.array(spatial.rotated.py_func(*q[body, 3:], *point))

@@ -1,0 +1,89 @@
+"""A spatial four-bar linkage, RSSR: crank and rocker on hinges that are not parallel, a coupler on two ball joints.
+
+The crank turns about z through the origin, the rocker about y through D. The coupler may also turn about its own axis,
+which no force resists: a second degree of freedom that the rest does not feel.
+"""
+
+import math
+
+import numpy as np
+
+from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.problem import Array, Problem
+from twoloop.mechanisms.spatial import GROUND
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
+
+GRAVITY = 9.81  # m/s^2, along -z
+CRANK, ROCKER = 0.3, 0.7  # m
+D = np.array([0.9, 0.0, 0.3])  # m
+START = (0.0, 0.5 * math.pi)  # angles of crank (from x) and rocker (from x, towards z) at the start
+RATE = 5.0  # of the crank at the start, rad/s
+MASSES = {"crank": 0.6, "coupler": 1.0, "rocker": 0.8}  # kg
+RADIUS = 0.02  # m, of all three round bars
+
+
+def inertia(mass: float, length: float) -> tuple[float, float, float]:
+    """Principal moments of a round bar along its first axis, kg m^2."""
+    across = mass * (length**2 / 12.0 + RADIUS**2 / 4.0)
+    return 0.5 * mass * RADIUS**2, across, across
+
+
+def frame(along: Array, up: Array) -> Array:
+    """Rotation matrix whose first column points along a bar, and the second across `up` and it."""
+    x = along / np.linalg.norm(along)
+    y = np.cross(up, x)
+    y = y / np.linalg.norm(y)
+    return np.column_stack([x, y, np.cross(x, y)])
+
+
+def spatial_four_bar() -> Problem:
+    """The RSSR linkage under its weight, its crank level and turning at 5 rad/s at the start."""
+    theta, phi = START
+    P = CRANK * np.array([math.cos(theta), math.sin(theta), 0.0])
+    P_v = CRANK * RATE * np.array([-math.sin(theta), math.cos(theta), 0.0])
+    arm = ROCKER * np.array([math.cos(phi), 0.0, math.sin(phi)])
+    turned = ROCKER * np.array([-math.sin(phi), 0.0, math.cos(phi)])
+    bar = D + arm - P
+    phi_rate = (bar @ P_v) / (bar @ turned)
+    S, S_v = D + arm, phi_rate * turned
+    length = float(np.linalg.norm(bar))
+    spin = np.cross(bar, S_v - P_v) / length**2  # without a turn about its own axis
+    up, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    rows = SpatialBodies((0.0, 0.0, -GRAVITY))
+    m = MASSES
+    crank = rows.body("crank", m["crank"], inertia(m["crank"], CRANK), 0.5 * P, frame(P, up), 0.5 * P_v, RATE * up)
+    coupler = rows.body(
+        "coupler", m["coupler"], inertia(m["coupler"], length), 0.5 * (P + S), frame(bar, y), 0.5 * (P_v + S_v), spin
+    )
+    rocker = rows.body(
+        "rocker",
+        m["rocker"],
+        inertia(m["rocker"], ROCKER),
+        D + 0.5 * arm,
+        frame(arm, y),
+        0.5 * S_v,
+        -phi_rate * y,  # from x towards z is against the right hand about y
+    )
+    rows.revolute(crank, GROUND, (0.0, 0.0, 0.0), up)
+    rows.spherical(coupler, crank, P)
+    rows.spherical(rocker, coupler, S)
+    rows.revolute(rocker, GROUND, D, y)
+    q0, v0 = rows.start
+    return Problem(
+        name="spatial four-bar",
+        system=rows.system("spatial four-bar"),
+        q0=q0,
+        v0=v0,
+        t_span=(0.0, 2.0),
+        energy=rows.energy,
+        parameters={"crank": CRANK, "coupler": length, "rocker": ROCKER, "D": tuple(D), "masses": MASSES},
+        note="Dimensions and start were chosen for this project.",
+        reference=computed("spatial four-bar"),
+        source="textbook mechanism (RSSR)",
+        tags=("closed chain", "rigid", "spatial"),
+        purpose=(
+            "A spatial loop by Euler parameters, 21 coordinates and 19 constraints, with a singular mass matrix and a "
+            "freedom, the coupler's turn about its axis, that nothing else feels."
+        ),
+        coordinates=rows.coordinates,
+    )

@@ -1,0 +1,65 @@
+"""The spatial rigid slider-crank of IFToMM's library: crank about x, ball joint, rod, cross, slider along x."""
+
+import math
+
+import numpy as np
+
+from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.problem import Problem
+from twoloop.mechanisms.spatial import GROUND
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
+
+GRAVITY = 9.81  # m/s^2, along -z
+CRANK, ROD = 0.08, 0.3  # m
+A = np.array([0.0, 0.1, 0.12])  # m, hinge of the crank
+RATE = 6.0  # of the crank at the start, rad/s about x
+MASSES = {"crank": 0.12, "rod": 0.5, "slider": 2.0}  # kg
+INERTIAS = {"crank": (1e-4, 1e-4, 1e-5), "rod": (4e-4, 4e-3, 4e-3), "slider": (1e-4, 1e-4, 1e-4)}  # kg m^2
+
+
+def spatial_slider_crank() -> Problem:
+    """The mechanism with its crank upright at 6 rad/s, under its weight."""
+    x = np.array([1.0, 0.0, 0.0])
+    up = np.array([0.0, 0.0, CRANK])
+    B, B_v = A + up, np.cross(RATE * x, up)
+    C = np.array([math.sqrt(ROD**2 - B[1] ** 2 - B[2] ** 2), 0.0, 0.0])
+    rod = C - B
+    C_v = (rod @ B_v) / rod[0] * x
+    along = rod / ROD
+    cross = np.cross(along, x)  # the axis of the cross that is fixed to the rod stays perpendicular to the slider's x
+    cross /= np.linalg.norm(cross)
+    R = np.column_stack([along, cross, np.cross(along, cross)])
+    # spin = along x along' + w along, with w such that (spin x cross) . x = 0
+    turn = np.cross(rod, C_v - B_v) / ROD**2
+    normal = np.cross(cross, x)
+    spin = turn - (turn @ normal) / (along @ normal) * along
+    rows = SpatialBodies((0.0, 0.0, -GRAVITY))
+    crank = rows.body("crank", MASSES["crank"], INERTIAS["crank"], A + 0.5 * up, np.eye(3), 0.5 * B_v, RATE * x)
+    bar = rows.body("rod", MASSES["rod"], INERTIAS["rod"], 0.5 * (B + C), R, 0.5 * (B_v + C_v), spin)
+    slider = rows.body("slider", MASSES["slider"], INERTIAS["slider"], C, np.eye(3), C_v)
+    rows.revolute(crank, GROUND, A, x)
+    rows.spherical(bar, crank, B)
+    rows.universal(bar, slider, C, cross, x)
+    rows.prismatic(GROUND, slider, (0.0, 0.0, 0.0), x)
+    q0, v0 = rows.start
+    return Problem(
+        name="spatial slider-crank",
+        system=rows.system("spatial slider-crank"),
+        q0=q0,
+        v0=v0,
+        t_span=(0.0, 5.0),
+        energy=rows.energy,
+        parameters={"crank": CRANK, "rod": ROD, "A": tuple(A), "masses": MASSES, "inertias": INERTIAS},
+        note=(
+            "The cross of the joint at the slider is such that the rod starts with the angular velocity (1.92, -0.96, "
+            "0.48) rad/s of the benchmark."
+        ),
+        reference=computed("spatial slider-crank"),
+        source=(
+            "IFToMM library of benchmarks, spatial rigid slider-crank; jgerstmayr/EXUDYN, "
+            "TestModels/sliderCrank3Dbenchmark.py; Haug, Computer-Aided Kinematics and Dynamics (1989), Sect. 12.6"
+        ),
+        tags=("closed chain", "rigid", "spatial"),
+        purpose="A spatial loop with four kinds of joint and one degree of freedom, by Euler parameters.",
+        coordinates=rows.coordinates,
+    )
