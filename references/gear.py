@@ -22,7 +22,7 @@ from references.index1 import solve_index1
 from twoloop.caches import compile_kept, watch
 from twoloop.checks import check_positive, check_size, check_times
 from twoloop.consistency import check_start
-from twoloop.kernels.common import FUNCTIONS, INTEGERS, MATRIX
+from twoloop.kernels.common import INTEGERS, KIT, MATRIX, Kit
 from twoloop.kernels.linalg import lu_factor, lu_solve
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -52,7 +52,7 @@ _REASONS = {
 }
 NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # places in the counters
 _INTEGRATE = types.int64(
-    FUNCTIONS,
+    KIT,
     types.int64,
     MATRIX,
     MATRIX,
@@ -175,7 +175,7 @@ def solve_gear(
         called = time.monotonic()
         last = min(made + stride, n_steps)
         code = _integrate(
-            system.functions,
+            Kit(system.functions),
             system.n_q,
             given,
             past,

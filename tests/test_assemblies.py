@@ -6,7 +6,7 @@ import pytest
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 
-METHODS = ["SunRadau5", "Gauss12", "RadauIIA5", "Newmark", "BDF", "DOP853"]
+METHODS = ["SunRadau5", "Gauss12", "RadauIIA5", "Newmark", "BDF", "DOP853", "Adams"]
 CRANK, ROD, SPEED = 0.3, 1.0, 2.0 * np.pi
 
 

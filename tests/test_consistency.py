@@ -213,7 +213,7 @@ def test_a_projection_can_be_started_from_at_any_scale(unit):
 
 
 @pytest.mark.parametrize("unit", UNITS.values())
-@pytest.mark.parametrize("method", ["SunRadau5", "DOP853", "PaperIRK"])
+@pytest.mark.parametrize("method", ["SunRadau5", "DOP853", "Adams", "PaperIRK"])
 def test_every_state_of_a_run_is_a_start(unit, method):
     problem = four_bar((unit, 2.0 * unit, 1.5 * unit), 3.0 * unit)
     end = 2.0 * math.sqrt(unit)

@@ -35,7 +35,7 @@ def test_every_preset_solves_the_pendulum(method):
     assert violations(pendulum(), result)[0] < 1e-9
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "Newmark", "BDF", "DOP853"])
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "Newmark", "BDF", "DOP853", "Adams"])
 def test_a_smaller_tolerance_gives_a_smaller_error(default_four_bar, method):
     errors = [
         worst(run(default_four_bar, method=method, rtol=tol, atol=tol).q[:, -1], default_four_bar.reference.q)
@@ -127,7 +127,7 @@ def test_a_first_step_longer_than_the_span_is_cut():
     assert result.t[-1] == 1e-3
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853"])
+@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853", "Adams"])
 def test_max_step_is_respected(method):
     free = swing(method=method, rtol=1e-5, atol=1e-5)
     bound = 0.5 * free.h.max()

@@ -7,7 +7,7 @@ from tests.problems import G, pendulum, pendulum_state, worst
 from twoloop import ConstrainedSystem, Status, solve_dae
 
 START = ([-1.0, 0.0], [0.0, 0.0])
-METHODS = ["SunRadau5", "Gauss12", "RadauIIA5", "Newmark", "BDF", "DOP853"]
+METHODS = ["SunRadau5", "Gauss12", "RadauIIA5", "Newmark", "BDF", "DOP853", "Adams"]
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -104,5 +104,5 @@ class VectorizingCompiler(KernelCompiler):
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
     """The address of a compiled function; it takes arguments and reports errors as numba's functions do."""
-    compiled = function.get_compile_result(signature)
+    compiled: Any = function.get_compile_result(signature)
     return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

@@ -13,10 +13,9 @@ Array = NDArray[np.float64]
 # Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
-LARGEST_MOVE = 3e-7  # of a position, after which a projection is not repeated: C is then off by its square, 1e-13
+LARGEST_MOVE = 1e-13  # of a position, after which a projection is not repeated: velocities are then off by as much
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
-ROUNDING = 1e-13  # of a position in a projection
 LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them
 
 
@@ -48,11 +47,6 @@ def least_tolerance(rtol: float, atol: float) -> float:
 def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
     """Where the outer loop stops unless a method has its own rule."""
     return OUTER_TOL_FIXED if fixed else OUTER_SHARE * least_tolerance(rtol, atol)
-
-
-def largest_move(rtol: float, atol: float, fixed: bool) -> float:
-    """How far the last correction of a projection may move a position: about the error of a step."""
-    return ROUNDING if fixed else min(LARGEST_MOVE, max(min(rtol, atol), ROUNDING))
 
 
 class Method(Protocol):

@@ -7,7 +7,7 @@ from tests.general.knife_edge import multiplier
 from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism
 from tests.general.runs import relative_error, run
 
-METHODS = ("Gauss12", "DOP853")
+METHODS = ("Gauss12", "DOP853", "Adams")
 CONSERVATIVE = [name for name in REGULAR if mechanism.__wrapped__(name).energy is not None]
 both = pytest.mark.parametrize("method", METHODS)
 

@@ -84,7 +84,7 @@ def test_bars_in_line_force_another_partition_and_nothing_jumps(collinear_four_b
     assert worst(landed.q, trajectory(problem.parameters, times)[0]) < 1e-9
 
 
-@pytest.mark.parametrize("method", ["Newmark", "BDF", "DOP853", "Gauss8", "PaperIRK", "RadauIIA5"])
+@pytest.mark.parametrize("method", ["Newmark", "BDF", "DOP853", "Adams", "Gauss8", "PaperIRK", "RadauIIA5"])
 def test_every_method_passes_the_collinear_positions(collinear_four_bar, method):
     problem = collinear_four_bar
     tolerance = 1e-6

@@ -1,4 +1,4 @@
-"""A step of the Adams methods, orders 1 to 12, on the accelerations of all coordinates: predict, evaluate, correct, evaluate.
+"""A step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
 
 Variable order and step in modified divided differences of a, as Krogh's DVDQ and Shampine and Gordon's STEP have them,
 for second-order equations: positions are the double integral of the polynomial through the accelerations, velocities
@@ -6,8 +6,8 @@ the single one. The first evaluation stands where the prediction is, off the con
 on them. Differences are of all coordinates, so that a new partition needs no conversion.
 
 With t_n the times of the accepted steps, psi_i(n) = t_n - t_{n-i}, and i counted from 1 as in the literature:
-beta_i = prod_{j<i} psi_j(n+1) / psi_j(n), and on the step, s from 0 to 1, the polynomial through the last k accelerations
-is sum_i c_i(s) beta_i phi_i(n), c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1), psi_0 = 0.
+beta_i = prod_{j<i} psi_j(n+1) / psi_j(n), and on the step, s from 0 to 1, the polynomial through the last k
+accelerations is sum_i c_i(s) beta_i phi_i(n), c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1), psi_0 = 0.
 g_i = int c_i ds and G_i = int (1 - s) c_i ds give velocities and positions; all terms of these are positive.
 """
 
@@ -15,7 +15,6 @@ import numpy as np
 
 from twoloop.kernels.calls import evaluate_there, project
 from twoloop.kernels.common import ATOL, DEPARTURE, DONE, N_OUTER, RTOL, STEP, inlined, kernel, merged
-from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure, keep_predicted
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do

@@ -17,8 +17,8 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
-from twoloop.kernels.projection import accelerate_there, to_constraints
 from twoloop.kernels.partition import note_pattern, partition_of_midpoint, renew, write_programs
+from twoloop.kernels.projection import accelerate_there, to_constraints
 
 (
     EVALUATE,

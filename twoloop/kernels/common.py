@@ -88,7 +88,6 @@ class Work(NamedTuple):
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see below
 
-
     address: Any = 0  # of the table by which kernels find these arrays
     table: Any = None
 
@@ -163,10 +162,10 @@ def _type_of_work(value: Any, context: Any) -> Any:
 class Kit:
     """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
-    The latter two are compiled once, and not again in what calls them.
+    The latter two are compiled once, and not again in what calls them; None where they are not called.
     """
 
-    def __init__(self, functions: Any, inner: Any, step: Any):
+    def __init__(self, functions: Any, inner: Any = None, step: Any = None):
         self.functions, self.inner, self.step = functions, inner, step
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
@@ -254,9 +253,8 @@ _OPTIONS: dict[str, Any] = {
 
 def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     """A decorator for what kernels call; such a function must not be called from Python."""
-    return njit(
-        **_OPTIONS | options, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=HelperCompiler
-    )
+    wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return njit(**{**_OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
 # a helper whose floating-point operations keep their order; said outright, because a callee inherits its caller's flags

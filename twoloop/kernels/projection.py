@@ -3,7 +3,7 @@
 Where a step integrates all coordinates, a state is off the constraints by the error of the formula. The pass finds the
 accelerations there and moves positions and velocities to the nearest that the constraints allow, nearest in the metric
 of M, which does not depend on the partition. Positions are then good to the square of their correction, velocities and
-accelerations to the correction itself: a larger one than asked for is followed by another pass.
+accelerations to the correction itself: one that is not near rounding is followed by another pass.
 """
 
 import numpy as np
@@ -17,14 +17,17 @@ from twoloop.kernels.common import (
     KNOWN,
     N_INNER,
     REDUCED,
+    ROUNDED,
     compiled,
     merged,
 )
 from twoloop.kernels.constraints import constraint_rates, kinematics
 from twoloop.kernels.factors import columns_of, rows_of, solve
 from twoloop.kernels.finite import CONSTRAINT, not_finite
-from twoloop.kernels.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_rows, factor_dependent, tangents
+from twoloop.kernels.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_dependent, factor_rows, tangents
 from twoloop.kernels.linalg import ldl_solve
+
+ABOVE_ROUNDING = 100.0  # of positions: no correction is asked to be smaller
 
 
 @merged
@@ -139,6 +142,7 @@ def _by_multipliers(w, q, v):
 def to_constraints(f, w, t, q, v, theta, a, lam):
     """Accelerations and multipliers at (q, v), and q and v put on the constraints; without rows of A only."""
     before = np.inf
+    theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
     for _ in range(MAX_INNER):
         code = accelerate_there(f, w, t, q, v, a)
         if code != DONE:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, Signature, infer_getattr
 from numba.extending import NativeValue, lower_builtin, models, register_model, unbox
-from numba.core.imputils import lower_getattr_generic
 from numba.np.arrayobj import make_array, populate_array
 
 from twoloop.linking import machine_code
@@ -73,7 +73,8 @@ class Reference(types.Type):
             words[place] = array.ctypes.data
             words[place + 1 : place + 1 + kind.ndim] = array.shape
         for field, signature in self.functions.items():
-            words[self.places[field]] = machine_code(getattr(values, field), signature)
+            function = getattr(values, field)
+            words[self.places[field]] = 0 if function is None else machine_code(function, signature)
         return words
 
 
@@ -101,7 +102,7 @@ def _load(context: Any, builder: Any, pointer: Any, place: int, kind: Any) -> An
 class _Fields(AttributeTemplate):
     key = Reference
 
-    def generic_resolve(self, typ: Any, field: str) -> Any:
+    def generic_resolve(self, typ: Any, field: str) -> Any:  # type: ignore[override]
         if field not in typ.functions:
             return typ.arrays.get(field)
 
@@ -144,9 +145,7 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
         convention = context.call_conv
         kind = convention.get_function_type(signature.return_type, signature.args).as_pointer()
         function = _load(context, builder, args[0], place, kind)
-        status, value = convention.call_function(
-            builder, function, signature.return_type, signature.args, args[1:]
-        )
+        status, value = convention.call_function(builder, function, signature.return_type, signature.args, args[1:])
         with builder.if_then(status.is_error, likely=False):
             convention.return_status_propagate(builder, status)
         return value
