@@ -8,6 +8,7 @@ from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
+from twoloop.storage import load
 from twoloop.system import ConstrainedSystem
 
 __version__ = "0.1.0"
@@ -25,6 +26,7 @@ __all__ = [
     "Status",
     "callback",
     "consistent_state",
+    "load",
     "paper_irk",
     "paper_newmark",
     "solve_dae",

@@ -47,9 +47,9 @@ class BDF:
     Sect. 5 of the paper proposes BDF as further work and leaves its form open; all of it is chosen here. Modified
     divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
     Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
-    equidistant history of Shampine and Reichelt (1997) they need no interpolation when a step is shortened to an
-    output time. The order is that of the largest next step, as in VODE. Stability and error constants: Hairer,
-    Norsett and Wanner, Solving ODEs I (1993), chapter III.
+    equidistant history of Shampine and Reichelt (1997) they need no interpolation when the step size changes. The order
+    is that of the largest next step, as in VODE. Stability and error constants: Hairer, Norsett and Wanner, Solving
+    ODEs I (1993), chapter III.
     """
 
     max_order: int = 5
@@ -79,4 +79,5 @@ class BDF:
             np.zeros(kernels.memory_size(n_q)),
             exponent=1.0,  # the step returns the root of its error that belongs to its order
             safety=kernels.SAFETY,
+            apart=True,
         )

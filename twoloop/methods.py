@@ -15,6 +15,9 @@ from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
 ILL_CONDITIONED = 1e8  # eigenvectors of A, as in kernels/newton.py; one over it: an eigenvalue that counts as zero
 NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
+# highest order for which a step is divided into so many parts: with fewer the error between steps is more than a few
+# times that at the steps (four-bar linkage, tolerances of 1e-4 to 1e-12)
+PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
 NEWMARK_OUTER_SHARE = 1e-3  # of err_out; its fixed-point iterations converge so fast that this costs next to nothing
 
 
@@ -134,7 +137,7 @@ class RungeKutta:
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         if self.outer == "paper":
             plan = Plan(kernels.paper_step, options, memory, exponent)
-            return replace(plan, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0)
+            return replace(plan, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0, lands=True)
         step = kernels.runge_kutta_step
         if self.variables == "momenta":
             from twoloop.kernels import momenta
@@ -153,8 +156,14 @@ class RungeKutta:
             else:
                 memory = automatic.automatic_memory(memory.size, size, exponent, newton_exponent)
                 step, exponent, least_error = automatic.automatic_step, 1.0, LEAST_ERROR**exponent
-        symmetric = self.partition == "symmetric"
-        return Plan(step, options, memory, exponent, symmetric=symmetric, predictive=True, least_error=least_error)
+        plan = Plan(step, options, memory, exponent, predictive=True, least_error=least_error)
+        return replace(plan, symmetric=self.partition == "symmetric", parts=self._parts())
+
+    def _parts(self) -> int:
+        """Parts of a step whose states carry the solution between its ends to the accuracy of the method."""
+        if self.outer != "fixed-point":
+            return 1
+        return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
 
 
 @dataclass(frozen=True)
@@ -168,9 +177,10 @@ class Newmark:
         near 1/6, for which the error estimate vanishes, go with fixed steps only.
     error_tol : float, optional
         err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
-        error of a run goes with error_tol^(2/3). None: when the largest component of e / h, the error per unit step, is
-        at most r atol + rtol |v|, so that the error of a run is proportional to the tolerance; 1 / r is the shortest
-        time scale so far, on which velocities and accelerations change the coordinates.
+        error of a run goes with error_tol^(2/3); steps are shortened to end at output times. None: when the largest
+        component of e / h, the error per unit step, is at most r atol + rtol |v|, so that the error of a run is
+        proportional to the tolerance; 1 / r is the shortest time scale so far, on which velocities and accelerations
+        change the coordinates.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
     outer_tol : float, optional
@@ -230,6 +240,8 @@ class Newmark:
             exponent=1.0 / 2.0 if self.error_tol is None else 1.0 / 3.0,
             factor_min=0.5,
             limit_start=1.0 if self.error_tol is not None else np.inf,
+            lands=self.error_tol is not None,
+            apart=True,
         )
 
 
@@ -285,7 +297,7 @@ def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float 
     - The outer loop stops when y_i would change by less than err_out / 1000, relative to max(|y_i|, 1); it is given
       up when the differences grow.
     - Newton starts from the Taylor polynomial of the dependents, not from the last position.
-    - The partition is renewed as in `paper_irk`.
+    - The partition is renewed as in `paper_irk`; steps are shortened to end at output times, too.
 
     Parameters
     ----------

@@ -1,11 +1,13 @@
 """What a run returns: Result, Status, Statistics."""
 
-from collections.abc import Callable
+import os
 from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+
+from twoloop.dense import DenseSolution
 
 Array = NDArray[np.float64]
 
@@ -96,13 +98,14 @@ class Result:
     lam : ndarray (n_c + n_a, n_t)
         Multipliers [lam; mu] of M a + C_q^T lam + A^T mu = Q; of least norm where rows depend on one another.
     h : ndarray
-        Sizes of the accepted steps, s.
+        Sizes of the accepted steps, s; after a terminal event the last is the part of the step before it.
     status : Status
         0: reached the end; 1: an event; negative: failed.
     message : str
         What happened and, after a failure, what to try.
     stats : Statistics
-        Counts and CPU time.
+        Counts and CPU time. After a terminal event `n_accepted` counts the steps up to it, the rest the few behind it,
+        too. What is evaluated between steps is in `cpu_time` alone, and not at all where `sol` does it.
     rejected_error, rejected_convergence : ndarray of int (n_accepted,) or None
         Attempts that failed the error test, and those whose loops did not converge, between the acceptance of the step
         before (or the start) and that of this one. Those after the last accepted step of a failed run are in `stats`
@@ -114,8 +117,11 @@ class Result:
         Rank of the constraints C_q and A at the start. None where a foreign solver does not tell.
     redundant : ndarray of int or None
         Rows of C_q and A, counted as in `lam`, that depended on the others at the start and were left out.
-    sol, t_events
-        None: dense output and events are not available yet.
+    sol : DenseSolution or None
+        With `dense_output=True`: `sol(t)` is the state at any time of the run.
+    t_events, q_events, v_events : list of ndarray or None
+        For each event function the times (n_events,) of its events, and coordinates and velocities (n_events, n_q)
+        there. None: no events were asked for.
     """
 
     t: Array
@@ -132,13 +138,30 @@ class Result:
     partitioned: NDArray[np.int64] | None = None
     rank: int | None = None
     redundant: NDArray[np.int64] | None = None
-    sol: Callable[[float], Array] | None = None
+    sol: DenseSolution | None = None
     t_events: list[Array] | None = None
+    q_events: list[Array] | None = None
+    v_events: list[Array] | None = None
 
     @property
     def success(self) -> bool:
         """Whether the run reached its end or an event."""
         return self.status >= 0
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to a file, as NumPy's npz without pickle; `twoloop.load` reads it.
+
+        The file takes 8 (1 + 3 n_q + n_c + n_a) bytes for each time of `t`. A dense solution takes 8 (2 + 3 n_q) more
+        for each step, and 8 (1 + 3 n_q) for each state within steps, of methods that need these (see `DenseSolution`).
+
+        Parameters
+        ----------
+        path : str or path
+            Where to; a file there is replaced.
+        """
+        from twoloop.storage import save
+
+        save(self, path)
 
     def __repr__(self) -> str:
         known = {f.name: getattr(self.stats, f.name) for f in fields(self.stats)}

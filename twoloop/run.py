@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
+from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
-from twoloop.kernels import common
-from twoloop.kernels.banded import banded_pays
-from twoloop.kernels.lapack import addresses
-from twoloop.kernels.layout import make_work
+from twoloop.kernels import common, intervals
 from twoloop.plan import Plan, least_tolerance
+from twoloop.recorder import Recorder, Wanted
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
+from twoloop.workspace import kit_of, workspace
 
 Array = NDArray[np.float64]
 
@@ -25,16 +25,14 @@ BUFFER_STEPS = 4096
 FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
 FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
 SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
+CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
-GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
 STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
 STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
-SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
-ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 # of the longest of the last steps: lengths tried for a step across a singular position, on which no stage should fall
 BRIDGES = tuple(0.85**k for k in range(28))
 CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
@@ -61,28 +59,17 @@ class Run:
         rtol: float,
         atol: Array,
         step_size: float | None,
+        interior: Plan | None = None,
     ):
-        from twoloop.kernels import advance
-        from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
+        from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
 
         self.a = advance
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
-        self.rtol, self.reuse = rtol, plan.reuse
-        flags = system.functions.flags.copy()
-        if system.constant_mass:
-            mass = system.mass(t0, q0)
-            flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+        self.rtol, self.reuse, self.interior = rtol, plan.reuse, interior
+        self.kit = kit_of(system, t0, q0, plan.step)
+        self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
-        definite = bool(
-            np.linalg.eigvalsh(system.mass(t0, q0)).min() > SINGULAR_MASS * np.abs(system.mass(t0, q0)).max()
-        )
-        flags[common.REDUCED] = not definite or system.n_q <= 2 * n_rows
-        bandwidth = system.bandwidth if definite and system.n_a == 0 else None
-        if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
-            flags[common.BANDWIDTH], flags[common.REDUCED] = bandwidth, 0
-        self.functions = system.functions._replace(flags=flags)
-        self.kit = common.Kit(self.functions, inner_loop, plan.step)
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         self.pattern = pattern_of(system, t0, q0)
         self.work = self._workspace()
@@ -116,17 +103,8 @@ class Run:
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
-        system = self.system
-        reduced = bool(self.functions.flags[common.REDUCED])
-        work = make_work(system.n_q, system.n_c, system.n_a, rank, rank_v, reduced)
-        work.notes[common.GAMMA_REQUIRED] = max(self.rtol, GAMMA_ACCURACY)
-        work.notes[common.GAMMA_SHARE] = 1.0
-        work.notes[common.ROUNDED] = ROUNDING * float(np.abs(self.state[: system.n_q]).max())
-        work.notes[common.REUSE] = max(self.reuse, work.notes[common.ROUNDED])
-        work.pattern[:] = self.pattern
-        if self.functions.flags[common.BANDWIDTH] >= 0:
-            work.lapack[:] = addresses()
-        return work
+        q0 = self.state[: self.system.n_q]
+        return workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
 
     def _begin(self) -> None:
         code = self.a.start(self.kit, self.work, self.t0, self.state)
@@ -203,21 +181,19 @@ class Run:
             scales.append(v / a)
         return FIRST_STEP * min(scales)
 
-    def go(
-        self, t1: float, times: Array | None, report: Any, time_limit: float | None, check_derivatives: bool
-    ) -> Result:
+    def go(self, t1: float, wanted: Wanted, report: Any, time_limit: float | None, check_derivatives: bool) -> Result:
         """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
         deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         a, system = self.a, self.system
-        every_step = times is None
-        outputs = np.array([t1]) if times is None else np.append(times[times > self.t0], t1)
-        if len(outputs) > 1 and outputs[-2] == t1:
-            outputs = outputs[:-1]
-        self.control[a.STORE_ALL] = every_step
-        first_row = every_step or (times is not None and times[0] == self.t0)
-        t_parts = [np.array([self.t0])] if first_row else []
-        rows = [self.state.copy()[None, :]] if first_row else []
-        step_parts = [np.array([[0.0, 0.0, 0.0, 1.0]])]  # the first partition of a run is not a renewal
+        recorder = self._recorder(wanted)
+        outputs = np.array([t1])
+        if wanted.times is not None and wanted.lands:
+            outputs = np.append(wanted.times[(wanted.times > self.t0) & (wanted.times < t1)], t1)
+        self.control[a.STORE_ALL] = wanted.every_step
+        largest_chunk = float(BUFFER_STEPS)
+        if any(event.terminal < np.inf for event in wanted.events or []):
+            largest_chunk = self.control[a.MAX_ATTEMPTS] = CHUNK_TO_EVENT
+        step_parts = [np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])]  # the first partition of a run is not a renewal
         out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
         out_state = np.empty((BUFFER_ROWS, len(self.state)))
         filled = np.zeros(2, dtype=np.int64)
@@ -225,9 +201,11 @@ class Run:
         cpu = 0.0
         code = a.PAUSED
         plan, control, kit = self.plan, self.control, self.kit
+        raised: Exception | None = None
         while code == a.PAUSED:
             filled[:] = 0
             began = time.process_time()
+            across = plan is not self.plan
             try:
                 code = a.advance(
                     kit,
@@ -247,13 +225,16 @@ class Run:
                 )
             except KeyboardInterrupt:
                 code = INTERRUPTED
+            except Exception as error:  # of a callback; beyond a terminal event it does not matter
+                code, raised = INTERRUPTED, error
             spent = time.process_time() - began
-            cpu += spent
-            t_parts.append(out_t[: filled[0]].copy())
-            rows.append(out_state[: filled[0]].copy())
             step_parts.append(out_steps[: filled[1]].copy())
+            recorder.add(out_t[: filled[0]], out_state[: filled[0]], self._kinds(step_parts[-1], across))
+            cpu += time.process_time() - began
+            if recorder.ended is not None:
+                break
             if spent < CHUNK_TIME:
-                self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], BUFFER_STEPS)
+                self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
             limited = self.control[a.MAX_STEPS] < np.inf
             if pace.stagnates(self.clock[a.T], out_steps[: filled[1], a.H], t1) and code == a.PAUSED and not limited:
                 code = STAGNATED
@@ -267,16 +248,28 @@ class Run:
                 plan, control, code = self._beyond(plan, control, code, int(filled[1]))
                 kit = self.kit if plan is self.plan else kit
             report(self.clock[a.T])
-        t = np.concatenate(t_parts)
-        table = np.concatenate(rows)
-        if times is not None and times[-1] != t1 and len(t) > 0 and t[-1] == t1:
-            t, table = t[:-1], table[:-1]
+        began = time.process_time()
+        recorder.finish()
+        cpu += time.process_time() - began
+        if raised is not None and recorder.ended is None:
+            raise raised
+        t, table = recorder.output()
+        steps, statistics = np.concatenate(step_parts), self._statistics(cpu)
+        if recorder.ended is not None:
+            event, end = recorder.ended
+            steps = steps[: recorder.n_steps + 1]
+            if recorder.n_steps > 0:
+                steps[-1, a.H] = recorder.last_step
+            status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
+        else:
+            status, message = self._outcome(code, t1, pace)
         n = system.n_q
-        steps = np.concatenate(step_parts)
-        errors, failures, partitions = np.diff(steps[:, a.ERRORS :], axis=0).astype(np.int64).T
-        status, message = self._outcome(code, t1, pace)
         if check_derivatives and code != INTERRUPTED:
-            status, message = self._check_again(t, table, status, message)
+            last = (float(self.clock[a.T]), self.state) if recorder.ended is None else (float(t[-1]), table[-1])
+            status, message = self._check_again(t, table, last, status, message)
+        errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
+        t_events, q_events, v_events = recorder.events()
         return Result(
             t=t,
             q=table[:, :n].T,
@@ -286,13 +279,33 @@ class Run:
             h=steps[1:, a.H],
             status=status,
             message=message,
-            stats=self._statistics(cpu),
+            stats=statistics,
             rank=self.rank,
             redundant=self.redundant,
             rejected_error=errors,
             rejected_convergence=failures,
             partitioned=partitions,
+            sol=recorder.solution(),
+            t_events=t_events,
+            q_events=q_events,
+            v_events=v_events,
         )
+
+    def _recorder(self, wanted: Wanted) -> Recorder:
+        """What takes the states; where some are to lie between steps, with what finds them."""
+        n, interpolator = self.system.n_q, None
+        if wanted.between_steps:
+            ranks = (len(self.work.rows), len(self.work.rows_v))
+            interpolator = Interpolator(self.system, self.t0, self.state[: 3 * n], self.rtol, ranks, self.interior)
+        return Recorder(wanted, interpolator, n, self.t0, self.state)
+
+    def _kinds(self, steps: Array, across: bool) -> NDArray[np.int64]:
+        """What kind of interval each of these accepted steps is, for the solution between them."""
+        if across:
+            return np.full(len(steps), intervals.ACROSS)
+        if self.plan.apart:
+            return np.full(len(steps), intervals.APART)
+        return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, intervals.ACCELERATIONS)
 
     def _bridge(self) -> tuple[Plan, Array]:
         """The plan and the controls for steps across a singular position, see kernels/bridge.py."""
@@ -437,12 +450,14 @@ class Run:
         ratio, words = least_inertia(self.system, t, q)
         return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
-    def _check_again(self, t: Array, table: Array, status: Status, message: str) -> tuple[Status, str]:
+    def _check_again(
+        self, t: Array, table: Array, last: tuple[float, Array], status: Status, message: str
+    ) -> tuple[Status, str]:
         """Status and message, unless a derivative is wrong where the run went."""
         n = self.system.n_q
         inner = np.arange(1, LATER_CHECKS + 1) * len(t) // (LATER_CHECKS + 1)
         states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in np.unique(inner) if 0 < k < len(t)]
-        states.append((float(self.clock[self.a.T]), self.state[:n], self.state[n : 2 * n]))
+        states.append((last[0], last[1][:n], last[1][n : 2 * n]))
         for instant, q, v in states:
             wrong = wrong_derivative(self.system, instant, q, v)
             if wrong is not None:

@@ -20,8 +20,10 @@ from twoloop.checks import (
     shown,
 )
 from twoloop.consistency import check_start, check_system
+from twoloop.events import check_events
 from twoloop.methods import PRESETS
 from twoloop.plan import Method
+from twoloop.recorder import Wanted
 from twoloop.result import Result
 from twoloop.run import Run
 from twoloop.system import ConstrainedSystem
@@ -78,8 +80,9 @@ def solve_dae(
         as an error, too, and must not exceed about a tenth of the motion in the step: so a step cannot end on another
         assembly of the mechanism.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution; steps are shortened to land on them. None: every
-        accepted step is stored.
+        Increasing times in t_span at which to store the solution, interpolated between the steps as by `sol`: these are
+        the same with and without. None: every accepted step is stored. With `step_size`, and the two methods of the
+        paper, nothing is interpolated: steps are shortened to land on the times.
     first_step : float, optional
         First step to try, s. None: chosen from the velocities and accelerations at the start.
     max_step : float
@@ -90,8 +93,15 @@ def solve_dae(
     step_size : float, optional
         Constant step, s: no error control; only the last step is shortened, to end at t_span[1]. Times in `t_eval`
         must then be multiples of it. A step that does not converge ends the run.
-    dense_output, events
-        Not available yet.
+    dense_output : bool
+        Whether to keep what `result.sol(t)` needs, the state at any time t of the run (see `DenseSolution`).
+    events : callable or list of callables, optional
+        Functions event(t, q, v) -> float, plain or compiled by numba, whose zeros are looked for, by the rules of
+        SciPy's `solve_ivp`: an attribute `terminal`, True or a number of occurrences, ends the run there; an
+        attribute `direction`, 1 or -1, lets only zeros count at which the value rises or falls. The sign is looked at
+        four times a step: two zeros closer than a quarter of a step, and one without a change of sign, are missed;
+        `max_step` helps. A zero at the start counts. The time of an event is found to rounding of the dense solution.
+        Other than terminal events leave the steps as they are.
     progress : bool, optional
         True: show a bar (needs the package rich).
     time_limit : float, optional
@@ -109,16 +119,12 @@ def solve_dae(
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong: before any work, naming it. An exception of a Python callback comes through
-        unchanged, with a note that says which callback and at what time.
-    NotImplementedError
-        If `dense_output` or `events` is asked for.
+        If an argument is wrong: before any work, naming it. An exception of a Python callback or an event comes
+        through unchanged, with a note that says which and at what time; so does what is wrong with an event's value.
     """
     check_system(system)
-    if check_flag("dense_output", dense_output):
-        raise NotImplementedError("dense_output is not available yet; use t_eval to get the solution at given times")
-    if events is not None:
-        raise NotImplementedError("events are not available yet; search the stored solution (t_eval) instead")
+    check_flag("dense_output", dense_output)
+    event_functions = None if events is None else check_events(events)
     if progress is not None:
         check_flag("progress", progress)
     check_flag("check_derivatives", check_derivatives)
@@ -155,13 +161,15 @@ def solve_dae(
     check_start(system, t0, q0, v0, derivatives=check_derivatives)
 
     plan = method.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-    run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size)
+    interior = method.plan(system.n_q, float(rtol), float(atol.min()), True) if plan.parts > 1 else None
+    run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interior)
     if step_size is None:
         run.set_sizes(first_step, float(max_step), t1)
     if max_steps is not None:
         run.control[run.a.MAX_STEPS] = max_steps
     with _progress_bar(progress, method.name, t0, t1) as report:
-        return run.go(t1, times, report, time_limit, check_derivatives)
+        wanted = Wanted(times, plan.lands or step_size is not None, bool(dense_output), event_functions)
+        return run.go(t1, wanted, report, time_limit, check_derivatives)
 
 
 def _check_method(method: str | Method) -> Method:

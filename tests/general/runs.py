@@ -8,7 +8,7 @@ import numpy as np
 from tests.general.mechanisms import mechanism
 from twoloop import ConstraintWarning, solve_dae
 
-TOLERANCE = 1e-10
+TOLERANCE = 5e-11
 
 
 @cache

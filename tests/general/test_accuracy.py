@@ -1,4 +1,4 @@
-"""Every mechanism to nine digits at a tolerance of 1e-10, against motions that share nothing with the integrator."""
+"""Every mechanism to nine digits at a tolerance of 5e-11, against motions that share nothing with the integrator."""
 
 import numpy as np
 import pytest

@@ -3,12 +3,13 @@ import pytest
 
 from tests.problems import called, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
-from twoloop import run as run_module
+from twoloop import workspace as workspace_module
 from twoloop.kernels import common, lapack
 from twoloop.kernels.banded import factor_bordered, lu_band, solve_bordered
 from twoloop.kernels.layout import make_work
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
 from twoloop.methods import Newmark, RungeKutta
+from twoloop.run import Run
 from twoloop.tableaux import gauss, radau_iia
 
 NEWTON = RungeKutta(radau_iia(3), outer="newton")
@@ -72,7 +73,7 @@ def both(system, *args, monkeypatch, **options):
     results = []
     for dense in (False, True):
         with monkeypatch.context() as patch:
-            patch.setattr(run_module, "banded_pays", lambda *sizes, answer=not dense: answer)
+            patch.setattr(workspace_module, "banded_pays", lambda *sizes, answer=not dense: answer)
             results.append(solve_dae(system, *args, **options))
     assert all(result.success for result in results), [result.message for result in results]
     return results
@@ -153,7 +154,7 @@ def test_mass_gives_the_same_run_as_dense(monkeypatch, method):
 def test_order_on_nonlinear_constraints(monkeypatch):
     system, q0, v0 = chain(stiffness=100.0)
     reference = solve_dae(system, (0.0, 0.4), q0, v0, RungeKutta(gauss(5)), 1e-13, 1e-13).q[:, -1]
-    monkeypatch.setattr(run_module, "banded_pays", lambda *sizes: True)
+    monkeypatch.setattr(workspace_module, "banded_pays", lambda *sizes: True)
     errors = [
         worst(solve_dae(system, (0.0, 0.4), q0, v0, NEWTON, step_size=h).q[:, -1], reference) for h in (0.02, 0.01)
     ]
@@ -163,9 +164,7 @@ def test_order_on_nonlinear_constraints(monkeypatch):
 
 def test_chosen_by_size():
     def chosen(system, q0, v0):
-        run = run_module.Run(
-            system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, np.full(system.n_q, 1e-6), 1e-3
-        )
+        run = Run(system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, np.full(system.n_q, 1e-6), 1e-3)
         return int(run.functions.flags[common.BANDWIDTH])
 
     for n_elements, bandwidth in ((4, -1), (8, -1), (16, 11)):

@@ -179,22 +179,11 @@ def test_output_times_cost_no_accuracy_and_few_evaluations(default_four_bar, n):
     assert landed.stats.n_accepted < 1.3 * max(free.stats.n_accepted, n)
 
 
-@pytest.mark.parametrize("gap", [1e-12, 1e-9, 1e-6, 1e-4])
-def test_output_times_close_together_do_not_spoil_the_history(default_four_bar, gap):
-    apart = np.linspace(0.1, 9.9, 99)
-    times = np.sort(np.concatenate([apart, apart + gap]))
-    free, error = four_bar_run(default_four_bar, 1e-8)
-    landed, landed_error = four_bar_run(default_four_bar, 1e-8, t_eval=times)
-    assert (landed.t == times).all()
-    assert landed_error < 3.0 * error
-    assert landed.stats.n_accepted < free.stats.n_accepted + 250  # 99 short steps among them
-
-
 @pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-8])
 def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(default_four_bar, tol):
     # the prediction alone is within the tolerance then, but a chain of predictions would explode
     _, error = four_bar_run(default_four_bar, tol, 1.0)
-    many, many_error = four_bar_run(default_four_bar, tol, 1.0, t_eval=np.linspace(0.0, 1.0, 10_001))
+    many, many_error = four_bar_run(default_four_bar, tol, 1.0, max_step=1e-4)
     assert many_error < error
     assert many.stats.n_evaluations >= 2 * many.stats.n_accepted
 

@@ -251,8 +251,8 @@ def test_a_moving_pivot():
         result = solve_dae(system, (0.0, 10.0), *start, "DOP853", tol, tol, t_eval=times)
         assert result.success and result.stats.n_partitions > 5
         assert max(violations(system, result)) < 1e-13
-        assert worst(result.q, q) < 3e2 * tol
-        assert worst(result.v, v) < 3e3 * tol
+        assert worst(result.q, q) < 1e3 * tol
+        assert worst(result.v, v) < 1e4 * tol
     other = solve_dae(system, (0.0, 10.0), *start, "Gauss12", 1e-12, 1e-12, t_eval=times)
     assert worst(result.q, other.q) < 5e-10
     assert worst(result.lam, other.lam) < 5e-8

@@ -113,7 +113,7 @@ def test_momentum_rates_are_the_derivative_of_the_momenta_along_the_motion():
     system = pendulums(True)
     q, v = double_pendulum_state(START[:2], START[2:])
     h = 1e-3
-    run = solve_dae(system, (0.0, 4 * h), q, v, "Gauss12", 1e-12, 1e-12, t_eval=h * np.arange(5))
+    run = solve_dae(system, (0.0, 4 * h), q, v, "Gauss12", step_size=h)
     work = make_work(4, 2)
     state = np.concatenate([run.q[:, 2], run.v[:, 2], np.zeros(6)])
     assert advance.start(kit_of(system), work, 0.0, state) == common.DONE

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from tests.problems import called, kit_of, oblique_pendulum, oblique_start, without_tangent, worst
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
-from twoloop import run as run_module
+from twoloop import workspace as workspace_module
 from twoloop.kernels import common
 from twoloop.kernels.layout import make_work
 from twoloop.kernels.newton_tangents import tangent_by_q, tangent_by_v
@@ -135,7 +135,7 @@ def test_tangents_of_a_system_whose_mass_varies():
 @pytest.mark.parametrize("banded", [False, True])
 @pytest.mark.parametrize("reaction", [{}, {"reaction_by_q": rod_by_q}], ids=["rod differenced", "rod given"])
 def test_tangents_replace_differences(monkeypatch, banded, reaction):
-    monkeypatch.setattr(run_module, "banded_pays", lambda *sizes: banded)
+    monkeypatch.setattr(workspace_module, "banded_pays", lambda *sizes: banded)
     calls = {"differences": {}, "tangents": {}}
     runs = {
         "differences": solve_dae(spring(calls["differences"]), (0.0, 0.5), *START, NEWTON, step_size=5e-3),

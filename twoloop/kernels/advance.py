@@ -23,6 +23,7 @@ from twoloop.kernels.common import (
     KIT,
     MATRIX,
     N_ACCEPTED,
+    N_JACOBIANS,
     N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
@@ -84,7 +85,7 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
 ) = range(18)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far
-H, ERRORS, FAILURES, PARTITIONS, N_STEP_COLUMNS = range(5)
+H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # places in `clock`, carried from call to call
 (
@@ -272,6 +273,7 @@ def advance(
         out_steps[filled[1], ERRORS] = w.counters[N_REJECTED_ERROR]
         out_steps[filled[1], FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
         out_steps[filled[1], PARTITIONS] = w.counters[N_PARTITIONS]
+        out_steps[filled[1], JACOBIANS] = w.counters[N_JACOBIANS]
         filled[1] += 1
         if lands or control[STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[T]

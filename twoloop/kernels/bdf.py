@@ -25,24 +25,20 @@ BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; wi
 NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
 HOLD = 1.2  # a step that could grow by less keeps its size
 GROWTH = 2.0  # the most by which a step grows
-SHORT = 0.03  # a step of less than this share of the last, between close output times, stays out of the history
 
 # places in `options`: scalars, then the parameter block of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
 # places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
 (
     LAST_ACCEPTED,  # set by advance() after every attempt
-    TRIAL,  # what the last attempt left: NOTHING, HISTORY or AHEAD
+    HAS_TRIAL,  # whether the last attempt left differences at its end
     ORDER,
     DEPTH,  # the highest difference there is
     AGE,  # accepted steps since the order changed or the error test failed
-    LEAD,  # how far the state is ahead of the history, s
     NEXT_ORDER,
     NEXT_DEPTH,
-    NEXT_LEAD,
     N_MEMORY_SCALARS,
-) = range(10)
-NOTHING, HISTORY, AHEAD = range(3)
+) = range(8)
 # rows of coefficients: times since the points of the history, from its last point and from the end of the step; the
 # error constants of orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
@@ -80,16 +76,13 @@ def _blocks(memory, n):
 @compiled
 def _take_over(memory, differences, trial):
     """Make the trial differences the history, if the last attempt was accepted."""
-    left = memory[TRIAL]
-    memory[TRIAL] = NOTHING
-    if left == NOTHING:
+    left = memory[HAS_TRIAL]
+    memory[HAS_TRIAL] = 0.0
+    if left == 0.0:
         return
     if memory[LAST_ACCEPTED] == 0.0:
         memory[ORDER] = memory[NEXT_ORDER]
         memory[AGE] = 0.0
-        return
-    memory[LEAD] = memory[NEXT_LEAD]
-    if left == AHEAD:
         return
     for j in range(int(memory[NEXT_DEPTH]) + 1):
         copy(trial[j], differences[j])
@@ -275,17 +268,15 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     y, y1 = state[: 2 * n], new_state[: 2 * n]
     differences, trial, prediction, rate, scratch = _blocks(memory, n)
     fixed = tolerances[ESTIMATE] == 0.0
-    after_accepted = memory[LAST_ACCEPTED] == 1.0  # a step that is short after a rejection is no landing
     _take_over(memory, differences, trial)
     if memory[DEPTH] == 0.0:
         _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
     k = int(memory[ORDER])
-    length = memory[LEAD] + h
-    _predict(memory, differences, trial, length, prediction, rate)
+    _predict(memory, differences, trial, h, prediction, rate)
     if fixed and k < options[HIGHEST]:
         code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
     else:
-        code = _correct(f, w, options, t + h, length, k, prediction, rate, new_state, scratch[:n])
+        code = _correct(f, w, options, t + h, h, k, prediction, rate, new_state, scratch[:n])
     if code != DONE:
         return code, np.inf
     d = prediction
@@ -296,12 +287,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[NEXT_ORDER] = min(k + 1, int(options[HIGHEST]))
     else:
         error = _judge(options, memory, tolerances, trial, y, y1, d)
-        error = max(error, departure(w, tolerances, length, y[:n], y[n:], y1[:n]))
-    if after_accepted and length < SHORT * _coefficients(memory, SPANS)[0]:
-        memory[TRIAL] = AHEAD
-        memory[NEXT_LEAD] = length
-    else:
-        memory[TRIAL] = HISTORY
-        memory[NEXT_LEAD] = 0.0
-        _extend(memory, trial, y1, d)
+        error = max(error, departure(w, tolerances, h, y[:n], y[n:], y1[:n]))
+    memory[HAS_TRIAL] = 1.0
+    _extend(memory, trial, y1, d)
     return DONE, error

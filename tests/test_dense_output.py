@@ -1,0 +1,271 @@
+"""result.sol: between the steps as good as at them, and on the constraints."""
+
+import copy
+import pickle
+import warnings
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.general.mechanisms import mechanism
+from tests.problems import force_residual, pendulum, pendulum_state, run, swing, violations, worst
+from twoloop import RungeKutta, Status, solve_dae
+from twoloop.mechanisms import moderately_stiff_beam
+from twoloop.methods import PRESETS
+from twoloop.tableaux import gauss, lobatto_iiie
+
+END = 2.0
+LOOSE = ("Newmark", "BDF", "PaperIRK", "PaperNewmark")  # steps without number at tight tolerances
+INNER = (0.1, 0.3, 0.5, 0.7, 0.9)
+
+
+@pytest.fixture(scope="module")
+def exact(default_four_bar):
+    """The motion from a run of far more steps than its tolerance asks for."""
+    return run(default_four_bar, END, method="DOP853", rtol=1e-13, atol=1e-13, max_step=4e-3, dense_output=True).sol
+
+
+def between(result, parts=INNER):
+    """Times within every step."""
+    return np.concatenate([result.t[:-1] + part * np.diff(result.t) for part in parts])
+
+
+def errors(result, exact):
+    """Errors of q and v at the steps, and between them."""
+    t, inner = result.t[1:], between(result)
+    at_steps, within = exact(t), result.sol(inner)
+    known = exact(inner)
+    return (
+        (worst(result.q[:, 1:], at_steps.q), worst(within.q, known.q)),
+        (worst(result.v[:, 1:], at_steps.v), worst(within.v, known.v)),
+    )
+
+
+@pytest.mark.parametrize("tol", [1e-4, 1e-8, 1e-12])
+@pytest.mark.parametrize("method", PRESETS)
+def test_between_the_steps_as_good_as_at_them(default_four_bar, exact, method, tol):
+    if tol < 1e-5 and method in LOOSE:
+        tol = 1e-6
+    result = run(default_four_bar, END, method=method, rtol=tol, atol=tol, dense_output=True)
+    (at_q, between_q), (at_v, between_v) = errors(result, exact)
+    # where extrapolation makes steps far better than their tolerance asks for, what lies between them may be less so
+    assert between_q < max(3.0 * at_q, 0.01 * tol) + 1e-13
+    assert between_v < max(3.0 * at_v, 0.5 * tol * np.abs(result.v).max()) + 2e-11
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "h"),
+    [
+        ("SunRadau5", 5, 0.02),
+        ("Gauss4", 4, 0.02),
+        ("Gauss6", 6, 0.02),
+        ("Gauss8", 8, 0.04),
+        ("Gauss10", 10, 0.04),
+        ("Gauss12", 12, 0.04),
+        (RungeKutta(lobatto_iiie(3)), 4, 0.02),
+        (RungeKutta(gauss(3), variables="momenta", partition="symmetric"), 6, 0.02),
+        ("RadauIIA5", 5, 0.01),
+        ("Newmark", 2, 0.01),
+        ("BDF", 5, 0.005),
+        ("DOP853", 8, 0.04),
+        ("PaperIRK", 5, 0.02),
+        ("PaperNewmark", 2, 0.01),
+    ],
+)
+def test_order_between_the_steps(default_four_bar, exact, method, order, h):
+    found = []
+    for step in (h, 0.5 * h):
+        result = run(default_four_bar, 0.8, method=method, step_size=step, dense_output=True)
+        assert result.success
+        (_, in_q), (_, in_v) = errors(result, exact)
+        found.append((in_q, in_v))
+    rates = np.log2(np.array(found[0]) / np.array(found[1]))
+    assert (rates > order - 0.5).all(), rates
+
+
+def test_on_the_constraints_at_ten_thousand_times(default_four_bar):
+    result = run(default_four_bar, 10.0, rtol=1e-6, atol=1e-6, dense_output=True)
+    position, velocity = violations(default_four_bar.system, result.sol(np.linspace(0.0, 10.0, 10_001)))
+    assert position < 1e-14
+    assert velocity < 1e-13
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "BDF", "RadauIIA5"])
+def test_at_a_step_the_state_is_the_one_stored(default_four_bar, method):
+    result = run(default_four_bar, 1.0, method=method, dense_output=True)
+    state = result.sol(result.t)
+    assert (state.q == result.q).all() and (state.v == result.v).all()
+    assert worst(state.a, result.a) < 1e-11 and worst(state.lam, result.lam) < 1e-11
+
+
+def test_accelerations_and_multipliers_belong_to_the_state(default_four_bar):
+    result = run(default_four_bar, 1.0, dense_output=True)
+    state = result.sol(between(result))
+    assert force_residual(default_four_bar.system, state) < 1e-11
+    assert state.a.shape == state.q.shape
+    assert state.lam.shape == (8, state.t.size)
+
+
+@pytest.mark.parametrize("tol", [1e-4, 1e-10])
+def test_gamma_by_differences(tol):
+    """Accelerations between steps of a system without gamma are as good as with it."""
+    t = np.linspace(0.0, 1.0, 21)
+    with_it, without = (
+        swing(1.0, system=pendulum(gamma=given), rtol=tol, atol=tol, dense_output=True).sol(t)
+        for given in (True, False)
+    )
+    assert worst(without.a, with_it.a) < max(1e-8, 100.0 * tol)
+    assert force_residual(pendulum(), without) < 1e-9
+
+
+def test_a_run_has_the_same_steps_with_and_without(default_four_bar):
+    with_it, without = run(default_four_bar, 2.0, dense_output=True), run(default_four_bar, 2.0)
+    assert (with_it.q == without.q).all()
+    assert with_it.stats.n_evaluations == without.stats.n_evaluations
+    assert without.sol is None
+
+
+@given(st.lists(st.floats(0.0, 1.5), min_size=1, max_size=12))
+def test_times_in_any_order_one_by_one_or_together(times):
+    sol = _swing()
+    together = sol(times)
+    assert together.q.shape == (2, len(times))
+    for k, t in enumerate(times):
+        alone = sol(t)
+        assert alone.q.shape == alone.v.shape == alone.a.shape == (2,)
+        assert alone.lam.shape == (1,)
+        assert worst(alone.q, together.q[:, k]) < 1e-15
+        assert worst(alone.v, together.v[:, k]) < 1e-15
+        assert worst(alone.q, pendulum_state(t)[0]) < 1e-6
+
+
+@cache
+def _swing():
+    return swing(1.5, system=pendulum(compile=True), dense_output=True).sol
+
+
+@pytest.mark.parametrize(
+    ("t", "error", "words"),
+    [
+        (-1e-9, ValueError, r"t must lie within the run, from 0.0 to 1.5; given -1e-09"),
+        ([0.1, 2.0], ValueError, r"from 0.0 to 1.5; given 2.0"),
+        (np.nan, ValueError, "must lie within the run.*given nan"),
+        ([[0.1]], ValueError, r"t must be a number or have shape \(n,\); given shape \(1, 1\)"),
+        ("now", TypeError, "t must be an array of real numbers"),
+        (True, TypeError, "t must be an array of real numbers"),
+        (None, TypeError, "t must be an array of real numbers"),
+    ],
+)
+def test_wrong_times(t, error, words):
+    with pytest.raises(error, match=words):
+        _swing()(t)
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "RadauIIA5"])
+@pytest.mark.parametrize(
+    "name", ["redundant slider-crank", "massless coordinate", "knife edge", "pendulum on a driven crank", "planet"]
+)
+def test_other_mechanisms(name, method):
+    """Redundant rows, a singular mass, non-holonomic rows, a drive, and no constraints at all."""
+    m = mechanism(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of redundant rows
+        result = solve_dae(m.system(), (0.0, 1.0), *m.start, method, dense_output=True, check_derivatives=False)
+    at_steps = max(worst(result.q[:, k], m.state(result.t[k])[0]) for k in range(1, result.t.size))
+    t = np.linspace(0.0, 1.0, 41)
+    state = result.sol(t)
+    assert max(worst(state.q[:, k], m.state(t[k])[0]) for k in range(t.size)) < 2.0 * at_steps + 1e-12
+    assert force_residual_of(m.system(), state) < 4.0 * force_residual_of(m.system(), result) + 1e-11
+
+
+def force_residual_of(system, state):
+    """Largest |M a + C_q^T lam + A^T mu - Q|."""
+    columns = zip(state.t, state.q.T, state.v.T, state.a.T, state.lam.T, strict=True)
+    return max(
+        np.abs(system.mass(t, q) @ a + system.rows(t, q).T @ lam - system.force(t, q, v)).max()
+        for t, q, v, a, lam in columns
+    )
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Gauss12"])
+def test_across_a_singular_position(method):
+    m = mechanism("A02, N = 1")
+    result = solve_dae(m.system(), (0.0, 2.0), *m.start, method, check_derivatives=False, dense_output=True)
+    at_steps = max(worst(result.q[:, k], m.state(result.t[k])[0]) for k in range(1, result.t.size))
+    t = np.linspace(0.0, 2.0, 60)
+    state = result.sol(t)
+    assert max(worst(state.q[:, k], m.state(t[k])[0]) for k in range(t.size)) < 2.0 * at_steps
+
+
+def test_vibrations_that_are_stepped_over_leave_no_noise():
+    """Newton's method on a stiff beam: its accelerations are of no use between the steps."""
+    problem = moderately_stiff_beam()
+    span = (problem.system, (0.0, 0.05), problem.q0, problem.v0)
+    exact = solve_dae(*span, "DOP853", 1e-9, 1e-9, dense_output=True)
+    result = solve_dae(*span, "RadauIIA5", 1e-2, 1e-2, dense_output=True)
+    known, state = exact.sol(between(result)), result.sol(between(result))
+    at_steps = exact.sol(result.t)
+    assert result.stats.n_jacobians > 0
+    assert worst(state.q, known.q) < 3.0 * worst(result.q, at_steps.q)
+    assert worst(state.v, known.v) < 3.0 * worst(result.v, at_steps.v)
+    assert violations(problem.system, state)[0] < 1e-13
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "DOP853"])
+def test_far_from_zero(method):
+    # times near 1.7e9 s have spacings of 2.4e-7 s
+    start = ([-1.0, 0.0], [0.0, 0.0])
+    result = solve_dae(pendulum(compile=True), (1.7e9, 1.7e9 + 1.0), *start, method, 1e-6, 1e-6, dense_output=True)
+    t = between(result)
+    assert worst(result.sol(t).q, pendulum_state(t - 1.7e9)[0]) < 1e-4
+
+
+@pytest.mark.parametrize("max_steps", [1, 2, 3, 4])
+@pytest.mark.parametrize("method", ["DOP853", "Gauss8"])
+def test_a_run_of_few_steps_covers_what_was_computed(default_four_bar, method, max_steps):
+    result = run(default_four_bar, 1.0, method=method, max_steps=max_steps, dense_output=True)
+    assert result.status == Status.MAX_STEPS
+    assert (result.sol.t_min, result.sol.t_max) == (0.0, result.t[-1])
+    assert worst(result.sol(0.5 * result.t[-1]).q[:, None], result.q) < 0.1
+    with pytest.raises(ValueError, match="must lie within the run"):
+        result.sol(1.0)
+
+
+def test_a_run_without_a_step():
+    result = swing(dense_output=True, step_size=2.0, method="Gauss12")
+    assert result.status == Status.NOT_CONVERGED
+    assert result.t.size == 1
+    assert (result.sol(0.0).q == result.q[:, 0]).all()
+
+
+def test_where_no_interior_states_are_found_the_neighbours_serve(default_four_bar, exact):
+    result = run(default_four_bar, 1.0, method="Gauss8", rtol=1e-6, atol=1e-6, dense_output=True)
+    table = result.sol.table
+    result.sol.interpolator.filled = {t: (table.t[:0], table.states[:0]) for t in table.t.tolist()}
+    t = between(result)
+    assert 0.0 < worst(result.sol(t).q, exact(t).q) < 1e-3
+
+
+def test_more_intervals_than_are_kept(default_four_bar, exact, monkeypatch):
+    result = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
+    t = between(result)
+    at_once = result.sol(t)
+    monkeypatch.setattr("twoloop.dense.KEPT", 5)
+    again = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
+    assert worst(again.sol(t).q, at_once.q) < 1e-12
+    assert len(again.sol.interpolator.filled) <= 10
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss8"])
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda result: pickle.loads(pickle.dumps(result))])
+def test_copies(default_four_bar, method, copied):
+    result = run(default_four_bar, 0.5, method=method, dense_output=True)
+    state, again = result.sol(0.3), copied(result).sol(0.3)
+    assert (state.q == again.q).all() and (state.lam == again.lam).all()
+
+
+def test_it_says_what_it_is():
+    assert repr(_swing()).startswith("DenseSolution(from t = 0 to 1.5 s, ")

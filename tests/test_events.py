@@ -1,0 +1,254 @@
+"""Events: where functions of the motion are zero, by the rules of SciPy."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from tests.problems import pendulum, run, swing, violations, worst
+from twoloop import ConstrainedSystem, Status, solve_dae
+
+
+def event(function, terminal=None, direction=None):
+    """An event function with attributes."""
+    if terminal is not None:
+        function.terminal = terminal
+    if direction is not None:
+        function.direction = direction
+    return function
+
+
+def at_one(terminal=None, direction=None):
+    """theta_3 = 1 of the four-bar linkage."""
+    return event(lambda t, q, v: q[8] - 1.0, terminal, direction)
+
+
+def clock(*times, terminal=None, direction=None):
+    """Zero at these times, whatever moves; the sign changes at each."""
+    return event(lambda t, q, v: float(np.prod([t - each for each in times])), terminal, direction)
+
+
+@pytest.fixture(scope="module")
+def oscillator():
+    """x'' = -x, without constraints: what SciPy solves, too."""
+    return ConstrainedSystem.from_python(
+        n_q=1, n_c=0, mass=np.eye(1), constraint=None, jacobian=None, force=lambda t, q, v: -q, compile=True
+    )
+
+
+@pytest.fixture(scope="module")
+def exact(default_four_bar):
+    """When theta_3 passes 1, from a run of far more steps than its tolerance asks for."""
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13, "max_step": 1e-2}
+    return run(default_four_bar, 4.0, events=at_one(), **options).t_events[0]
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "DOP853", "RadauIIA5"])
+def test_theta_3_is_one(default_four_bar, exact, method):
+    result = run(default_four_bar, 4.0, method=method, rtol=1e-11, atol=1e-11, events=at_one(), dense_output=True)
+    (times,), (q,), (v,) = result.t_events, result.q_events, result.v_events
+    assert times.size == exact.size == 8
+    assert worst(times, exact) < 1e-11
+    assert worst(q[:, 8], 1.0) < 1e-14
+    state = result.sol(times)
+    assert (state.q == q.T).all() and (state.v == v.T).all()
+    assert max(violations(default_four_bar.system, state)) < 1e-13
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss8", "BDF"])
+def test_events_leave_a_run_as_it_is(default_four_bar, method):
+    free = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6)
+    never = clock(10.0, terminal=True)  # short chunks
+    searched = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6, events=[at_one(), never])
+    assert (free.t == searched.t).all() and (free.q == searched.q).all() and (free.lam == searched.lam).all()
+    assert free.stats.n_evaluations == searched.stats.n_evaluations
+    assert free.t_events is None
+    assert searched.t_events[0].size > 0 and searched.t_events[1].size == 0
+    assert searched.q_events[1].shape == searched.v_events[1].shape == (0, 9)
+
+
+@pytest.mark.parametrize("terminal", [True, 1, 3, np.int64(3)])
+def test_a_terminal_event_ends_the_run_there(default_four_bar, exact, terminal):
+    count = int(terminal)
+    result = run(default_four_bar, 4.0, rtol=1e-9, atol=1e-9, events=[at_one(), at_one(terminal)], dense_output=True)
+    assert result.status is Status.EVENT and result.success
+    assert "events[1]" in result.message and f"t = {result.t[-1]:.10g}" in result.message
+    assert result.t[-1] == result.t_events[1][-1] == result.sol.t_max
+    assert result.t[-1] == pytest.approx(exact[count - 1], abs=1e-8)
+    assert [times.size for times in result.t_events] == [count, count]  # those at the same time are recorded, too
+    assert (result.q[:, -1] == result.q_events[1][-1]).all()
+    assert result.h.sum() == pytest.approx(result.t[-1], abs=1e-13)
+    assert len(result.h) == result.stats.n_accepted == result.t.size - 1 == len(result.rejected_error)
+    assert max(violations(default_four_bar.system, result)) < 1e-13
+    state = result.sol(result.t[-1])
+    assert worst(state.a, result.a[:, -1]) < 1e-11 and worst(state.lam, result.lam[:, -1]) < 1e-11
+
+
+def test_with_output_times_the_run_ends_with_the_last_before_the_event(default_four_bar, exact):
+    times = np.linspace(0.0, 4.0, 41)
+    result = run(default_four_bar, 4.0, t_eval=times, events=at_one(True))
+    assert (result.t == times[times <= exact[0]]).all()
+    assert result.t_events[0] == pytest.approx(exact[:1], abs=1e-6)
+
+
+@pytest.mark.parametrize("t_eval", [None, np.linspace(0.0, 2.0, 21)])
+def test_events_of_fixed_steps(default_four_bar, exact, t_eval):
+    result = run(default_four_bar, 2.0, method="Gauss6", step_size=0.01, events=[at_one(), at_one(2)], t_eval=t_eval)
+    assert result.status is Status.EVENT
+    assert worst(result.t_events[0], exact[:2]) < 1e-8
+    assert worst(result.h[:-1], 0.01) < 1e-15 and 0.0 < result.h[-1] <= 0.01
+    assert result.t[-1] == (result.t_events[1][-1] if t_eval is None else 0.9)
+
+
+def test_restart_after_an_event_follows_the_same_motion(default_four_bar):
+    first = run(default_four_bar, 4.0, rtol=1e-11, atol=1e-11, events=at_one(True))
+    span = (first.t[-1], 4.0)
+    second = solve_dae(default_four_bar.system, span, first.q[:, -1], first.v[:, -1], rtol=1e-11, atol=1e-11)
+    whole = run(default_four_bar, 4.0, rtol=1e-11, atol=1e-11)
+    assert worst(second.q[:, -1], whole.q[:, -1]) < 1e-8
+
+
+@pytest.mark.parametrize("terminal", [None, 1, 2, 3])
+@pytest.mark.parametrize("direction", [None, -1, 0, 1.0])
+@pytest.mark.parametrize("start", [(1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+def test_the_rules_are_those_of_scipy(oscillator, start, direction, terminal):
+    """x = 0 and v = 0 along x'' = -x, one of them zero at the start."""
+    q, v = start
+    ours = [event(lambda t, q, v: q[0], terminal, direction), event(lambda t, q, v: v[0] - 0.5)]
+    theirs = [event(lambda t, y: y[0], terminal, direction or 0), event(lambda t, y: y[1] - 0.5)]
+    result = solve_dae(oscillator, (0.0, 12.0), [q], [v], "DOP853", 1e-10, 1e-10, events=ours)
+    scipys = solve_ivp(lambda t, y: (y[1], -y[0]), (0.0, 12.0), start, "DOP853", rtol=1e-10, atol=1e-10, events=theirs)
+    assert result.status == scipys.status
+    assert result.t[-1] == pytest.approx(scipys.t[-1], abs=1e-8)
+    for mine, its in zip(result.t_events, scipys.t_events, strict=True):
+        assert mine.size == its.size
+        assert mine == pytest.approx(its, abs=1e-8)
+
+
+@given(st.lists(st.floats(0.05, 1.9), min_size=1, max_size=4, unique=True))
+def test_every_crossing_that_is_sampled_is_found(times):
+    """Zeros at any times further apart than a quarter of a step, some of them on samples."""
+    times = sorted(times)
+    if np.diff(times).min(initial=1.0) < 0.02:
+        return
+    result = swing(2.0, system=_pendulum, method="SunRadau5", max_step=0.05, events=clock(*times))
+    assert result.t_events[0] == pytest.approx(times, abs=1e-14)
+
+
+_pendulum = pendulum(compile=True)
+
+
+@pytest.mark.parametrize("at", [0.5, 1 / 128, 1.0, 63 / 128])
+def test_a_zero_on_a_sample_counts_once(at):
+    """Fixed steps of 1/32 with samples at 1/128: the zero is exactly on the end of a step, or within."""
+    result = swing(
+        1.0, system=_pendulum, method="Gauss8", step_size=1 / 32, events=[clock(at), clock(at, terminal=True)]
+    )
+    assert [times.tolist() for times in result.t_events] == [[at], [at]]
+    assert result.t[-1] == at
+    assert result.h.sum() == at
+
+
+def test_a_terminal_zero_at_the_start_ends_the_run_at_once():
+    result = swing(1.0, system=_pendulum, events=clock(0.0, terminal=True), dense_output=True)
+    assert result.status is Status.EVENT
+    assert (result.t == [0.0]).all() and result.h.size == 0
+    assert (result.sol(0.0).q == result.q[:, 0]).all()
+
+
+def test_the_first_of_several_terminal_events_counts():
+    events = [clock(0.7, terminal=True), clock(0.69, terminal=True), clock(0.6), clock(0.71)]
+    result = swing(1.0, system=_pendulum, method="Gauss8", step_size=1 / 32, events=events)
+    assert result.t[-1] == pytest.approx(0.69)
+    assert [times.size for times in result.t_events] == [0, 1, 1, 0]
+    assert "events[1]" in result.message
+
+
+def test_what_fails_beyond_a_terminal_event_does_not_matter():
+    def force(t, q, v):
+        if t > 0.8:
+            raise RuntimeError("no force there")
+        return np.array([0.0, -9.81])
+
+    system = pendulum(force=force)
+    result = swing(2.0, system=system, events=clock(0.5, terminal=True))
+    assert result.status is Status.EVENT and result.t[-1] == pytest.approx(0.5)
+    with pytest.raises(RuntimeError, match="no force there"):
+        swing(2.0, system=system, events=clock(0.5))
+
+
+def test_events_are_not_evaluated_far_beyond_a_terminal_one():
+    seen = []
+
+    def end(t, q, v):
+        seen.append(t)
+        return t - 0.5
+
+    end.terminal = True
+    result = swing(2.0, system=_pendulum, events=end)
+    assert max(seen) < 0.5 + 2.0 * result.h.max()
+
+
+def test_compiled_events():
+    @numba.njit
+    def lowest(t, q, v):
+        return q[0]
+
+    result = swing(2.0, system=_pendulum, events=lowest)
+    assert result.t_events[0].size > 0
+    assert worst(result.q_events[0][:, 0], 0.0) < 1e-15
+
+
+def test_what_an_event_is_given_is_its_own():
+    def greedy(t, q, v):
+        q[:], v[:] = 7.0, 7.0
+        return 1.0
+
+    assert (swing(1.0, system=_pendulum, events=greedy).q == swing(1.0, system=_pendulum).q).all()
+
+
+def test_without_a_change_of_sign_there_is_no_event():
+    result = swing(1.0, system=_pendulum, events=lambda t, q, v: (t - 0.4) ** 2 + 1e-9)
+    assert result.t_events[0].size == 0
+
+
+def raising(t, q, v):
+    raise KeyError("tip")
+
+
+@pytest.mark.parametrize(
+    ("events", "error", "words"),
+    [
+        (3, TypeError, r"events must be a function event\(t, q, v\) or a list of such; given 3 of type int"),
+        ("hit", TypeError, "events must be a function"),
+        ([at_one(), None], TypeError, r"events\[1\] must be a function event\(t, q, v\); given None"),
+        (lambda t, q, v: q, TypeError, r"events\[0\] must return a number; at t = 0.0 it returned array"),
+        (lambda t, q, v: "high", TypeError, r"events\[0\] must return a number; at t = 0.0 it returned 'high'"),
+        (lambda t, q, v: None, TypeError, r"events\[0\] must return a number.*None"),
+        (lambda t, q, v: q[0] > 0.0, TypeError, r"events\[0\] must return a number.*(True|False)"),
+        (lambda t, q, v: np.nan, ValueError, r"events\[0\] must return a finite number; at t = 0.0 it returned nan"),
+        ([at_one(terminal="yes")], TypeError, r"events\[0\].terminal must be True, False or a positive number"),
+        ([at_one(terminal=-1)], ValueError, r"events\[0\].terminal must be True, False or a positive number.*-1"),
+        ([at_one(terminal=1.5)], TypeError, r"events\[0\].terminal must be"),
+        ([at_one(direction="up")], TypeError, r"events\[0\].direction must be -1, 0 or 1; given 'up'"),
+        ([at_one(direction=2)], ValueError, r"events\[0\].direction must be -1, 0 or 1; given 2"),
+        ([at_one(direction=np.nan)], ValueError, r"events\[0\].direction must be -1, 0 or 1; given nan"),
+        (lambda t: 1.0, TypeError, "takes 1 positional argument"),
+    ],
+)
+def test_wrong_events(default_four_bar, events, error, words):
+    with pytest.raises(error, match=words):
+        run(default_four_bar, 1.0, events=events)
+
+
+def test_an_exception_of_an_event_comes_through_with_a_note():
+    with pytest.raises(KeyError, match="tip") as caught:
+        swing(1.0, system=_pendulum, events=[clock(0.5), raising])
+    assert caught.value.__notes__ == ["raised by events[1] (raising) at t = 0.0"]
+
+
+def test_a_value_that_is_wrong_later_is_named_with_its_time():
+    with pytest.raises(ValueError, match=r"events\[0\] must return a finite number; at t = 0\.\d+ it returned nan"):
+        swing(1.0, system=_pendulum, events=lambda t, q, v: np.nan if t > 0.3 else 1.0)

@@ -1,0 +1,109 @@
+"""t_eval: interpolated where steps adapt, landed on where they are fixed or the paper's."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from tests.problems import run, violations, worst
+from twoloop import Status
+from twoloop.methods import PRESETS
+
+PAPERS = ("PaperIRK", "PaperNewmark")
+ADAPTIVE = [name for name in PRESETS if name not in PAPERS]
+TIMES = np.linspace(0.0, 1.0, 1001)
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_output_times_change_neither_steps_nor_counts(default_four_bar, method):
+    options = {"method": method, "rtol": 1e-6, "atol": 1e-6}
+    free = run(default_four_bar, 1.0, **options)
+    given = run(default_four_bar, 1.0, t_eval=TIMES, **options)
+    assert (given.t == TIMES).all()
+    assert (given.h == free.h).all()
+    for name in ("n_accepted", "n_rejected_error", "n_outer", "n_inner", "n_evaluations", "n_factorizations"):
+        assert getattr(given.stats, name) == getattr(free.stats, name), name
+    assert (given.q[:, -1] == free.q[:, -1]).all()
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "RadauIIA5", "BDF"])
+def test_they_are_those_of_the_dense_solution(default_four_bar, method):
+    given = run(default_four_bar, 1.0, method=method, t_eval=TIMES, dense_output=True)
+    alone = run(default_four_bar, 1.0, method=method, t_eval=TIMES)
+    state = given.sol(TIMES)
+    for result in (given, alone):  # steps looked at chunk by chunk, and none kept
+        assert worst(result.q, state.q) < 1e-14
+        assert worst(result.v, state.v) < 1e-13
+        assert worst(result.a, state.a) < 1e-11
+        assert worst(result.lam, state.lam) < 1e-11
+    assert alone.sol is None
+
+
+def test_they_are_on_the_constraints(default_four_bar):
+    result = run(default_four_bar, 1.0, rtol=1e-4, atol=1e-4, t_eval=TIMES)
+    position, velocity = violations(default_four_bar.system, result)
+    assert position < 1e-14
+    assert velocity < 1e-13
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 3, 7])
+def test_the_chunks_of_a_run_do_not_show(default_four_bar, chunk, monkeypatch):
+    usual = run(default_four_bar, 1.0, t_eval=TIMES)
+    monkeypatch.setattr("twoloop.run.FIRST_CHUNK", chunk)
+    monkeypatch.setattr("twoloop.run.CHUNK_TIME", 0.0)  # chunks do not grow
+    other = run(default_four_bar, 1.0, t_eval=TIMES)
+    assert (other.q == usual.q).all() and (other.lam == usual.lam).all()
+
+
+@pytest.mark.parametrize("times", [[1.0], [0.0], [0.0, 1.0], [0.3], [0.3, 0.30000001], [1e-9, 1.0 - 1e-9]])
+def test_few_output_times(default_four_bar, times):
+    result = run(default_four_bar, 1.0, t_eval=times)
+    assert (result.t == times).all()
+    assert result.q.shape == (9, len(times))
+    assert result.lam.shape == (8, len(times))
+
+
+@pytest.mark.parametrize("method", PAPERS)
+def test_the_procedures_of_the_paper_land(default_four_bar, method):
+    options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
+    free = run(default_four_bar, 0.5, **options)
+    landed = run(default_four_bar, 0.5, t_eval=[0.123, 0.5], **options)
+    assert (landed.t == [0.123, 0.5]).all()
+    assert landed.h.size != free.h.size or worst(landed.h, free.h) > 0.0
+    ends = np.cumsum(landed.h)
+    assert np.abs(ends - 0.123).min() < 1e-12
+
+
+def test_fixed_steps_land_and_have_a_dense_solution_all_the_same(default_four_bar):
+    times = np.array([0.1, 0.25, 1.0])
+    result = run(default_four_bar, 1.0, method="Gauss6", step_size=0.01, t_eval=times, dense_output=True)
+    free = run(default_four_bar, 1.0, method="Gauss6", step_size=0.01)
+    assert (result.t == times).all()
+    assert worst(result.q, free.q[:, [10, 25, 100]]) < 1e-14
+    assert worst(result.sol(free.t).q, free.q) < 1e-13
+
+
+@pytest.mark.parametrize("method", ["SunRadau5", "Gauss8"])
+def test_a_failed_run_has_the_times_that_it_reached(default_four_bar, method):
+    result = run(default_four_bar, 1.0, method=method, t_eval=TIMES, max_steps=10)
+    assert result.status == Status.MAX_STEPS
+    assert 1 < result.t.size < TIMES.size
+    assert (result.t == TIMES[: np.searchsorted(TIMES, result.h.sum(), side="right")]).all()
+
+
+def test_the_states_of_all_steps_are_not_kept(default_four_bar):
+    """Memory goes with the output times and a chunk of steps, not with the steps of the run."""
+
+    def peak(**options):
+        tracemalloc.start()
+        result = run(default_four_bar, 40.0, method="Gauss4", rtol=1e-9, atol=1e-9, **options)
+        try:
+            return result.h.size, tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    run(default_four_bar, 0.1, method="Gauss4", dense_output=True)  # compiled by now
+    n_steps, few = peak(t_eval=[0.0, 40.0])
+    _, all_of_them = peak(dense_output=True)
+    assert n_steps > 5000
+    assert few < 0.4 * all_of_them

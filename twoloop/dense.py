@@ -1,0 +1,278 @@
+"""The solution between steps: polynomials through stored states, put back on the constraints."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+import warnings
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks import check_real
+from twoloop.consistency import ConstraintWarning, pattern_of
+from twoloop.kernels import common
+from twoloop.kernels import intervals as names
+from twoloop.plan import INNER_TOL, Plan
+from twoloop.system import ConstrainedSystem
+from twoloop.workspace import kit_of, workspace
+
+Array = NDArray[np.float64]
+Groups = NDArray[np.int64]
+
+KEPT = 512  # intervals whose interior states are kept
+
+
+class Table(NamedTuple):
+    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), the kind of the interval behind each but one."""
+
+    t: Array
+    states: Array
+    kinds: NDArray[np.int64]  # see kernels/intervals.py
+
+
+class Interpolator:
+    """Evaluates tables of states of one system; has a workspace of its own.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem.
+    t0, row : float, ndarray (3 n_q,)
+        A state [q, v, a] of the run.
+    rtol : float
+        Relative tolerance of the run.
+    ranks : (int, int)
+        Of C_q, and of C_q and A.
+    plan : Plan, optional
+        How the method makes fixed steps, where `plan.parts` > 1: intervals are divided by these.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        row: Array,
+        rtol: float,
+        ranks: tuple[int, int],
+        plan: Plan | None = None,
+    ):
+        from twoloop.kernels import advance, dense  # compiled, or read from the cache, when it is first needed
+
+        self.kernels = dense
+        self.made_of = (system, t0, row.copy(), rtol, ranks, plan)
+        self.system, self.plan, self.rtol, self.ranks = system, plan, rtol, ranks
+        self.parts = 1 if plan is None else plan.parts
+        q0 = row[: system.n_q]
+        self.kit = kit_of(system, t0, q0, None if plan is None else plan.step)
+        self.work = workspace(system, self.kit, pattern_of(system, t0, q0), q0, rtol, 0.0, ranks)
+        self.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
+        self.filled: dict[float, tuple[Array, Array]] = {}
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Scratch for the coefficients of two polynomials."""
+        half = 3 * max(names.WINDOW, self.parts + 1)
+        self.nodes, self.room = np.zeros(2 * half), np.zeros((2 * half, self.system.n_q))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # for copies, and other processes
+        return type(self), self.made_of, {"parts": self.parts, "filled": self.filled}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_room()
+
+    def states(self, table: Table, times: Array) -> Array:
+        """Rows [q, v] at `times`, sorted, each within the table."""
+        if len(times) == 0 or len(table.t) == 1:
+            return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
+        intervals = np.clip(np.searchsorted(table.t, times, side="right") - 1, 0, len(table.t) - 2)
+        which, first = np.unique(intervals, return_index=True)
+        groups = np.empty((len(which), names.N_COLUMNS), dtype=np.int64)
+        groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
+        groups[:, names.KIND] = table.kinds[which]
+        groups[:, names.FIRST_TIME], groups[:, names.END_TIME] = first, np.append(first[1:], len(times))
+        out = np.empty((len(times), 2 * self.system.n_q))
+        failures = 0
+        if self.parts > 1:
+            others = []
+            for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+                divided, own, rest = self._divided(table, block)
+                failures += self._between(divided, own, times, out)
+                others.append(rest)
+            groups = np.concatenate(others)
+        failures += self._between(table, groups, times, out)
+        if failures > 0:
+            _warn(f"at {failures} of {len(times)} times the state is interpolated and off the constraints")
+        return out
+
+    def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
+        arrays = (np.ascontiguousarray(groups), times, self.nodes, self.room, out)
+        return int(self.kernels.between(self.kit, self.work, INNER_TOL, table.t, table.states, *arrays))
+
+    def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
+        """A table of interior states, the groups of intervals that are in it, and those of others."""
+        begins = table.t[groups[:, names.FIRST_OWN]].tolist()
+        if self.plan is not None and len(self.filled) > KEPT:
+            self.filled.clear()
+        missing = (groups[:, names.KIND] == names.ACCELERATIONS) & [t not in self.filled for t in begins]
+        self._fill(table, groups[missing, names.FIRST_OWN])
+        filled = np.array([t in self.filled and len(self.filled[t][0]) > 0 for t in begins])
+        pairs = [self.filled[t] for t, there in zip(begins, filled, strict=True) if there]
+        sizes = np.array([len(t) for t, _ in pairs], dtype=np.int64)
+        own = groups[filled]
+        own[:, names.LAST_OWN] = np.cumsum(sizes) - 1
+        own[:, names.FIRST_OWN] = own[:, names.LAST_OWN] - sizes + 1
+        t = np.concatenate([table.t[:0], *(t for t, _ in pairs)])
+        states = np.concatenate([table.states[:0], *(states for _, states in pairs)])
+        return Table(t, states, table.kinds), own, groups[~filled]
+
+    def _fill(self, table: Table, intervals: Groups) -> None:
+        """Find the interior states of these intervals; where that fails, with fewer of them."""
+        if self.plan is None or len(intervals) == 0:
+            return
+        n = self.system.n_q
+        tolerances = np.zeros(common.ATOL + n)  # without an estimate
+        state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
+        plan = self.plan
+        vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
+        for parts in range(self.parts, 1, -1):
+            rows = parts + 1
+            out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
+            self.kernels.fill(self.kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
+            found = np.isfinite(times[:, 0])
+            for k in np.flatnonzero(found):
+                self.filled[float(times[k, 0])] = (times[k].copy(), states[k].copy())
+            intervals = intervals[~found]
+            if len(intervals) == 0:
+                return
+        for i in intervals:  # next to a singular position
+            self.filled[float(table.t[i])] = (table.t[:0], table.states[:0])
+
+    def interiors(self, table: Table) -> tuple[Array, Array]:
+        """The interior states of all intervals, (n - 1, parts + 1) and (n - 1, parts + 1, 3 n_q), for `keep`.
+
+        NaN where there are none.
+        """
+        shape = (len(table.t) - 1, self.parts + 1)
+        t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
+        for i in np.flatnonzero(table.kinds == names.ACCELERATIONS):
+            if table.t[i] not in self.filled:
+                self._fill(table, np.array([i]))
+            own_t, own = self.filled[table.t[i]]
+            t[i, : len(own_t)], states[i, : len(own)] = own_t, own
+        return t, states
+
+    def keep(self, table: Table, t: Array, states: Array) -> None:
+        """Take interior states as they were found before; no others can be found."""
+        self.parts = t.shape[1] - 1
+        self._make_room()
+        there = np.isfinite(t)
+        pairs = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True)]
+        self.filled = dict(zip(table.t[:-1].tolist(), pairs, strict=True))
+
+    def complete(self, times: Array, states: Array) -> Array:
+        """Rows [a, lam] at rows [q, v] on the constraints."""
+        out = np.empty((len(times), self.system.n_q + self.system.n_c + self.system.n_a))
+        failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
+        if failures > 0:
+            _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
+        return out
+
+
+def _warn(what: str) -> None:
+    warnings.warn(f"the constraint Jacobian has lost rank: {what}", ConstraintWarning, stacklevel=4)
+
+
+class DenseState:
+    """The state of a run at any times.
+
+    Attributes
+    ----------
+    t : float or ndarray (n,)
+        Times, s.
+    q, v : ndarray (n_q,) or (n_q, n)
+        Coordinates and velocities, on the constraints to rounding.
+    a : ndarray (n_q,) or (n_q, n)
+        Accelerations there, evaluated when they are first asked for.
+    lam : ndarray (n_c + n_a,) or (n_c + n_a, n)
+        Multipliers there, likewise.
+    """
+
+    def __init__(self, interpolator: Interpolator, t: Array, order: Groups, rows: Array):
+        self._interpolator, self._order, self._rows = interpolator, order, rows
+        n = interpolator.system.n_q
+        self.t: Any = t if t.ndim else float(t)
+        self.q, self.v = self._unsorted(rows[:, :n]), self._unsorted(rows[:, n:])
+
+    def _unsorted(self, rows: Array) -> Array:
+        """Columns in the order of `t` of rows in that of time."""
+        columns = np.empty(rows.shape[::-1])
+        columns[:, self._order] = rows.T
+        return columns if np.ndim(self.t) else columns[:, 0]
+
+    @cached_property
+    def _completed(self) -> Array:
+        return self._interpolator.complete(np.atleast_1d(self.t)[self._order], self._rows)
+
+    @property
+    def a(self) -> Array:
+        """Accelerations."""
+        return self._unsorted(self._completed[:, : self._interpolator.system.n_q])
+
+    @property
+    def lam(self) -> Array:
+        """Multipliers."""
+        return self._unsorted(self._completed[:, self._interpolator.system.n_q :])
+
+
+class DenseSolution:
+    """`result.sol`: the state of a run at any time between its start and its end.
+
+    Between accepted steps q and v are Hermite polynomials, and dependents are then restored by the inner loop, so that
+    the constraints hold to rounding. At an accepted step the state is the one stored. The polynomials go through q, v
+    and a of four neighbouring states (order 12), where Newton's method was at work in the outer loop through q and v
+    (order 8: a has the noise of vibrations that are stepped over); of `BDF` and `Newmark` v has a polynomial of its
+    own, through v and a (order 8). `RungeKutta` of order 6 and
+    more with outer="fixed-point" takes steps that are too long for this: each is divided into 2 to 6 equal steps of the
+    method, when the first time within it is asked for, which costs about as much as the run has cost; where these steps
+    do not converge, next to a singular position, neighbouring states are all there is. Evaluations for this, and for
+    restoring, are counted nowhere.
+
+    It takes 8 (2 + 3 n_q) bytes of memory a step.
+
+    Attributes
+    ----------
+    t_min, t_max : float
+        The times that it covers, s.
+    """
+
+    def __init__(self, interpolator: Interpolator, table: Table, t_max: float):
+        self.interpolator, self.table = interpolator, table
+        self.t_min, self.t_max = float(table.t[0]), t_max
+
+    def __call__(self, t: ArrayLike) -> DenseState:
+        """The state at a time or at times (n,) in any order.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If t is no number or vector, or not within the run.
+        """
+        times = check_real("t", t)
+        if times.ndim > 1:
+            raise ValueError(f"t must be a number or have shape (n,); given shape {times.shape}")
+        outside = ~((times >= self.t_min) & (times <= self.t_max))  # NaN, too
+        if outside.any():
+            raise ValueError(
+                f"t must lie within the run, from {self.t_min!r} to {self.t_max!r}; given "
+                f"{float(np.atleast_1d(times)[np.atleast_1d(outside)][0])!r}"
+            )
+        order = np.argsort(np.atleast_1d(times), kind="stable")
+        rows = self.interpolator.states(self.table, np.atleast_1d(times)[order])
+        return DenseState(self.interpolator, times, order, rows)
+
+    def __repr__(self) -> str:
+        return f"DenseSolution(from t = {self.t_min:g} to {self.t_max:g} s, {len(self.table.t) - 1} steps)"

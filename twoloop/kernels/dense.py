@@ -1,0 +1,201 @@
+"""The solution between accepted steps: polynomials through neighbouring states, put back on the constraints.
+
+States are rows [q, v, a] at the times `t`; interval i lies between rows i and i + 1. With PARTS > 1 interior states are
+computed first, by steps of the method, and a polynomial goes through those of one interval.
+"""
+
+import numpy as np
+from numba import types
+
+from twoloop.kernels.calls import accelerations, find_tangents, renew_partition, restore
+from twoloop.kernels.common import (
+    DONE,
+    GAMMA_INACCURATE,
+    GAMMA_REQUIRED,
+    INTEGERS,
+    KIT,
+    MATRIX,
+    REDUCED,
+    SINGULAR,
+    VECTOR,
+    WORK,
+    compiled,
+    f8,
+    i8,
+    kernel,
+    merged,
+)
+from twoloop.kernels.intervals import (
+    ACCELERATIONS,
+    APART,
+    END_TIME,
+    FIRST_OWN,
+    FIRST_TIME,
+    KIND,
+    LAST_OWN,
+    WINDOW,
+)
+from twoloop.kernels.linalg import copy
+from twoloop.kernels.partition import partition_is_poor
+
+TABLE = types.int64[:, ::1]
+
+
+@merged
+def _window(n, i, last):
+    """First and last of the n rows that the polynomial of the interval from row i goes through: centred but at ends."""
+    if last > i + 1:  # the interval has states of its own
+        return i, last
+    size = min(WINDOW, n)
+    lo = max(0, min(i + 1 - size // 2, n - size))
+    return lo, lo + size - 1
+
+
+@compiled
+def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
+    """Newton's form of the Hermite polynomial through rows lo to hi, in (time - t[i]) / h; its number of coefficients.
+
+    For the block of columns from `place` on, less row i of them, with `order` values at each node: the blocks behind it
+    are its derivatives.
+    """
+    n = c.shape[1]
+    size = (hi - lo + 1) * order
+    for r in range(size):
+        row = lo + r // order
+        z[r] = (t[row] - t[i]) / h
+        for m in range(n):
+            c[r, m] = states[row, place + m] - states[i, place + m]
+    for j in range(1, size):
+        for r in range(size - 1, j - 1, -1):
+            row, gap = lo + r // order, z[r] - z[r - j]
+            if (r - j) // order == r // order:
+                scale = h if j == 1 else 0.5 * h * h
+                for m in range(n):
+                    c[r, m] = scale * states[row, place + j * n + m]
+            else:
+                for m in range(n):
+                    c[r, m] = (c[r, m] - c[r - 1, m]) / gap
+    return size
+
+
+@merged
+def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
+    """q and v as the polynomials have them, by Horner's scheme."""
+    n = q.size
+    for m in range(n):
+        value, slope = c[size - 1, m], 0.0
+        for r in range(size - 2, -1, -1):
+            slope = slope * (s - z[r]) + value
+            value = value * (s - z[r]) + c[r, m]
+        q[m], v[m] = value + states[i, m], slope / h
+    if kind == APART:
+        for m in range(n):
+            value = c_v[size_v - 1, m]
+            for r in range(size_v - 2, -1, -1):
+                value = value * (s - z_v[r]) + c_v[r, m]
+            v[m] = value + states[i, n + m]
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
+def between(f, w, tolerance, t, states, groups, times, z, room, out):
+    """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found.
+
+    There q and v are those of the polynomials. `z` and `room` hold nodes and coefficients of two polynomials.
+    """
+    n = w.Q.size
+    half = z.size // 2
+    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    reduced = f.flags[REDUCED] == 1  # then w.D is known
+    failures = 0
+    for g in range(groups.shape[0]):
+        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        h = t[last] - t[i]
+        lo, hi = _window(t.size, i, last)
+        order = 3 if kind >= ACCELERATIONS else 2
+        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        # which coordinates are kept is to depend on the time alone, not on what else is asked for
+        chosen = False
+        for p in range(groups[g, FIRST_TIME], groups[g, END_TIME]):
+            q, v = out[p, :n], out[p, n : 2 * n]
+            if times[p] == t[i] or times[p] == t[last]:
+                copy(states[i if times[p] == t[i] else last, : 2 * n], out[p])
+                continue
+            s = (times[p] - t[i]) / h
+            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            code = DONE if chosen else renew_partition(f, w, t[i], states[i, :n])
+            if code == DONE:
+                code = restore(f, w, times[p], q, v, tolerance)
+            chosen = code == DONE and not (reduced and partition_is_poor(w))
+            if not chosen:
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                code = renew_partition(f, w, times[p], q)
+                if code == DONE:
+                    code = restore(f, w, times[p], q, v, tolerance)
+            if code != DONE:
+                failures += 1
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+    return failures
+
+
+@kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
+def complete(f, w, times, states, out):
+    """Rows [a, lam] of `out` at states [q, v] on the constraints; the number of those at which there are none: NaN."""
+    n = w.Q.size
+    code = SINGULAR
+    failures = 0
+    for p in range(times.size):
+        q, v = states[p, :n], states[p, n : 2 * n]
+        if code == DONE:
+            code = find_tangents(f, w, times[p], q)
+        if code != DONE or partition_is_poor(w):
+            code = renew_partition(f, w, times[p], q)
+            if code == DONE:
+                code = find_tangents(f, w, times[p], q)
+        if code == DONE:
+            code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
+        if code == GAMMA_INACCURATE:  # the best that there is, as no step depends on it
+            required = w.notes[GAMMA_REQUIRED]
+            w.notes[GAMMA_REQUIRED] = np.inf
+            code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
+            w.notes[GAMMA_REQUIRED] = required
+        if code != DONE:
+            out[p] = np.nan
+            failures += 1
+    return failures
+
+
+@kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
+def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states, intervals, out_t, out):
+    """States within intervals, by equal steps of the method; how many intervals could not be filled, their t NaN.
+
+    `out_t` and `out` have the same number of rows for each; the first and the last are the ends of the interval.
+    """
+    n = w.Q.size
+    rows = out_t.size // intervals.size
+    failures = 0
+    for g in range(intervals.size):
+        i, first = intervals[g], g * rows
+        last = first + rows - 1
+        copy(at_rest, memory)
+        state[:] = 0.0
+        copy(states[i], state[: 3 * n])
+        out_t[first], out_t[last] = t[i], t[i + 1]
+        copy(states[i], out[first])
+        copy(states[i + 1], out[last])
+        code = renew_partition(f, w, t[i], state[:n])
+        for r in range(first + 1, last):
+            before = out_t[r - 1]
+            out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (rows - 1)
+            if code == DONE:
+                code, _ = f.step(f, w, options, memory, before, out_t[r] - before, tolerances, state, new_state)
+                if code != DONE and renew_partition(f, w, before, state[:n]) == DONE:
+                    copy(at_rest, memory)
+                    code, _ = f.step(f, w, options, memory, before, out_t[r] - before, tolerances, state, new_state)
+            memory[0] = 1.0
+            copy(new_state, state)
+            copy(new_state[: 3 * n], out[r])
+        if code != DONE:
+            out_t[first] = np.nan
+            failures += 1
+    return failures

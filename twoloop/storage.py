@@ -1,0 +1,104 @@
+"""Results in files: NumPy's npz, without pickle."""
+
+import json
+import os
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.consistency import check_system
+from twoloop.dense import DenseSolution, Interpolator, Table
+from twoloop.result import Result, Statistics, Status
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+FORMAT = "twoloop result 1"
+ALWAYS = ("t", "q", "v", "a", "lam", "h")
+SOMETIMES = ("rejected_error", "rejected_convergence", "partitioned", "redundant")
+OF_EVENTS = ("t_events", "q_events", "v_events")
+
+
+def save(result: Result, path: str | os.PathLike[str]) -> None:
+    """Write a result to a file, see `Result.save`."""
+    arrays: dict[str, Any] = {name: getattr(result, name) for name in ALWAYS}
+    arrays |= {name: getattr(result, name) for name in SOMETIMES if getattr(result, name) is not None}
+    n_events = None if result.t_events is None else len(result.t_events)
+    for name in OF_EVENTS:
+        arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
+    words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
+    words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events}
+    if result.sol is not None:
+        interpolator, table = result.sol.interpolator, result.sol.table
+        arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
+        words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
+        if interpolator.parts > 1:
+            arrays["sol_interior_t"], arrays["sol_interior_states"] = interpolator.interiors(table)
+    with Path(path).open("wb") as file:
+        np.savez(file, words=np.array(json.dumps(words)), allow_pickle=False, **arrays)
+
+
+def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) -> Result:
+    """Read a result that `Result.save` wrote.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    system : ConstrainedSystem, optional
+        The system that was solved; only with it `result.sol` can be evaluated. None: `result.sol` is None.
+
+    Returns
+    -------
+    Result
+        As it was saved.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    TypeError, ValueError
+        If the file was not written by `Result.save`, or holds a result of a system of other sizes.
+    """
+    if system is not None:
+        check_system(system)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        words = json.loads(str(arrays["words"]))
+    except (KeyError, EOFError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"path must lead to a file written by Result.save; {str(path)!r} is none") from error
+    if not isinstance(words, dict) or words.get("format") != FORMAT:
+        raise ValueError(f"path must lead to a file written by Result.save; {str(path)!r} holds something else")
+    if system is not None:
+        sizes, given = (len(arrays["q"]), len(arrays["lam"])), (system.n_q, system.n_c + system.n_a)
+        if sizes != given:
+            raise ValueError(
+                f"system must be the one that was solved, with n_q = {sizes[0]} and n_c + n_a = {sizes[1]}; "
+                f"{system.name!r} has {given[0]} and {given[1]}"
+            )
+    optional: dict[str, Any] = {name: arrays.get(name) for name in SOMETIMES}
+    if words["n_events"] is not None:
+        optional |= {name: [arrays[f"{name}_{k}"] for k in range(words["n_events"])] for name in OF_EVENTS}
+    return Result(
+        **{name: arrays[name] for name in ALWAYS},
+        **optional,
+        status=Status(words["status"]),
+        message=words["message"],
+        stats=Statistics(**words["stats"]),
+        rank=words["rank"],
+        sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
+    )
+
+
+def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str, Any]) -> DenseSolution:
+    table = Table(arrays["sol_t"], arrays["sol_states"], arrays["sol_kinds"])
+    rank, rank_v = words["sol_ranks"]
+    interpolator = Interpolator(system, float(table.t[0]), table.states[0], words["sol_rtol"], (rank, rank_v))
+    if "sol_interior_t" in arrays:
+        interpolator.keep(table, arrays["sol_interior_t"], arrays["sol_interior_states"])
+    return DenseSolution(interpolator, table, words["sol_end"])

@@ -1,0 +1,56 @@
+"""What every use of the kernels needs of a system: its callbacks with flags, and a workspace."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels import common
+from twoloop.kernels.banded import banded_pays
+from twoloop.kernels.lapack import addresses
+from twoloop.kernels.layout import make_work
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
+SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
+
+
+def kit_of(system: ConstrainedSystem, t0: float, q0: Array, step: Any = None) -> common.Kit:
+    """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and a step."""
+    from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
+
+    flags = system.functions.flags.copy()
+    mass = system.mass(t0, q0)
+    if system.constant_mass:
+        flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+    definite = bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+    flags[common.REDUCED] = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
+    bandwidth = system.bandwidth if definite and system.n_a == 0 else None
+    if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
+        flags[common.BANDWIDTH], flags[common.REDUCED] = bandwidth, 0
+    return common.Kit(system.functions._replace(flags=flags), inner_loop, step)
+
+
+def workspace(
+    system: ConstrainedSystem,
+    kit: common.Kit,
+    pattern: Array,
+    q0: Array,
+    rtol: float,
+    reuse: float,
+    ranks: tuple[int | None, int | None] = (None, None),
+) -> common.Work:
+    """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows."""
+    flags = kit.flags
+    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(flags[common.REDUCED]))
+    work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
+    work.notes[common.GAMMA_SHARE] = 1.0
+    work.notes[common.ROUNDED] = ROUNDING * float(np.abs(q0).max())
+    work.notes[common.REUSE] = max(reuse, work.notes[common.ROUNDED])
+    work.pattern[:] = pattern
+    if flags[common.BANDWIDTH] >= 0:
+        work.lapack[:] = addresses()
+    return work
