@@ -7,7 +7,7 @@ from tests.general.dead_points import CUSP_TIME, cusp
 from tests.general.mechanisms import SINGULAR, WINDOWS, mechanism
 from tests.general.runs import error, run
 from tests.general.windows import first_singular_time
-from twoloop import Status, solve_dae
+from twoloop import DOP853, Status, solve_dae
 
 METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
 
@@ -29,7 +29,7 @@ def test_every_method_crosses(n, method):
     assert error(m, result) < 1e-4
 
 
-@pytest.mark.parametrize("method", ["DOP853"])
+@pytest.mark.parametrize("method", [DOP853("restored")], ids=["DOP853"])
 @pytest.mark.parametrize("name", [name for name in SINGULAR if name not in {f"A02, N = {n}" for n in WINDOWS}])
 def test_other_dead_points(name, method):
     m, (result, _) = mechanism(name), run(name, method)

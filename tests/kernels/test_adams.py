@@ -68,8 +68,8 @@ def test_price_of_ten_seconds(default_four_bar, tol, steps):
 
 def test_it_takes_fewer_evaluations_than_others_at_equal_error(default_four_bar):
     own, error = four_bar_run(default_four_bar, 1e-12)
-    other, other_error = four_bar_run(default_four_bar, 1e-12, method="Gauss12")
-    assert error < 10.0 * other_error + 1e-11
+    other, other_error = four_bar_run(default_four_bar, 1e-10, method="Gauss12")
+    assert error < 10.0 * other_error
     assert own.stats.n_evaluations < 0.5 * other.stats.n_evaluations
 
 
@@ -82,7 +82,7 @@ def test_it_does_not_drift_off_the_constraints(linkage, tol, request):
     position, velocity = violations(problem.system, result)
     assert position < 1e-14
     assert velocity < 3e-12
-    assert force_residual(problem.system, result) < 1e-10
+    assert force_residual(problem.system, result) < 1e-8
 
 
 @pytest.mark.parametrize("tol", TOLERANCES)
@@ -131,5 +131,5 @@ def test_plain_python_gives_the_run_of_compiled_functions():
 
 
 def test_it_says_that_it_cannot_keep_a_constant_step():
-    with pytest.raises(ValueError, match="method='Adams' .* leave step_size out"):
+    with pytest.raises(ValueError, match=r"method='Adams' .* leave step_size out"):
         swing(method="Adams", step_size=0.01)

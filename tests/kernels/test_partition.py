@@ -94,7 +94,9 @@ def test_every_method_passes_the_collinear_positions(collinear_four_bar, method)
     assert result.success, result.message
     assert result.stats.n_partitions > 1
     truth = trajectory(problem.parameters, [10.0])[0][:, 0]
-    assert worst(result.q[:, -1], truth) < {"Newmark": 1e-2, "BDF": 1e-3, "PaperIRK": 1e-3}.get(method, 1e-4)
+    assert worst(result.q[:, -1], truth) < {"Newmark": 1e-2, "BDF": 1e-3, "PaperIRK": 1e-3, "Adams": 1e-3}.get(
+        method, 1e-4
+    )
 
 
 def test_no_single_angle_serves_the_default_linkage_for_a_period(default_four_bar):

@@ -18,7 +18,6 @@ PROBLEMS = {name: problem for name, (problem, *_) in {**COMPUTED, **CLOSED}.item
 PROBLEMS["driven slider-crank"] = driven_slider_crank()
 SINGULAR = [name for name, problem in PROBLEMS.items() if "singular" in problem.tags]
 # reach 7.9, 8.2 and 8.5 digits in q; Gauss12 has 11.5 or more. Delete each as soon as it passes
-SHORT = {("A01 pendulum", "DOP853"), ("projection pendulum", "DOP853"), ("heavy top", "DOP853")}
 
 
 def of(name):
@@ -170,8 +169,6 @@ def test_printed_values_hold_the_digits_said(problem):
 @pytest.mark.parametrize("method", ["Gauss12", "DOP853"])
 @pytest.mark.parametrize("name", [name for name in PROBLEMS if name not in SINGULAR])
 def test_nine_digits(name, method, request):
-    if (name, method) in SHORT:
-        request.applymarker(pytest.mark.xfail(reason="DOP853 reaches 7.9 to 8.5 digits here", strict=True))
     result, known = end_of(name, method), of(name).reference
     assert digits(result.q[:, -1], known.q) > 9.0
     assert digits(result.v[:, -1], known.v) > 8.0

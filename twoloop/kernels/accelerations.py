@@ -238,6 +238,29 @@ def _on_null_space(f, w, a):
     return MASS_NOT_DEFINITE if finite(w.M) and finite(w.D) else NOT_FINITE
 
 
+@compiled
+def factor_for_projection(f, w, t, q):
+    """M, and the factors of T^T M T or G M^-1 G^T, at a state whose rows, factors and w.D stand in w."""
+    code = DONE
+    if f.flags[CONSTANT_MASS] == 0:
+        if f.flags[REDUCED] == 1:
+            mass_matrix(f, w, t, q)
+        else:
+            w.counters[N_FACTORIZATIONS] += 1
+            code = factor_mass(f, w, t, q)
+    if code != DONE:
+        return code
+    if f.flags[REDUCED] == 0:
+        return _schur_complement(f, w)
+    columns = columns_of(w.index_v)
+    if f.flags[DIAGONAL_MASS] == 1:
+        _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.z, w.Q, w.y, w.A, w.x)
+    else:
+        _reduce_dense(columns, w.independent_v, w.M, w.D, w.z, w.Q, w.y, w.A, w.MT)
+    w.counters[N_FACTORIZATIONS] += 1
+    return DONE if ldl_factor(w.A) else MASS_NOT_DEFINITE
+
+
 @merged
 def accelerate(f, w, t, q, v, a):
     """The accelerations at a state whose rows, factors and w.D stand in w."""

@@ -8,7 +8,7 @@ accelerations to the correction itself: one that is not near rounding is followe
 
 import numpy as np
 
-from twoloop.kernels.accelerations import accelerate, equilibrate
+from twoloop.kernels.accelerations import accelerate, equilibrate, factor_for_projection
 from twoloop.kernels.common import (
     DIAGONAL_MASS,
     DONE,
@@ -31,8 +31,8 @@ ABOVE_ROUNDING = 100.0  # of positions: no correction is asked to be smaller
 
 
 @merged
-def accelerate_there(f, w, t, q, v, a):
-    """Accelerations at (q, v), which need not be on the constraints; leaves rows, factors and tangents there in w."""
+def _look(f, w, t, q, v):
+    """Rows, factors and tangents at (q, v), which need not be on the constraints."""
     if f.flags[KINEMATICS_GIVEN] == 1:
         kinematics(f, w, t, q, v)
         w.notes[KNOWN] = 1.0
@@ -41,6 +41,13 @@ def accelerate_there(f, w, t, q, v, a):
         code = factor_dependent(f, w, t, q)
     if code == DONE and f.flags[REDUCED] == 1:
         tangents(f, w, t, q)
+    return code
+
+
+@merged
+def accelerate_there(f, w, t, q, v, a):
+    """Accelerations at (q, v)."""
+    code = _look(f, w, t, q, v)
     return accelerate(f, w, t, q, v, a) if code == DONE else code
 
 
@@ -70,12 +77,15 @@ def _along_tangents(w, columns, y, x):
 
 @compiled
 def _to_constraints(f, w, q, v):
-    """Correct q and v by T and the factors of T^T M T; the largest correction of a position."""
+    """Correct q and v by T and the factors of T^T M T; the largest correction of a position, and of a velocity."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
     n_dof, x, y = independent.size, w.x, w.y
     for k in range(rows.size):
         w.z[k] = w.C[rows[k]]
     solve(w.index_v, w.values_v, w.z)
+    for k in range(rows.size):
+        if not np.isfinite(w.z[k]):
+            return np.inf, np.inf
     for j in range(n_dof):
         x[independent[j]] = 0.0
     for k in range(rows.size):
@@ -92,22 +102,23 @@ def _to_constraints(f, w, q, v):
             change += w.D[j, k] * x[j]
         q[columns[k]] += change
         largest = max(largest, abs(change))
-        if not np.isfinite(change):
-            return np.inf
     for j in range(n_dof):
         x[independent[j]] = v[independent[j]]
     for k in range(rows.size):
         x[columns[k]] = v[columns[k]] - w.D[n_dof, k]
     _mass_times(f, w, x, y)
     _along_tangents(w, columns, y, x)
+    faster = 0.0
     for j in range(n_dof):
+        faster = max(faster, abs(v[independent[j]] - x[j]))
         v[independent[j]] = x[j]
     for k in range(rows.size):
         total = w.D[n_dof, k]
         for j in range(n_dof):
             total += w.D[j, k] * x[j]
+        faster = max(faster, abs(v[columns[k]] - total))
         v[columns[k]] = total
-    return largest
+    return largest, faster
 
 
 @compiled
@@ -117,55 +128,73 @@ def _by_multipliers(w, q, v):
     for i in range(rows.size):
         g[i] = w.C[rows[i]]
     ldl_solve(w.S, g)
-    largest = 0.0
+    largest, faster = 0.0, 0.0
+    for i in range(rows.size):
+        if not np.isfinite(g[i]):
+            return np.inf, np.inf
     for j in range(q.size):
         change = 0.0
         for i in range(rows.size):
             change += solved[i, j] * g[i]
         q[j] -= change
         largest = max(largest, abs(change))
-        if not np.isfinite(change):
-            return np.inf
     for i in range(rows.size):
         total = w.Rate[rows[i]]
         for j in range(v.size):
             total += w.G[rows[i], j] * v[j]
         g[i] = total
     ldl_solve(w.S, g)
-    for i in range(rows.size):
-        for j in range(v.size):
-            v[j] -= solved[i, j] * g[i]
+    for j in range(v.size):
+        change = 0.0
+        for i in range(rows.size):
+            change += solved[i, j] * g[i]
+        v[j] -= change
+        faster = max(faster, abs(change))
+    return largest, faster
+
+
+@merged
+def _largest(x):
+    largest = 0.0
+    for j in range(x.size):
+        largest = max(largest, abs(x[j]))
     return largest
 
 
 @merged
 def to_constraints(f, w, t, q, v, theta, a, lam):
-    """Accelerations and multipliers at (q, v), and q and v put on the constraints; without rows of A only."""
+    """(q, v) put on the constraints, then accelerations and multipliers there; without rows of A only.
+
+    Positions are corrected until a correction is at most theta, velocities alike, relative to the largest.
+    """
     before = np.inf
     theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
     for _ in range(MAX_INNER):
-        code = accelerate_there(f, w, t, q, v, a)
+        code = _look(f, w, t, q, v)
+        if code == DONE:
+            code = factor_for_projection(f, w, t, q)
         if code != DONE:
             return code
         if f.flags[KINEMATICS_GIVEN] == 0:
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
-        equilibrate(f, w, a, lam)
         if f.flags[REDUCED] == 1:
-            correction = _to_constraints(f, w, q, v)
+            moved, faster = _to_constraints(f, w, q, v)
         else:
             if f.flags[KINEMATICS_GIVEN] == 0:
                 constraint_rates(f, w, t, q, w.Rate)
-            correction = _by_multipliers(w, q, v)
-        if not np.isfinite(correction):
+            moved, faster = _by_multipliers(w, q, v)
+        if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
-        if correction <= theta:
-            return DONE
-        if correction > CONTRACTION * before:
-            largest = 0.0
-            for j in range(q.size):
-                largest = max(largest, abs(q[j]))
-            return DONE if correction <= ROUNDING * largest else INNER_DIVERGED
-        before = correction
-    return INNER_DIVERGED
+        if moved <= theta and faster <= theta * max(1.0, _largest(v)):
+            break
+        if moved > CONTRACTION * before:
+            if not moved <= ROUNDING * _largest(q):
+                return INNER_DIVERGED
+            break
+        before = max(moved, theta)
+    code = accelerate(f, w, t, q, v, a)
+    if code == DONE:
+        equilibrate(f, w, a, lam)
+    return code
