@@ -36,7 +36,7 @@ install: $(STAMP) ## make .venv; runs by itself when it must
 
 $(STAMP): requirements.lock pyproject.toml
 	@$(FIND_PYTHON); \
-	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for two or three."; \
+	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for one."; \
 	"$$python" -m venv --clear .venv
 	@$(RUN) $(PIP) install -r requirements.lock
 	@$(RUN) $(PIP) install --no-deps --no-build-isolation --editable .
@@ -52,7 +52,7 @@ reports: install ## all studies into reports/
 compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "import twoloop.kernels.calls"
 	@$(RUN) -c "import twoloop.kernels.newton" & \
-	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, bridge, advance" && wait $$! && \
+	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, adams, bridge, advance, dense" && wait $$! && \
 	$(RUN) -c "import twoloop.kernels.automatic"
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too

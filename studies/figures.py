@@ -43,6 +43,7 @@ YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7
 
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "DOP853 (two-loop)": (RED, "o"),
+    "Adams": (BLACK, "o"),
     "Gauss12": (BLUE, "s"),
     "Gauss6": (SKY, "D"),
     "SunRadau5": (PINK, "v"),

@@ -19,7 +19,7 @@ ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
 STIFF = (NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studies.beam` has the paper's procedures
-QUICK = (*COMPARED[:5], "DOP853, projected")  # others take seconds to compile or to run
+QUICK = (*COMPARED[:6], "DOP853, projected")  # others take seconds to compile or to run
 DEFAULT = "SunRadau5"  # of solve_dae
 SETTINGS = ("tol", "h", "err_out")
 

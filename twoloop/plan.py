@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 # Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
-LARGEST_MOVE = 1e-13  # of a position, after which a projection is not repeated: velocities are then off by as much
+LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
 LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them

@@ -222,7 +222,7 @@ def _stamp(module: str) -> str:
     return digest.hexdigest()
 
 
-_ANNOUNCEMENT = "twoloop: compiling the integrator, two or three minutes; later processes read it from the disk"
+_ANNOUNCEMENT = "twoloop: compiling the integrator, about a minute; later processes read it from the disk"
 
 
 def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., Any]], Dispatcher]:

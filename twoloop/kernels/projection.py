@@ -27,7 +27,7 @@ from twoloop.kernels.finite import CONSTRAINT, not_finite
 from twoloop.kernels.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_dependent, factor_rows, tangents
 from twoloop.kernels.linalg import ldl_solve
 
-ABOVE_ROUNDING = 100.0  # of positions: no correction is asked to be smaller
+ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
 
 
 @merged
@@ -167,7 +167,7 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
 
     Positions are corrected until a correction is at most theta, velocities alike, relative to the largest.
     """
-    before = np.inf
+    before, at_rest = np.inf, False
     theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
     for _ in range(MAX_INNER):
         code = _look(f, w, t, q, v)
@@ -187,8 +187,10 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
             moved, faster = _by_multipliers(w, q, v)
         if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
-        if moved <= theta and faster <= theta * max(1.0, _largest(v)):
+        # where positions rest, the tangents are those of the pass before: velocities are then right after one more
+        if moved <= theta and (at_rest or faster <= theta * max(1.0, _largest(v))):
             break
+        at_rest = moved <= theta
         if moved > CONTRACTION * before:
             if not moved <= ROUNDING * _largest(q):
                 return INNER_DIVERGED
