@@ -38,7 +38,13 @@ OTHERS = (
     *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
 )
 DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", "Gauss12", OWN_EXPLICIT, "Adams", IDA_C)
-LISTED = (*DRAWN, QUARTER, "DOP853, projected", "LSODA, index 1", "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
+LISTED = (
+    *DRAWN,
+    QUARTER,
+    "DOP853, projected",
+    "LSODA, index 1",
+    "Exudyn, GeneralizedAlpha",
+)  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
