@@ -35,6 +35,14 @@ def test_dense_output(names):
     assert (names["again"].sol(3.21).q == names["results"][0].sol(3.21).q).all()
 
 
+def test_reactions(names):
+    pin = names["pin"]
+    assert pin.force.shape == (2, 1001)
+    assert np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max()
+    assert names["clamp"].force[:, -1] == pytest.approx([0.0, 29.43], abs=1e-10)
+    assert names["clamp"].torque[-1] == pytest.approx(14.715, abs=1e-10)
+
+
 def test_the_third_event_ends_the_run(names):
     result = names["result"]
     assert result.status == 1

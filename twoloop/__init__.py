@@ -4,6 +4,7 @@ from twoloop.bdf import BDF
 from twoloop.callbacks import callback
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
+from twoloop.joints import Joint
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state
 from twoloop.result import Result, Statistics, Status
@@ -19,6 +20,7 @@ __all__ = [
     "ConsistentState",
     "ConstrainedSystem",
     "ConstraintWarning",
+    "Joint",
     "Newmark",
     "Result",
     "RungeKutta",

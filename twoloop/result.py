@@ -1,13 +1,20 @@
 """What a run returns: Result, Status, Statistics."""
 
+from __future__ import annotations  # Reaction and its kin are imported when they are asked for
+
 import os
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.dense import DenseSolution
+from twoloop.system import ConstrainedSystem
+
+if TYPE_CHECKING:
+    from twoloop.reactions import Reaction
 
 Array = NDArray[np.float64]
 
@@ -122,6 +129,8 @@ class Result:
     t_events, q_events, v_events : list of ndarray or None
         For each event function the times (n_events,) of its events, and coordinates and velocities (n_events, n_q)
         there. None: no events were asked for.
+    system : ConstrainedSystem or None
+        The system, where it has joints; `reactions` evaluates its rows.
     """
 
     t: Array
@@ -142,11 +151,40 @@ class Result:
     t_events: list[Array] | None = None
     q_events: list[Array] | None = None
     v_events: list[Array] | None = None
+    system: ConstrainedSystem | None = None
 
     @property
     def success(self) -> bool:
         """Whether the run reached its end or an event."""
         return self.status >= 0
+
+    def reactions(self, name: str) -> Reaction:
+        """Force and torque of a joint on its body at the times `t`.
+
+        They are those of the generalised reaction -C_q^T lam (or -A^T mu) of the rows of the joint: what the joint
+        does to the body that it names, along the axes of space. A bob that hangs from a link is pulled upwards. The
+        body on the other side gets the opposite. Where rows depend on one another the multipliers, and so the
+        reactions of single joints, may not be unique: `Reaction.unique` says so.
+
+        Parameters
+        ----------
+        name : str
+            Of one of the joints of the system (`problem.joints` of a ready mechanism).
+
+        Returns
+        -------
+        Reaction
+            `.force` (2 or 3, n_t), N, and `.torque` (n_t,) or (3, n_t), N m, about `.point` (2 or 3, n_t), m;
+            `.unique`.
+
+        Raises
+        ------
+        ValueError
+            If there is no joint of this name, the system has no joints, or the result was read without its system.
+        """
+        from twoloop.reactions import reaction
+
+        return reaction(self, name)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result to a file, as NumPy's npz without pickle; `twoloop.load` reads it.

@@ -4,7 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from twoloop.bounds import check_callback
 from twoloop.callbacks import KINDS, STATE, stand_in
 from twoloop.checks import check_number, check_real, check_size
 from twoloop.jacobian import differenced_jacobian
+from twoloop.joints import Joint, check_joints
 from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
 from twoloop.pickling import packed, unpacked
 from twoloop.system_methods import add_callbacks
@@ -55,6 +56,8 @@ class ConstrainedSystem:
         No entry (i, j) with |i - j| > bandwidth is other than zero in M, in the derivatives of the force by q and v,
         and in the second derivatives of each constraint by q; C_q itself may be full. With it the cost of a step of a
         large system grows in proportion to n_q. Needs a constant M. None: nothing is known.
+    joints : sequence of Joint
+        Named rows, whose forces and torques `Result.reactions` gives.
     name : str
         Shown in messages.
 
@@ -62,7 +65,7 @@ class ConstrainedSystem:
     ------
     TypeError, ValueError
         If a size or the bandwidth is not a sensible integer, a callback was not made by `twoloop.callback`, one that a
-        size asks for is missing, or force_by_v or reaction_by_q is given without force_by_q.
+        size asks for is missing, force_by_v or reaction_by_q is given without force_by_q, or a joint does not fit.
 
     Notes
     -----
@@ -83,12 +86,14 @@ class ConstrainedSystem:
         parameters: ArrayLike = (),
         constant_mass: bool = False,
         bandwidth: int | None = None,
+        joints: Sequence[Joint] = (),
         name: str = "system",
         **callbacks: Dispatcher | None,
     ):
         self.n_q = check_size("n_q", n_q, 1)
         self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
         self.name = name
+        self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
         self.parameters = check_real("parameters", parameters)
         if self.parameters.ndim != 1 or not np.isfinite(self.parameters).all():
             raise ValueError(f"parameters must be a vector of finite numbers; given {parameters!r}")
@@ -132,6 +137,7 @@ class ConstrainedSystem:
         n_a: int = 0,
         compile: bool = False,
         bandwidth: int | None = None,
+        joints: Sequence[Joint] = (),
         name: str = "system",
         **functions: Any,
     ) -> ConstrainedSystem:
@@ -149,6 +155,8 @@ class ConstrainedSystem:
             the values of closures and globals as they are now.
         bandwidth : int, optional
             As for the class; `mass` must then be an array.
+        joints : sequence of Joint
+            As for the class.
         name : str
             Shown in messages.
 
@@ -183,7 +191,12 @@ class ConstrainedSystem:
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
             check_arguments(kind, function)
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
-        options: dict[str, Any] = {"constant_mass": constant_mass, "bandwidth": bandwidth, "name": name}
+        options: dict[str, Any] = {
+            "constant_mass": constant_mass,
+            "bandwidth": bandwidth,
+            "joints": joints,
+            "name": name,
+        }
         if compile:
             compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
             system = cls(**sizes, **options, **compiled)
@@ -277,7 +290,7 @@ class ConstrainedSystem:
     def __reduce__(self) -> tuple[Any, ...]:
         plain = self._returning or (self._python.functions if self._python is not None else {})
         options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "n_a": self.n_a}
-        options |= {"bandwidth": self.bandwidth, "name": self.name}
+        options |= {"bandwidth": self.bandwidth, "joints": self.joints, "name": self.name}
         if plain:
             options["compile"] = not self.called_in_python
         else:

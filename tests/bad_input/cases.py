@@ -1,6 +1,7 @@
 """What users get wrong, all of it: the tests run it, and docs/errors.md is written from it."""
 
 from tests.bad_input.between_steps import BETWEEN_STEPS
+from tests.bad_input.joints import JOINTS
 from tests.bad_input.mechanisms import MECHANISMS
 from tests.bad_input.methods import METHODS
 from tests.bad_input.projection import PROJECTION
@@ -9,4 +10,4 @@ from tests.bad_input.start import START
 from tests.bad_input.systems import SYSTEMS
 from tests.general.wrong_rows import ROWS
 
-CASES = [*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS]
+CASES = [*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS]

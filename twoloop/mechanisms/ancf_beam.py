@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from twoloop.callbacks import callback
 from twoloop.checks import check_number, check_positive, check_size
+from twoloop.joints import Joint
 from twoloop.mechanisms.ancf_element import (
     FALL,
     FOURTH,
@@ -191,6 +192,7 @@ def ancf_beam(
         parameters=p,
         constant_mass=True,
         bandwidth=11,  # a node's neighbours
+        joints=[Joint("base", (0, 1), (0, 1))],
         name=name,
     )
     q0 = np.zeros((n_elements + 1, 6))

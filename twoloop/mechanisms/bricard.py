@@ -7,6 +7,7 @@ model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity along -y.
 
 import numpy as np
 
+from twoloop.joints import Joint
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.problem import Array, Problem
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
@@ -41,6 +42,14 @@ def _dot(a: Vector, b: Vector) -> list[tuple[float, Scalar, Scalar]]:
     return [(1.0, x, y) for x, y in zip(a, b, strict=True)]
 
 
+def _joint(hinge: int, rows: list[int]) -> Joint:
+    """The hinge at a corner: what it does to the bar that begins there, at the last corner to the bar that ends."""
+    bar, s = (hinge, -0.5) if hinge < 5 else (4, 0.5)
+    other = "ground" if hinge in (0, 5) else f"bar {hinge}"
+    position, columns = tuple(range(12 * bar, 12 * bar + 3)), tuple(range(12 * bar + 3, 12 * bar + 12))
+    return Joint(f"hinge bar {bar + 1}-{other}", tuple(rows), position, columns, (s, 0.0, 0.0))
+
+
 def _rows() -> QuadraticSystem:
     weight = np.tile([0.0, -GRAVITY, *[0.0] * 10], 5)
     rows = QuadraticSystem(np.diag(MASSES), weight)
@@ -53,12 +62,12 @@ def _rows() -> QuadraticSystem:
     for hinge, axis in enumerate(AXES):
         start = _end(hinge, -0.5) if hinge < 5 else fixed(*CORNERS[5])
         end = _end(hinge - 1, 0.5) if hinge > 0 else fixed(*CORNERS[0])
-        for a, b in zip(start, end, strict=True):
-            rows.row((1.0, difference(a, b), ONE))
+        numbers = [rows.row((1.0, difference(a, b), ONE)) for a, b in zip(start, end, strict=True)]
         of_one = _carried(hinge - 1, axis) if hinge > 0 else fixed(*axis)
         for across in np.roll(np.eye(3), 1, axis=0):
             if across @ axis == 0.0:
-                rows.row(*_dot(of_one, _carried(hinge, across) if hinge < 5 else fixed(*across)))
+                numbers.append(rows.row(*_dot(of_one, _carried(hinge, across) if hinge < 5 else fixed(*across))))
+        rows.joints.append(_joint(hinge, numbers))
     return rows
 
 

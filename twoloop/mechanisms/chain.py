@@ -1,7 +1,6 @@
 """Planar chains of equal masses on massless links, in Cartesian coordinates: the double pendulum and a closed chain."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import brentq
@@ -33,8 +32,8 @@ def double_pendulum() -> Problem:
     The motion is chaotic, which over the 3 s of the usual run costs about a digit.
     """
     rows = _masses(2)
-    rows.distance(point(0), fixed(0.0, 0.0), 1.0)
-    rows.distance(point(2), point(0), 1.0)
+    rows.link("link 1", 0, fixed(0.0, 0.0), 1.0)
+    rows.link("link 2", 2, point(0), 1.0)
     return Problem(
         name="double pendulum",
         system=rows.system("double pendulum"),
@@ -76,9 +75,9 @@ def closed_chain(n: int = 4) -> Problem:
     if n > N_MOST:
         raise ValueError(f"n must be at most {N_MOST}, as far as the chain was checked; given {n}")
     rows, length = _masses(n), 1.0 / (n + 1)
-    joints = [fixed(0.0, 0.0), *[point(2 * i) for i in range(n)], fixed(SLACK, 0.0)]
-    for left, right in pairwise(joints):
-        rows.distance(right, left, length)
+    for i in range(n):
+        rows.link(f"link {i + 1}", 2 * i, point(2 * i - 2) if i > 0 else fixed(0.0, 0.0), length)
+    rows.link(f"link {n + 1}", 2 * n - 2, fixed(SLACK, 0.0), length)
     name = f"closed chain of {n}"
     return Problem(
         name=name,

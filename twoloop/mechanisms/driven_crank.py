@@ -21,7 +21,7 @@ ANGLE, RATE = 0.4 - 0.5 * np.pi, -1.0  # of the pendulum at the start, from the 
 
 def driven_crank() -> Problem:
     """The crank at the angle 2.5 t + 0.2 sin(t), and the pendulum 0.4 rad off the vertical at -1 rad/s."""
-    rows = PlanarBodies(MASSES, INERTIAS, GRAVITY)
+    rows = PlanarBodies(("crank", "rod"), MASSES, INERTIAS, GRAVITY)
     rows.pin(0, (-0.5 * CRANK, 0.0), GROUND, (0.0, 0.0))
     rows.pin(1, (-0.5 * ROD, 0.0), 0, (0.5 * CRANK, 0.0))
     rows.drive(2, **DRIVE)

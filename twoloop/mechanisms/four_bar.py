@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from twoloop.callbacks import callback
 from twoloop.checks import check_finite, check_vector
+from twoloop.joints import Joint
 from twoloop.mechanisms.planar import body_names
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
@@ -189,6 +190,7 @@ def four_bar(
         kinematics=kinematics,
         parameters=[L1, L2, L3, ground],
         constant_mass=True,
+        joints=_joints(L1, L2, L3, ground),
         name="four-bar",
     )
     return Problem(
@@ -215,6 +217,24 @@ def four_bar(
         purpose="One loop that is released from rest and swings; which coordinates are independent must change.",
         coordinates=body_names("bar 1", "bar 2", "bar 3"),
     )
+
+
+def _joints(L1: float, L2: float, L3: float, ground: float) -> list[Joint]:
+    """The four pins, each as it acts on the bar that begins there, A on bar 3.
+
+    A row of C places a bar, or A, by the whole chain from O, so that a pin is a difference of rows.
+    """
+    E = np.eye(8)
+    E[2:6, 0:4] -= np.eye(4)  # pins 1-2 and 2-3: the position of a bar less that of the one before
+    E[6:, :] = 0.0
+    E[6, [4, 7]] = E[7, [5, 6]] = 1.0  # pin A: the end of bar 3 from its own centre, x and then y
+    bars = [((3 * i, 3 * i + 1), (3 * i + 2,)) for i in range(3)]
+    return [
+        Joint("O", (0, 1), *bars[0], point=(0.0, 0.0), in_space=True, equations=E),
+        Joint("1-2", (2, 3), *bars[1], point=(-0.5 * L2, 0.0), equations=E),
+        Joint("2-3", (4, 5), *bars[2], point=(-0.5 * L3, 0.0), equations=E),
+        Joint("A", (6, 7), *bars[2], point=(ground, 0.0), in_space=True, equations=E),
+    ]
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:

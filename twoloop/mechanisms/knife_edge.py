@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.joints import Joint
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
 
@@ -65,6 +66,7 @@ def knife_edge() -> Problem:
         nonholonomic_gamma=nonholonomic_gamma,
         parameters=[MASS, INERTIA, MASS * PULL],
         constant_mass=True,
+        joints=[Joint("blade", (0,), (0, 1), (2,))],
         name="knife edge",
     )
     q0, v0 = motion(0.0)

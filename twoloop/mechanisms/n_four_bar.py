@@ -157,7 +157,7 @@ def _of_tips(n: int) -> QuadraticSystem:
 
 
 def _of_bodies(n: int) -> PlanarBodies:
-    rows = PlanarBodies(np.ones(2 * n + 1), np.full(2 * n + 1, 1.0 / 12.0), GRAVITY)
+    rows = PlanarBodies(_bars(n), np.ones(2 * n + 1), np.full(2 * n + 1, 1.0 / 12.0), GRAVITY)
     for i in range(n + 1):
         rows.pin(i, (-0.5, 0.0), GROUND, (float(i), 0.0))
     for j in range(n):
@@ -170,5 +170,8 @@ def _of_bodies(n: int) -> PlanarBodies:
 def _names(n: int, coordinates: str) -> tuple[str, ...]:
     if coordinates == "tips":
         return tuple(f"{axis} of B{i} (m)" for i in range(n + 1) for axis in "xy")
-    bars = [f"crank {i}" for i in range(n + 1)] + [f"coupler {j}" for j in range(n)]
-    return body_names(*bars)
+    return body_names(*_bars(n))
+
+
+def _bars(n: int) -> list[str]:
+    return [f"crank {i}" for i in range(n + 1)] + [f"coupler {j}" for j in range(n)]

@@ -8,7 +8,7 @@ from scipy.special import ellipj, ellipk
 
 from twoloop.checks import check_finite
 from twoloop.mechanisms.problem import Array, Condition, Problem, Reference
-from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.mechanisms.quadratic import QuadraticSystem, fixed
 
 CVODE_GRAVITY = 13.7503716360407456549801915596211144  # (2 K(m = 1/2))^2: a quarter of the period is 1/2
 
@@ -43,7 +43,7 @@ class Swing:
 
 def _pendulum(name: str, gravity: float, side: int, end: float, **known: object) -> Problem:
     rows = QuadraticSystem(np.eye(2), np.array([0.0, -gravity]))
-    rows.distance(point(0), fixed(0.0, 0.0), 1.0)
+    rows.link("link", 0, fixed(0.0, 0.0), 1.0)
     motion = Swing(1.0, gravity, side)
     q, v = motion(end)
     lam = np.array([v @ v - gravity * q[1]])

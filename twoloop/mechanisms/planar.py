@@ -9,6 +9,7 @@ ground is body -1.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ import numba
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.joints import Joint, unused
 from twoloop.mechanisms.problem import Array
 from twoloop.system import ConstrainedSystem
 
@@ -175,39 +177,58 @@ class Energy:
 
 
 class PlanarBodies:
-    """Collects bodies and their joints.
+    """Collects bodies and their joints, which are named by their kind and their bodies: "pin rod-ground".
 
     Parameters
     ----------
+    names : sequence of str
+        Of the bodies.
     masses, inertias : sequence of float
         kg, and kg m^2 about the centre of mass.
     gravity : float
         m/s^2, along -y.
     """
 
-    def __init__(self, masses: Any, inertias: Any, gravity: float = 9.81):
+    def __init__(self, names: Sequence[str], masses: Any, inertias: Any, gravity: float = 9.81):
+        self.names = tuple(names)
         self.masses, self.inertias = np.asarray(masses, dtype=float), np.asarray(inertias, dtype=float)
         self.gravity, self.n_c = gravity, 0
         self._joints: list[list[float]] = []
+        self._named: list[Joint] = []
 
-    def _add(self, kind: float, rows: int, numbers: list[float]) -> int:
+    def _add(
+        self, kind: float, rows: int, numbers: list[float], name: str, body: int, point: tuple[float, float]
+    ) -> int:
+        first = 3 * body
+        numbered = tuple(range(self.n_c, self.n_c + rows))
+        self._named.append(Joint(unused(name, self._named), numbered, (first, first + 1), (first + 2,), point))
         self._joints.append([kind, float(self.n_c), *numbers])
         self.n_c += rows
         return self.n_c - rows
 
+    def _between(
+        self, kind: str, i: int, a: tuple[float, float], j: int, b: tuple[float, float]
+    ) -> tuple[str, int, tuple[float, float]]:
+        """Name of a joint, the body on which it acts (i, or j where i is the ground), and the point of this body."""
+        body, other, point = (j, i, b) if i == GROUND else (i, j, a)
+        return f"{kind} {self.names[body]}-{'ground' if other == GROUND else self.names[other]}", body, point
+
     def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
         """Two rows: point a of body i is point b of body j (or of the ground); returns the first one's number."""
-        return self._add(PIN, 2, [i, *a, j, *b, 0.0])
+        return self._add(PIN, 2, [i, *a, j, *b, 0.0], *self._between("pin", i, a, j, b))
 
     def distance(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float], length: float) -> int:
         """A row: both points are `length` apart."""
-        return self._add(DISTANCE, 1, [i, *a, j, *b, 0.5 * length**2])
+        return self._add(DISTANCE, 1, [i, *a, j, *b, 0.5 * length**2], *self._between("distance", i, a, j, b))
 
     def drive(
         self, coordinate: int, start: float, rate: float = 0.0, amplitude: float = 0.0, frequency: float = 0.0
     ) -> int:
         """A row: a coordinate is start + rate t + amplitude sin(frequency t); by default it is held."""
-        return self._add(COORDINATE, 1, [coordinate, start, rate, GROUND, amplitude, frequency, 0.0])
+        body, part = divmod(coordinate, 3)
+        name = f"drive of {('x', 'y', 'angle')[part]} of {self.names[body]}"
+        numbers = [coordinate, start, rate, GROUND, amplitude, frequency, 0.0]
+        return self._add(COORDINATE, 1, numbers, name, body, (0.0, 0.0))
 
     def system(self, name: str) -> ConstrainedSystem:
         """The system of the joints so far."""
@@ -226,6 +247,7 @@ class PlanarBodies:
             kinematics=kinematics,
             parameters=np.concatenate([sizes, bodies.ravel(), np.ravel(self._joints)]),
             constant_mass=True,
+            joints=self._named,
             name=name,
         )
 

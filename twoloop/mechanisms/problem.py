@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.joints import Joint
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -160,3 +161,8 @@ class Problem:
         unknown = [tag for tag in self.tags if tag not in TAGS]
         if unknown:
             raise ValueError(f"tags must be of {', '.join(TAGS)}; given {unknown[0]!r}")
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The named joints of the system, whose forces and torques `Result.reactions` gives."""
+        return self.system.joints

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.joints import Joint
 from twoloop.mechanisms.problem import Array
 from twoloop.system import ConstrainedSystem
 
@@ -99,6 +100,7 @@ class QuadraticSystem:
 
     def __init__(self, mass: Array, force: Array):
         self.mass, self.force = np.asarray(mass, dtype=float), np.asarray(force, dtype=float)
+        self.joints: list[Joint] = []
         self._constants: list[float] = []
         self._linear: list[tuple[float, ...]] = []
         self._quadratic: list[tuple[float, ...]] = []
@@ -124,6 +126,12 @@ class QuadraticSystem:
         parts = [(0.5, difference(a, b), difference(a, b)) for a, b in zip(first, second, strict=True)]
         return self.row(*parts, (-0.5 * length**2, ONE, ONE))
 
+    def link(self, name: str, i: int, other: Sequence[Scalar], length: float) -> int:
+        """A row, and a joint of this name: the point mass at q[i], q[i + 1] keeps its distance from another point."""
+        row = self.distance(point(i), other, length)
+        self.joints.append(Joint(name, (row,), (i, i + 1)))
+        return row
+
     def system(self, name: str, bandwidth: int | None = None) -> ConstrainedSystem:
         """The system of the rows so far."""
         entries = [(i, j, self.mass[i, j]) for i, j in np.argwhere(self.mass)]
@@ -140,6 +148,7 @@ class QuadraticSystem:
             parameters=np.concatenate([sizes, self.force, self._constants, *tables]),
             constant_mass=True,
             bandwidth=bandwidth,
+            joints=self.joints,
             name=name,
         )
 

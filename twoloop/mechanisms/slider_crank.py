@@ -19,14 +19,15 @@ CRANK, ROD = 0.5, 1.2  # m
 MASSES = (1.0, 1.5, 0.8)  # kg
 INERTIAS = (MASSES[0] * CRANK**2 / 12.0, MASSES[1] * ROD**2 / 12.0, 0.02)  # kg m^2
 PARAMETERS = {"crank": CRANK, "rod": ROD, "masses": MASSES, "inertias": INERTIAS, "gravity": GRAVITY}
-NAMES = body_names("crank", "rod", "slider")
+BODIES = ("crank", "rod", "slider")
+NAMES = body_names(*BODIES)
 ANGLE, RATE = 0.5, 8.0  # of the free crank at the start, rad and rad/s
 DRIVE = {"start": 0.5, "rate": 4.0, "amplitude": 0.3, "frequency": 3.0}
 SOURCE = "textbook mechanism; dimensions and start were chosen for this project"
 
 
 def _rows(redundant: bool) -> PlanarBodies:
-    rows = PlanarBodies(MASSES, INERTIAS, GRAVITY)
+    rows = PlanarBodies(BODIES, MASSES, INERTIAS, GRAVITY)
     rows.pin(0, (-0.5 * CRANK, 0.0), GROUND, (0.0, 0.0))
     rows.pin(1, (-0.5 * ROD, 0.0), 0, (0.5 * CRANK, 0.0))
     rows.pin(2, (0.0, 0.0), 1, (0.5 * ROD, 0.0))

@@ -1,11 +1,12 @@
 """How a mechanism of spatial bodies is put together: bodies at their start, joints and springs between them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.joints import Joint, unused
 from twoloop.mechanisms import spatial
 from twoloop.mechanisms.problem import Array
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
@@ -17,6 +18,8 @@ NAMES = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
 
 class SpatialBodies:
     """Collects bodies, joints and springs. Points and directions are given in space, at the start.
+
+    Joints are named by their kind and their bodies: "revolute crank-ground" is what the ground does to the crank.
 
     Parameters
     ----------
@@ -33,6 +36,7 @@ class SpatialBodies:
         self._v: list[Array] = [np.zeros(0)]
         self._R: list[Array] = []
         self._joints: list[list[float]] = []
+        self._named: list[Joint] = []  # rows not counting the normalisations
         self._springs: list[list[float]] = []
 
     def body(
@@ -83,37 +87,55 @@ class SpatialBodies:
         self._joints.append([kind, float(self.n_joint_rows), float(i), *a, float(j), *b, *s])
         self.n_joint_rows += rows
 
-    def spherical(self, i: int, j: int, point: ArrayLike) -> None:
-        """Three rows: both bodies share a point."""
+    def _coincide(self, i: int, j: int, point: ArrayLike) -> None:
         self._add(POINT, 3, i, self._from_centre(i, point), j, self._from_centre(j, point), np.zeros(3))
 
-    def perpendicular(self, i: int, a: ArrayLike, j: int, b: ArrayLike) -> None:
-        """A row: the direction a of body i and b of body j stay perpendicular."""
+    def _perpendicular(self, i: int, a: ArrayLike, j: int, b: ArrayLike) -> None:
         self._add(DIRECTION, 1, i, self._along(i, a), j, self._along(j, b), np.zeros(3))
 
-    def parallel(self, i: int, j: int, axis: ArrayLike) -> None:
-        """Two rows: both bodies keep a common direction."""
+    def _parallel(self, i: int, j: int, axis: ArrayLike) -> None:
         for across in _across(axis):
-            self.perpendicular(i, across, j, axis)
+            self._perpendicular(i, across, j, axis)
+
+    def _name(self, kind: str, i: int, j: int, point: ArrayLike, first: int) -> None:
+        """Name the rows since `first`: a joint that acts on body i, or, where that is the ground, on body j."""
+        body, other = (j, i) if i == GROUND else (i, j)
+        name = f"{kind} {self._names[body]}-{'ground' if other == GROUND else self._names[other]}"
+        rows, place = tuple(range(first, self.n_joint_rows)), 7 * body
+        position, parameters = tuple(range(place, place + 3)), tuple(range(place + 3, place + 7))
+        there = tuple(self._from_centre(body, point))
+        self._named.append(Joint(unused(name, self._named), rows, position, parameters, there))
+
+    def spherical(self, i: int, j: int, point: ArrayLike) -> None:
+        """Three rows: both bodies share a point."""
+        first = self.n_joint_rows
+        self._coincide(i, j, point)
+        self._name("spherical", i, j, point, first)
 
     def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
         """Five rows: a hinge at a point."""
-        self.spherical(i, j, point)
-        self.parallel(i, j, axis)
+        first = self.n_joint_rows
+        self._coincide(i, j, point)
+        self._parallel(i, j, axis)
+        self._name("revolute", i, j, point, first)
 
     def universal(self, i: int, j: int, point: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
         """Four rows: a cross at a point, one axis fixed in body i, the other, perpendicular, in body j."""
-        self.spherical(i, j, point)
-        self.perpendicular(i, a, j, b)
+        first = self.n_joint_rows
+        self._coincide(i, j, point)
+        self._perpendicular(i, a, j, b)
+        self._name("universal", i, j, point, first)
 
     def prismatic(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
         """Five rows: body j slides along an axis of body i through a point, and does not turn on it."""
+        start = self.n_joint_rows
         first, second = _across(axis)
         here, there = self._from_centre(i, point), self._from_centre(j, point)
         for across in (first, second):
             self._add(PLANE, 1, i, self._along(i, across), j, there, here)
-        self.parallel(i, j, axis)
-        self.perpendicular(i, first, j, second)
+        self._parallel(i, j, axis)
+        self._perpendicular(i, first, j, second)
+        self._name("prismatic", i, j, point, start)
 
     def spring(
         self, i: int, a: ArrayLike, j: int, b: ArrayLike, stiffness: float, damping: float, length: float
@@ -135,6 +157,7 @@ class SpatialBodies:
             jacobian=spatial.jacobian,
             gamma=spatial.gamma,
             parameters=np.concatenate([[n, len(self._joints), len(self._springs)], self.gravity, *tables]),
+            joints=[replace(joint, rows=tuple(n + row for row in joint.rows)) for joint in self._named],
             name=name,
         )
 

@@ -1,0 +1,418 @@
+"""Reactions against Newton's and Euler's laws, body by body, from accelerations and applied forces alone."""
+
+import copy
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+import twoloop
+from twoloop import ConstrainedSystem, ConstraintWarning, Joint, solve_dae
+from twoloop.mechanisms import (
+    andrews,
+    bricard,
+    closed_chain,
+    double_pendulum,
+    driven_crank,
+    driven_slider_crank,
+    four_bar,
+    heavy_top,
+    knife_edge,
+    moderately_stiff_beam,
+    n_four_bar,
+    pendulum,
+    projection_pendulum,
+    redundant_slider_crank,
+    rolling_disc,
+    spatial_four_bar,
+    spatial_slider_crank,
+    sundials_slider_crank,
+    very_flexible_beam,
+)
+from twoloop.mechanisms import governor as governor_of
+from twoloop.mechanisms.governor import ANGLE, CUBE, DAMPING, HEIGHT, LENGTH, SLACK, STIFFNESS
+from twoloop.mechanisms.rotation import G, rotation_matrix
+
+DOWN = np.array([0.0, -9.81])
+
+
+def run(problem, t_end):
+    """A few states of a run."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConstraintWarning)
+        result = solve_dae(
+            problem.system, (0.0, t_end), problem.q0, problem.v0, "DOP853", t_eval=np.linspace(0.0, t_end, 6)
+        )
+    assert result.success
+    return result
+
+
+def sums(result, dimension):
+    """Force and torque about the origin of space on each body, by the names of the joints, "kind body-other"."""
+    forces, torques = {}, {}
+    for joint in result.system.joints:
+        reaction = result.reactions(joint.name)
+        n_t = result.t.size
+        assert reaction.force.shape == reaction.point.shape == (dimension, n_t)
+        assert reaction.torque.shape == ((n_t,) if dimension == 2 else (3, n_t))
+        torque = reaction.torque + moment(reaction.point, reaction.force)
+        kind, _, bodies = joint.name.partition(" ")
+        ends = [bodies.split(" of ")[1], "ground"] if kind == "drive" else bodies.split("-")
+        for body, sign in zip(ends, (1.0, -1.0), strict=True):
+            forces[body] = forces.get(body, 0.0) + sign * reaction.force
+            torques[body] = torques.get(body, 0.0) + sign * torque
+    return forces, torques
+
+
+def moment(arm, force):
+    """Of a force about the origin: a number, planar, or a vector."""
+    return arm[0] * force[1] - arm[1] * force[0] if len(arm) == 2 else np.cross(arm, force, axis=0)
+
+
+def close(actual, expected, scale):
+    assert np.abs(actual - expected).max() < 1e-9 * max(1.0, np.abs(scale).max())
+
+
+# --- planar bodies: x, y of the centre, angle
+
+N_BAR = n_four_bar(3, "bodies")
+PLANAR = {
+    "redundant slider-crank": (redundant_slider_crank, ("crank", "rod", "slider"), 0.5),
+    "driven slider-crank": (driven_slider_crank, ("crank", "rod", "slider"), 0.5),
+    "driven crank": (driven_crank, ("crank", "rod"), 0.5),
+    "N-four-bar": (lambda: N_BAR, [name.removeprefix("x (m) of ") for name in N_BAR.coordinates[::3]], 0.2),
+}
+
+
+def check_planar(result, names, masses, inertias, forces, torques):
+    for body, name in enumerate(names):
+        centre, acceleration = (array[3 * body : 3 * body + 2] for array in (result.q, result.a))
+        inertial = masses[body] * (acceleration - DOWN[:, None])
+        close(forces[name], inertial, inertial)
+        spun = inertias[body] * result.a[3 * body + 2] + moment(centre, inertial)
+        close(torques[name], spun, np.abs(inertial))
+
+
+@pytest.mark.parametrize("name", PLANAR)
+def test_planar_bodies(name):
+    make, names, t_end = PLANAR[name]
+    problem = make()
+    result = run(problem, t_end)
+    mass = problem.system.mass(0.0, problem.q0).diagonal()
+    check_planar(result, names, mass[::3], mass[2::3], *sums(result, 2))
+
+
+@pytest.mark.parametrize("changed", [{}, {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}], ids=["default", "second"])
+def test_four_bar(changed):
+    problem = four_bar(**changed)
+    result = run(problem, 1.0)
+    lengths = np.array([problem.parameters[name] for name in ("L1", "L2", "L3")])
+    pins = {name: result.reactions(name) for name in ("O", "1-2", "2-3", "A")}
+    assert problem.joints == problem.system.joints and {joint.name for joint in problem.joints} == set(pins)
+    # the point of a pin between two bars is the end of the one, and the beginning of the other
+    for bar, pin in enumerate(("1-2", "2-3", "A")):
+        angle = result.q[3 * bar + 2]
+        end = result.q[3 * bar : 3 * bar + 2] + 0.5 * lengths[bar] * np.array([np.cos(angle), np.sin(angle)])
+        assert np.abs(end - pins[pin].point).max() < 1e-12
+    forces, torques = {}, {}
+    for bar, signs in enumerate(({"O": 1.0, "1-2": -1.0}, {"1-2": 1.0, "2-3": -1.0}, {"2-3": 1.0, "A": 1.0})):
+        forces[bar] = sum(sign * pins[pin].force for pin, sign in signs.items())
+        torques[bar] = sum(sign * moment(pins[pin].point, pins[pin].force) for pin, sign in signs.items())
+    check_planar(result, range(3), lengths, lengths**3 / 12.0, forces, torques)
+    for pin in pins.values():  # pins carry no torque
+        assert np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max()
+        assert pin.unique
+
+
+def test_knife_edge():
+    problem = knife_edge()
+    result = run(problem, 2.0)
+    blade = result.reactions("blade")
+    m, slope = problem.parameters["mass"], problem.parameters["slope"]
+    inertial = m * (result.a[:2] - np.array([[9.81 * np.sin(slope)], [0.0]]))
+    close(blade.force, inertial, inertial)
+    close(blade.torque, problem.parameters["inertia"] * result.a[2], inertial)
+    along = np.stack([np.cos(result.q[2]), np.sin(result.q[2])])
+    assert np.abs((blade.force * along).sum(axis=0)).max() < 1e-12  # across the blade
+
+
+@pytest.mark.parametrize(
+    "make", [pendulum, projection_pendulum, double_pendulum, closed_chain, lambda: closed_chain(7)]
+)
+def test_point_masses_on_links(make):
+    problem = make()
+    result = run(problem, 0.5)
+    n, gravity = problem.system.n_q // 2, problem.parameters["gravity"]
+    total = np.zeros_like(result.q)
+    for joint in problem.joints:
+        link = result.reactions(joint.name)
+        own = list(joint.translation)
+        total[own] += link.force
+        number = int(joint.name.removeprefix("link").strip() or 1)
+        if number == n + 1:
+            continue  # from the last mass to the ground
+        if number > 1:
+            total[[own[0] - 2, own[1] - 2]] -= link.force
+        assert (link.torque == 0.0).all() and link.unique
+    masses = problem.parameters["mass"]
+    inertial = masses * (result.a + gravity * np.tile([[0.0], [1.0]], (n, 1)))
+    close(total, inertial, inertial)
+
+
+@pytest.mark.parametrize("make", [very_flexible_beam, moderately_stiff_beam])
+def test_the_base_of_the_beam(make):
+    """Weight and reaction change the momentum; the motion x = y = const of all nodes has that of the whole beam."""
+    problem = make(2)
+    result = run(problem, 0.05)
+    M = problem.system.mass(0.0, problem.q0)
+    rigid = np.zeros((2, problem.system.n_q))
+    rigid[0, 0::6] = rigid[1, 1::6] = 1.0
+    mass = rigid[0] @ M @ rigid[0]
+    force = result.reactions("base").force
+    expected = rigid @ M @ result.a - mass * DOWN[:, None]
+    close(force, expected, force)
+
+
+# --- spatial bodies: centre of mass and Euler parameters
+
+SPATIAL = {
+    "heavy top": (heavy_top, 0.05),
+    "spatial four-bar": (spatial_four_bar, 0.3),
+    "spatial slider-crank": (spatial_slider_crank, 0.3),
+    "governor": (governor_of, 0.05),
+}
+GOVERNOR_ROD = np.array([np.cos(ANGLE), 0.0, -np.sin(ANGLE)])
+
+
+def springs(result, names):
+    """Forces and torques about the origin of the governor's two springs."""
+    forces, torques = ({name: np.zeros((3, result.t.size)) for name in names} for _ in range(2))
+    q0 = result.q[:, 0]
+    for rod, side in (("rod A", 1.0), ("rod B", -1.0)):
+        mirror = np.array([side, 1.0, 1.0])
+        hinge = mirror * np.array([0.5 * CUBE, 0.0, LENGTH])
+        ends = {
+            "slider": mirror * np.array([0.5 * CUBE, 0.0, HEIGHT]),
+            rod: hinge + 0.5 * LENGTH * mirror * GOVERNOR_ROD,
+        }
+        at, moving = {}, {}
+        for name, start in ends.items():
+            k = 7 * names.index(name)
+            own = rotation_matrix(q0[k + 3 : k + 7]).T @ (start - q0[k : k + 3])
+            turned = [(rotation_matrix(e), u) for e, u in states(result, k)]
+            at[name] = result.q[k : k + 3] + np.stack([R @ own for R, _ in turned], axis=1)
+            rates = [np.cross(R @ spin, R @ own) for R, spin in turned]
+            moving[name] = result.v[k : k + 3] + np.stack(rates, axis=1)
+        gap, rate = at[rod] - at["slider"], moving[rod] - moving["slider"]
+        length = np.linalg.norm(gap, axis=0)
+        pull = (STIFFNESS * (length - SLACK) + DAMPING * (gap * rate).sum(axis=0) / length) * gap / length
+        for name, sign in (("slider", 1.0), (rod, -1.0)):
+            forces[name] = forces[name] + sign * pull
+            torques[name] = torques[name] + sign * moment(at[name], pull)
+    return forces, torques
+
+
+def states(result, k):
+    """Euler parameters and the angular velocity along the axes of the body whose coordinates begin at k."""
+    return [(e, 2.0 * G(e) @ u) for e, u in zip(result.q[k + 3 : k + 7].T, result.v[k + 3 : k + 7].T, strict=True)]
+
+
+@pytest.mark.parametrize("name", SPATIAL)
+def test_spatial_bodies(name):
+    make, t_end = SPATIAL[name]
+    problem = make()
+    result = run(problem, t_end)
+    names = [coordinate.removeprefix("x (m) of ") for coordinate in problem.coordinates[::7]]
+    forces, torques = sums(result, 3)
+    of_springs = springs(result, names) if name == "governor" else None
+    M = problem.system.mass(0.0, problem.q0)
+    for body, label in enumerate(names):
+        k = 7 * body
+        mass, e0 = M[k, k], problem.q0[k + 3 : k + 7]
+        inertia = G(e0) @ M[k + 3 : k + 7, k + 3 : k + 7] @ G(e0).T / 4.0
+        inertial = mass * (result.a[k : k + 3] - np.array([[0.0], [0.0], [-9.81]]))
+        spun = np.empty_like(inertial)
+        for i, (e, spin) in enumerate(states(result, k)):
+            turning = inertia @ (2.0 * G(e) @ result.a[k + 3 : k + 7, i]) + np.cross(spin, inertia @ spin)
+            spun[:, i] = rotation_matrix(e) @ turning
+        spun += moment(result.q[k : k + 3], inertial)
+        scale = inertial
+        if of_springs is not None:
+            inertial, spun = inertial - of_springs[0][label], spun - of_springs[1][label]
+            scale = np.abs(of_springs[0][label]) + np.abs(inertial)
+        close(forces[label], inertial, scale)
+        close(torques[label], spun, scale)
+    assert all(result.reactions(joint.name).unique for joint in problem.joints)
+
+
+def test_bars_by_rotation_matrices_with_a_redundant_row():
+    """Bricard: hinges share a load in any proportion, the sum on each bar is that of Newton and Euler."""
+    problem = bricard()
+    result = run(problem, 0.3)
+    assert (result.rank, problem.system.n_c) == (59, 60)
+    forces, torques = sums(result, 3)
+    moments = np.array([1.0 / 12.0, 0.01 / 12.0, 0.01 / 12.0])  # kg m^2, the second moments along the columns
+    for bar in range(5):
+        k = 12 * bar
+        inertial = 1.0 * (result.a[k : k + 3] - np.array([[0.0], [-9.81], [0.0]]))
+        columns, turning = (array[k + 3 : k + 12].reshape(3, 3, -1) for array in (result.q, result.a))
+        spun = sum(moments[i] * np.cross(columns[i], turning[i], axis=0) for i in range(3))
+        spun = spun + moment(result.q[k : k + 3], inertial)
+        close(forces[f"bar {bar + 1}"], inertial, 10.0)
+        close(torques[f"bar {bar + 1}"], spun, 10.0)
+    assert not any(result.reactions(joint.name).unique for joint in problem.joints)
+
+
+# --- what is unique
+
+
+def test_a_redundant_row_is_said_to_leave_single_joints_open():
+    """Another choice of the multipliers of the same motion changes single joints, and no sum on a body."""
+    problem = redundant_slider_crank()
+    result = run(problem, 0.3)
+    rows = problem.system.rows(0.0, problem.q0)
+    idle = np.linalg.svd(rows)[0][:, result.rank :]
+    assert idle.shape == (9, 1)
+    changed = {
+        joint.name: bool(np.abs(rows[list(joint.rows)].T @ idle[list(joint.rows)]).max() > 1e-6)
+        for joint in problem.joints
+    }
+    assert {name: not result.reactions(name).unique for name in changed} == changed
+    assert changed["pin rod-crank"] and changed["distance slider-crank"]
+    assert not changed["pin crank-ground"]
+
+
+def test_rows_that_depend_on_one_another_within_a_joint_leave_it_unique():
+    system = hanging(n_c=2, rows=(0, 1))
+    with pytest.warns(ConstraintWarning):
+        result = solve_dae(system, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0])
+    link = result.reactions("link")
+    assert result.rank == 1 and link.unique
+    assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-12
+    apart = hanging(n_c=2, rows=(0,))
+    with pytest.warns(ConstraintWarning):
+        assert not solve_dae(apart, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0]).reactions("link").unique
+
+
+# --- signs, points, names
+
+
+def hanging(n_c=1, rows=(0,), joints=None):
+    """A bob of 1 kg on a link of 1 m, said once or twice."""
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=n_c,
+        mass=np.eye(2),
+        force=gravity,
+        constraint=once if n_c == 1 else twice,
+        jacobian=jacobian_once if n_c == 1 else jacobian_twice,
+        joints=[Joint("link", rows, (0, 1))] if joints is None else joints,
+        name="bob",
+    )
+
+
+def gravity(t, q, v):
+    return np.array([0.0, -9.81])
+
+
+def once(t, q):
+    return np.array([0.5 * (q @ q - 1.0)])
+
+
+def twice(t, q):
+    return np.repeat(0.5 * (q @ q - 1.0), 2)
+
+
+def jacobian_once(t, q):
+    return q[None, :]
+
+
+def jacobian_twice(t, q):
+    return np.stack([q, q])
+
+
+@pytest.mark.parametrize(("rows", "unique"), [((0,), False), ((1,), False), ((0, 1), True)])
+def test_what_is_unique_among_sums_of_rows(rows, unique):
+    sums_of_rows = np.array([[1.0, 0.0], [1.0, 2.0]])
+    system = hanging(n_c=2, joints=[Joint("link", rows, (0, 1), equations=sums_of_rows)])
+    with pytest.warns(ConstraintWarning):
+        link = solve_dae(system, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0]).reactions("link")
+    assert link.unique == unique
+    if unique:
+        assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-12
+
+
+def test_what_hangs_is_pulled_upwards():
+    result = solve_dae(hanging(), (0.0, 0.1), [0.0, -1.0], [0.0, 0.0])
+    link = result.reactions("link")
+    assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-13
+    assert (link.point == result.q).all()
+
+
+def test_a_drive_does_work_by_its_torque():
+    problem = driven_crank()
+    times = np.linspace(0.4, 0.5, 41)
+    result = solve_dae(
+        problem.system, (0.0, 1.0), problem.q0, problem.v0, "Gauss12", rtol=1e-11, atol=1e-11, t_eval=times
+    )
+    torque = result.reactions("drive of angle of crank").torque
+    energy = problem.energy(result.t, result.q, result.v)
+    power = torque * result.v[2]
+    weights = np.tile([2.0, 4.0], 20)
+    work = (power[:-1] @ weights + power[-1] - power[0]) * (times[1] - times[0]) / 3.0  # Simpson's rule
+    assert work == pytest.approx(energy[-1] - energy[0], rel=1e-8)
+
+
+def test_a_point_elsewhere_carries_the_moment_of_the_force():
+    problem = driven_crank()
+    joint = problem.joints[0]
+    moved = Joint("elsewhere", joint.rows, joint.translation, joint.rotation, (0.3, -0.2), in_space=True)
+    system = copy.copy(problem.system)
+    system.joints = (joint, moved)
+    result = solve_dae(system, (0.0, 0.3), problem.q0, problem.v0)
+    here, there = result.reactions(joint.name), result.reactions("elsewhere")
+    assert (here.force == there.force).all()
+    assert np.abs(there.torque - here.torque - moment(here.point - there.point, here.force)).max() < 1e-12
+    assert (there.point == [[0.3], [-0.2]]).all()
+
+
+def test_names():
+    result = run(four_bar(), 0.1)
+    with pytest.raises(ValueError, match=r"name must be a joint of 'four-bar': 'O', '1-2', '2-3', 'A'; given 'B'"):
+        result.reactions("B")
+    spatial = [joint.name for joint in spatial_slider_crank().joints]
+    assert spatial == [
+        "revolute crank-ground",
+        "spherical rod-crank",
+        "universal rod-slider",
+        "prismatic slider-ground",
+    ]
+
+
+@pytest.mark.parametrize("make", [andrews, sundials_slider_crank, rolling_disc, n_four_bar])
+def test_mechanisms_without_absolute_coordinates_have_no_joints(make):
+    problem = make()
+    assert problem.joints == ()
+    with pytest.raises(ValueError, match=r"Name them in the system, joints=\[twoloop.Joint"):
+        run(problem, 1e-3).reactions("O")
+
+
+def test_results_in_files(tmp_path):
+    problem = four_bar()
+    result = run(problem, 0.1)
+    result.save(tmp_path / "run.npz")
+    with pytest.raises(ValueError, match=r"twoloop.load\(path, system\)"):
+        twoloop.load(tmp_path / "run.npz").reactions("O")
+    again = twoloop.load(tmp_path / "run.npz", problem.system)
+    assert (again.reactions("O").force == result.reactions("O").force).all()
+
+
+def test_copies_and_pickles_keep_joints():
+    system = hanging()
+    for other in (copy.copy(system), copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
+        assert [joint.name for joint in other.joints] == ["link"]
+        assert (
+            np.abs(solve_dae(other, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0]).reactions("link").force[1] - 9.81).max()
+            < 1e-12
+        )
