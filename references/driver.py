@@ -89,6 +89,11 @@ def check_run(
 ) -> tuple[float, float, Array, Array, Array | None]:
     """Return start, end, q0, v0 and output times, or say what is wrong with an argument of a run."""
     check_system(system)
+    if system.n_a > 0:
+        raise ValueError(
+            f"system must have constraints on positions only: the adapters of other solvers have no rows A v + b = 0; "
+            f"given {system.name!r} with n_a = {system.n_a}. Take solve_dae"
+        )
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)

@@ -284,10 +284,9 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
     row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
     row |= {**run.settings, "t_end": case.t_end, "repeat": k}
     what = (id(case), solver.name)
-    if what not in warm:  # compiles what is not compiled yet; a failure comes back in the run itself
+    if what not in warm:
         warm.add(what)
-        span = 10.0 * run.value if solver.setting == "h" else WARM_UP * case.t_end
-        attempt(replace(run, case=replace(case, t_end=min(span, case.t_end), time_limit=COMPILING)), k)
+        warm_up(run, k)
     result, status, message = attempt(run, k)
     stats = Statistics() if result is None else result.stats
     spent = [] if result is None else [stats.cpu_time]
@@ -308,6 +307,12 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
     invariants = dict(case.invariants)
     row |= metrics.measure(case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants)
     return row if measure is None else row | measure(run, result)
+
+
+def warm_up(run: Run, repeat: int, limit: float = COMPILING) -> None:
+    """Compile what a run calls, by the beginning of it; a failure comes back in the run itself."""
+    span = 10.0 * run.value if run.solver.setting == "h" else WARM_UP * run.case.t_end
+    attempt(replace(run, case=replace(run.case, t_end=min(span, run.case.t_end), time_limit=limit)), repeat)
 
 
 def called_from(run: Run) -> str:

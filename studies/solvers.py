@@ -29,9 +29,10 @@ IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, 
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
 CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
+ADAMS = "Adams"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", OWN_BDF)
-PRESETS = (*IMPLICIT, OWN_EXPLICIT, "Adams")  # of twoloop, with their own options
+PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS)  # of twoloop, with their own options
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
@@ -40,7 +41,7 @@ GEAR_STARTS = ("accurate", "ramp")
 
 # what `compare` runs, and the lines from which its figure takes the cheapest seven
 COMPARED = (
-    *("Adams", "DOP853 (two-loop)", "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
+    *(ADAMS, "DOP853 (two-loop)", "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
     *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
 )
 

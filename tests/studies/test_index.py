@@ -260,11 +260,33 @@ def test_each_promise_has_its_opposite(tmp_path):
     assert "Large steps*: does not hold" in screen(tmp_path, step_size=steps | {"longer": False})
 
 
+def test_what_can_be_trusted_turns_with_the_findings(tmp_path):
+    found = {"n": 21, "tight": 1e-10, "only_ours": ["a"], "only_others": [], "none_right": ["b", "c"], "not_put": ["d"]}
+    text = screen(tmp_path, validation=found | {"n_wrong": {"ours": 1, "others": 57}})
+    assert "right on 17, ours only on 1 (and on 1 that our adapters do not put to others), others only on 0" in text
+    assert "1 of ours, 57 of others" in text
+    traps = {"n_traps": 15, "ours_bad": [{}], "others_bad": [{}, {}], "missed_by_all": []}
+    assert "wrong and silent, or hang: 1 of ours, 2 of others." in screen(tmp_path, honesty=traps)
+    text = screen(tmp_path, honesty=traps | {"missed_by_all": ["pulse"]})
+    assert "no solver notices: pulse." in text
+    assert "73 planted faults" in screen(tmp_path, planted_errors={"n": 73, "missed": ["x"]})
+
+
 def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):
     text = index.first_screen(tmp_path, False)
-    for name in ("work_precision", "energy", "violation", "beam", "step_size", "claims", "table3"):
+    for name in (
+        "work_precision",
+        "energy",
+        "violation",
+        "beam",
+        "step_size",
+        "claims",
+        "table3",
+        "validation",
+        "honesty",
+    ):
         assert f"not run yet (`python -m studies.{name}`)" in text
-    assert text.count(": not run yet") + text.count("(not run yet:") == 10 + len(index.STUDIES)
+    assert text.count(": not run yet") + text.count("(not run yet:") == 13 + len(index.STUDIES)
     assert "Not judged by quick runs" in index.first_screen(tmp_path, True)
     (tmp_path / "beam.json").write_text("{")
     with pytest.raises(StudyError, match=r"beam.json cannot be read.*studies.beam again"):

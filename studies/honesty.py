@@ -1,0 +1,274 @@
+"""Which solver says so when it is wrong: every solver on every trap, right, said so, wrong and silent, or hung."""
+
+import multiprocessing
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from multiprocessing.connection import Connection
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from references.ida import solve_ida
+from references.ida_c import solve_ida_c
+from references.index1 import solve_index1
+from studies import study
+from studies.cli import StudyError
+from studies.render import render, table
+from studies.store import Output, Row
+from studies.traps import Trap, traps
+from twoloop import ConstrainedSystem, Result, solve_dae
+
+Array = NDArray[np.float64]
+
+OWN = ("SunRadau5", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
+QUICK_OWN, QUICK_SCIPY = ("SunRadau5", "DOP853", "BDF"), ("DOP853",)
+LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
+LEAST = 1e-10  # ... of which no more is asked than this
+GRACE = 6.0  # s beyond the time limit of a run after which it hangs
+TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right answer: the first that succeed
+TRUTH_LIMIT = 10.0  # s that one of them may take
+AGREE = 1e-7  # how far the two may differ
+RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
+ORDER = (HANG, SILENT, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
+
+Call = Callable[[Trap], Result]
+
+
+def own(method: str, trap: Trap) -> Result:
+    """One of ours, as a user calls it."""
+    step = {} if trap.step_size is None else {"step_size": trap.step_size}
+    tolerances = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
+    span = (0.0, trap.t_end)
+    return solve_dae(trap.system, span, trap.q0, trap.v0, method=method, **tolerances, **step)  # type: ignore[arg-type]
+
+
+def scipy(method: str, trap: Trap) -> Result:
+    """One of SciPy's solvers on index 1."""
+    return solve_index1(*_start(trap), method, trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
+
+
+def ida(trap: Trap) -> Result:
+    """IDA through scikit-sundae."""
+    return solve_ida(*_start(trap), "stabilised", trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
+
+
+def ida_c(trap: Trap) -> Result:
+    """IDA's library with compiled functions."""
+    return solve_ida_c(*_start(trap), trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
+
+
+def _start(trap: Trap) -> tuple[Any, Any, Any, Any]:
+    return trap.system, (0.0, trap.t_end), trap.q0, trap.v0
+
+
+def solvers(quick: bool) -> dict[str, Call]:
+    """Name to call; "two-loop" ones first."""
+    made: dict[str, Call] = {f"{name} (two-loop)": partial(own, name) for name in (QUICK_OWN if quick else OWN)}
+    made |= {} if quick else {"IDA, stabilised": ida, "IDA from C": ida_c}
+    return made | {f"{name}, index 1": partial(scipy, name) for name in (QUICK_SCIPY if quick else SCIPY)}
+
+
+def right_answer(trap: Trap) -> Array | None:
+    """Positions at the end by two unlike methods, from one break of the forces to the next; None where there is none.
+
+    Raises
+    ------
+    StudyError
+        If the two agree at no tolerance.
+    """
+    if trap.motion is not None:
+        return trap.motion(trap.t_end)[0]
+    if trap.sane is None:
+        return None
+    differ = np.inf
+    for tolerance in TRUTHS:
+        first = _end(trap.sane, trap, "RadauIIA5", tolerance)
+        second = None if first is None else _end(trap.sane, trap, "Gauss12", tolerance)
+        if first is not None and second is not None:
+            differ = float(np.abs(first - second).max())
+            if differ <= AGREE:
+                return second
+    raise StudyError(f"no right answer for {trap.name} on {trap.mechanism}: two methods differ by {differ:.1e}")
+
+
+def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -> Array | None:
+    """Positions at the end, in pieces between the breaks; None where a piece fails."""
+    q, v = trap.q0, trap.v0
+    for begin, end in pairwise((0.0, *trap.breaks, trap.t_end)):
+        result = solve_dae(
+            system, (begin, end), q, v, method=method, rtol=tolerance, atol=tolerance, time_limit=TRUTH_LIMIT
+        )
+        if not result.success:
+            return None
+        q, v = result.q[:, -1], result.v[:, -1]
+    return q
+
+
+def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
+    """Make a run in a process of its own and send what came of it."""
+    made: Row = {"status": "", "message": "", "error": None, "warned": ""}
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            result = call(trap)
+            made |= {"status": result.status.name, "message": result.message}
+            if result.success and truth is not None:
+                made["error"] = float(np.abs(result.q[:, -1] - truth).max())
+        except Exception as error:
+            made |= {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
+    made["warned"] = " / ".join(str(each.message) for each in said)
+    pipe.send(made)
+
+
+def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
+    """The rule: what a run that came back is."""
+    if row["status"] != "REACHED_END":
+        return SAID
+    limit = LOOSENESS * max(trap.tolerance, LEAST)
+    if has_answer and row["error"] is not None and row["error"] <= limit:
+        return RIGHT
+    return SAID if row["warned"] else SILENT
+
+
+def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
+    """One cell, in a process of its own that is ended when it does not come back."""
+    row: Row = {"trap": trap.name, "mechanism": trap.mechanism, "solver": name, "tol": trap.tolerance}
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=cell, args=(call, trap, truth, there), daemon=True)
+    process.start()
+    there.close()
+    began = time.monotonic()
+    try:
+        came = here.poll(trap.time_limit + GRACE)
+        row |= here.recv() if came else {"status": "HANG", "message": "", "error": None, "warned": ""}
+    except EOFError:
+        row |= {"status": "CRASHED", "message": "the process ended without an answer", "error": None, "warned": ""}
+        came = True
+    process.kill()
+    process.join()
+    row["seconds"] = time.monotonic() - began
+    return row | {"outcome": outcome(row, trap, truth is not None) if came else HANG}
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all cells. The checks of a start in our adapters of foreign solvers are off: those are to answer alone."""
+    rows = []
+    known = solvers(output.call.quick)
+    with output.kept() as kept, unchecked():
+        compiled: set[tuple[str, int, int]] = set()
+        for trap in traps(output.call.quick):
+            if all(f"{trap.name} | {trap.mechanism} | {name}" in kept for name in known):
+                truth = None
+            else:
+                truth = right_answer(trap)
+            for name, call in known.items():
+                key = f"{trap.name} | {trap.mechanism} | {name}"
+                if key not in kept:
+                    if not applies(name, trap):
+                        row = {"trap": trap.name, "mechanism": trap.mechanism, "solver": name, "outcome": NOT_RUN}
+                        kept.add(key, row | {"status": "", "message": "its adapter has no fixed steps"})
+                    else:
+                        warm_up(name, call, trap, compiled)
+                        kept.add(key, run(name, call, trap, truth))
+                rows.append(kept[key])
+    return pd.DataFrame(rows)
+
+
+def applies(name: str, trap: Trap) -> bool:
+    """Fixed steps are asked for of ours alone."""
+    return trap.step_size is None or name.endswith("(two-loop)")
+
+
+def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[str, int, int]]) -> None:
+    """Compile in this process what the children call, on a harmless motion."""
+    shared = call.func.__name__ if isinstance(call, partial) and not name.endswith("(two-loop)") else name
+    size = (shared, trap.system.n_q, trap.system.n_c)
+    sane = trap.sane or trap.system
+    if size in compiled:
+        return
+    compiled.add(size)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            call(replace(trap, system=sane, t_end=1e-6, tolerance=1e-4))
+        except Exception:  # comes again in the run, where it is counted
+            return
+
+
+class unchecked:
+    """Context: references/ without the check of a start, which is ours."""
+
+    def __enter__(self) -> None:
+        self.patches = [patch(f"references.{name}.check_start") for name in ("ida", "ida_c", "index1")]
+        for each in self.patches:
+            each.start()
+
+    def __exit__(self, *_: object) -> None:
+        for each in self.patches:
+            each.stop()
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says."""
+    names, trap_names = list(dict.fromkeys(rows["solver"])), list(dict.fromkeys(rows["trap"]))
+    found: dict[str, Any] = {"n_traps": len(trap_names), "n_cells": int((rows["outcome"] != NOT_RUN).sum())}
+    found["cells"] = []
+    for trap in trap_names:
+        line = {"trap": trap}
+        for name in names:
+            these = rows[(rows["trap"] == trap) & (rows["solver"] == name)]["outcome"].tolist()
+            line[name] = [what for what in ORDER if what in these]
+        found["cells"].append(line)
+    found |= {"solvers": names, "looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
+    ran = rows[rows["outcome"] != NOT_RUN]
+    found["missed_by_all"] = [
+        str(trap) for trap, own in ran.groupby("trap", sort=False) if own["outcome"].isin((SILENT, HANG)).all()
+    ]
+    found["counts"] = {
+        name: {what: int((rows[rows["solver"] == name]["outcome"] == what).sum()) for what in ORDER} for name in names
+    }
+    bad = rows[rows["outcome"].isin((SILENT, HANG))]
+    for which in (True, False):
+        some = bad[bad["solver"].str.endswith("(two-loop)") == which]
+        found["ours_bad" if which else "others_bad"] = [
+            {key: row[key] for key in ("trap", "mechanism", "solver", "outcome", "error")} for _, row in some.iterrows()
+        ]
+    return found
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    cells = [
+        [
+            each["trap"],
+            *(
+                " / ".join(f"**{what.lower()}**" if what in (SILENT, HANG) else what for what in each[name])
+                for name in found["solvers"]
+            ),
+        ]
+        for each in found["cells"]
+    ]
+    short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
+    counts = [[name, *(each[what] for what in ORDER)] for name, each in found["counts"].items()]
+    ready = {"cells": table(["trap", *short], cells), "counts": table(["solver", *(x.lower() for x in ORDER)], counts)}
+    output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study and write its report."""
+    study.run_rows("honesty", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

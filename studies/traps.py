@@ -1,0 +1,213 @@
+"""Traps: systems and starts on which a solver goes wrong unless it notices, each on two chains of point masses.
+
+One set of compiled callbacks serves all of them: what makes the trap stands in the vector of parameters.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop import ConstrainedSystem
+from twoloop.callbacks import callback
+from twoloop.mechanisms import n_four_bar
+
+Array = NDArray[np.float64]
+
+NEVER = 1e30  # s
+# places in the parameters: gravity, mass of the last point, stiffness of a spring that holds it, begin and end of a
+# force along x and its size, when the force becomes NaN, when it raises, wrong entry of C_q, amplitude and frequency
+# of the pivot, where the spring is at rest
+G, LAST, SPRING, BEGIN, END, PUSH, NAN, RAISES, WRONG, AMPLITUDE, OMEGA, REST = range(12)
+SANE = (9.81, 1.0, 0.0, NEVER, NEVER, 0.0, NEVER, NEVER, 0.0, 0.0, 0.0, 0.0)
+
+
+@callback("mass")
+def mass(t, q, p, M):  # type: ignore[no-untyped-def]
+    for i in range(q.size):
+        M[i, i] = p[1] if i >= q.size - 2 else 1.0
+
+
+@callback("force")
+def force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    if t > p[7]:
+        raise ValueError("the trap's callback raises")
+    n = q.size
+    for i in range(1, n, 2):
+        Q[i] = -p[0] * (p[1] if i == n - 1 else 1.0)
+    Q[n - 2] -= p[2] * (q[n - 2] - p[11])
+    if p[3] < t <= p[4]:
+        Q[n - 2] += p[5]
+    if t > p[6]:
+        Q[n - 2] = math.nan
+
+
+@callback("constraint")
+def constraint(t, q, p, C):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    for i in range(C.size):
+        k = i % n  # a further row repeats one
+        x = q[0] - p[9] * math.sin(p[10] * t) if k == 0 else q[2 * k] - q[2 * k - 2]
+        y = q[1] if k == 0 else q[2 * k + 1] - q[2 * k - 1]
+        C[i] = 0.5 * (x * x + y * y - 1.0) * (1.0 + i // n)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    for i in range(Cq.shape[0]):
+        k, scale = i % n, 1.0 + i // n
+        if k == 0:
+            Cq[i, 0] = scale * (q[0] - p[9] * math.sin(p[10] * t))
+            Cq[i, 1] = scale * q[1]
+        else:
+            for axis in range(2):
+                apart = scale * (q[2 * k + axis] - q[2 * k - 2 + axis])
+                Cq[i, 2 * k + axis] = apart
+                Cq[i, 2 * k - 2 + axis] = -apart
+    Cq[0, 1] += p[8]
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    rate = p[9] * p[10] * math.cos(p[10] * t)
+    for i in range(0, Ct.size, n):
+        Ct[i] = -(1.0 + i // n) * (q[0] - p[9] * math.sin(p[10] * t)) * rate
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    rate = p[9] * p[10] * math.cos(p[10] * t)
+    second = -p[10] * p[10] * p[9] * math.sin(p[10] * t)
+    for i in range(Qd.size):
+        k = i % n
+        x = v[0] - rate if k == 0 else v[2 * k] - v[2 * k - 2]
+        y = v[1] if k == 0 else v[2 * k + 1] - v[2 * k - 1]
+        Qd[i] = -(x * x + y * y)
+        if k == 0:
+            Qd[i] += (q[0] - p[9] * math.sin(p[10] * t)) * second
+        Qd[i] *= 1.0 + i // n
+
+
+def chain(n: int, parameters: Array, rows: int = 0) -> ConstrainedSystem:
+    """A chain of n points a metre apart that hangs from a pivot, the first `rows` of its constraints twice."""
+    return ConstrainedSystem(
+        n_q=2 * n,
+        n_c=n + rows,
+        mass=mass,
+        force=force,
+        constraint=constraint,
+        jacobian=jacobian,
+        constraint_rate=constraint_rate,
+        gamma=gamma,
+        parameters=parameters,
+        constant_mass=True,
+        name=f"chain of {n}",
+    )
+
+
+@dataclass(frozen=True)
+class Trap:
+    """What is wrong, on one mechanism.
+
+    Attributes
+    ----------
+    name : str
+    mechanism : str
+    system : ConstrainedSystem
+    q0, v0 : ndarray (n_q,)
+    t_end : float
+    sane : ConstrainedSystem or None
+        The same without the mistake: its motion is the right answer. None: there is none, and whoever reports success
+        is wrong.
+    breaks : tuple of float
+        Times at which the right motion is computed in pieces.
+    motion : callable or None
+        motion(t) -> q, v, where it is known.
+    tolerance, time_limit : float
+    step_size : float or None
+        For methods that take fixed steps.
+    """
+
+    name: str
+    mechanism: str
+    system: ConstrainedSystem
+    q0: Array
+    v0: Array
+    t_end: float
+    sane: ConstrainedSystem | None = None
+    breaks: tuple[float, ...] = ()
+    motion: Callable[[float], tuple[Array, Array]] | None = field(default=None, repr=False)
+    tolerance: float = 1e-8
+    time_limit: float = 3.0
+    step_size: float | None = None
+
+
+def start(n: int) -> tuple[Array, Array]:
+    """The chain out of the vertical, at rest."""
+    angles = np.linspace(0.6, 0.2, n)
+    q = np.empty(2 * n)
+    q[::2], q[1::2] = np.cumsum(np.sin(angles)), -np.cumsum(np.cos(angles))
+    return q, np.zeros(2 * n)
+
+
+def traps(quick: bool) -> list[Trap]:
+    """All traps, each on a chain of two and of three points; singular positions on two linkages."""
+    made = [trap for n in ((2,) if quick else (2, 3)) for trap in of_chain(n)]
+    for n in () if quick else (1, 2):
+        problem = n_four_bar(n)
+        made.append(
+            Trap(
+                "singular position crossed",
+                problem.name,
+                problem.system,
+                problem.q0,
+                problem.v0,
+                5.0,
+                problem.system,
+                motion=problem.motion,
+            )
+        )
+    return made
+
+
+def of_chain(n: int) -> list[Trap]:
+    """The traps on one chain."""
+    q0, v0 = start(n)
+
+    def system(rows: int = 0, **changed: float) -> ConstrainedSystem:
+        p = np.array(SANE)
+        for name, value in changed.items():
+            p[globals()[name]] = value
+        return chain(n, p, rows)
+
+    def trap(name: str, made: ConstrainedSystem, sane: ConstrainedSystem | None, t_end: float = 2.0, **more: object):  # type: ignore[no-untyped-def]
+        return Trap(name, f"chain of {n}", made, **({"q0": q0, "v0": v0} | more), t_end=t_end, sane=sane)  # type: ignore[arg-type]
+
+    across = np.zeros(2 * n)
+    across[:2] = 1e-2 * q0[:2]
+    fast = system(AMPLITUDE=0.01, OMEGA=1e3)
+    moving = np.zeros(2 * n)
+    moving[::2] = 0.01 * 1e3  # all points with the pivot
+    push, pulse = system(BEGIN=0.7, END=NEVER, PUSH=20.0), system(BEGIN=1.0, END=1.001, PUSH=1e3)
+    spring, heavy = system(SPRING=1e7, REST=q0[-2]), system(LAST=1e10)
+    return [
+        trap("inconsistent positions", system(), None, q0=q0 + across / 10.0),
+        trap("inconsistent velocities", system(), None, v0=across),
+        trap("NaN in the force after 1 s", system(NAN=1.0), None),
+        trap("exception in a callback after 1 s", system(RAISES=1.0), None),
+        trap("one wrong entry of C_q", system(WRONG=1e-3), system()),
+        trap("force that jumps", push, push, breaks=(0.7,)),
+        trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001)),
+        trap("redundant row", system(rows=1), system()),
+        trap("pivot driven at 1000 rad/s", fast, fast, 1.0, v0=moving),
+        trap("spring of 1e7 N/m", spring, spring, 1.0),
+        trap("masses 1 to 1e10", heavy, heavy, 1.0),
+        trap("tolerance of 1e-17", system(), system(), tolerance=1e-17),
+        trap("time limit of 0.5 s", system(), None, 1e5, time_limit=0.5),
+        trap("fixed steps of 0.5 s", system(), system(), step_size=0.5),
+    ]

@@ -1,0 +1,75 @@
+"""The honesty study: the rule of the outcomes, a process that hangs, and ours on a few traps."""
+
+import time
+from dataclasses import replace
+from functools import partial
+
+import pandas as pd
+import pytest
+
+from studies import honesty
+from studies.render import render
+from studies.traps import traps
+from twoloop import solve_dae
+
+TRAPS = {trap.name: trap for trap in traps(quick=True)}
+SOUND = TRAPS["redundant row"]
+
+
+DOP853 = partial(honesty.own, "DOP853")
+
+
+def row_of(trap, call=DOP853):
+    return honesty.run("x", call, trap, honesty.right_answer(trap))
+
+
+def test_a_right_answer():
+    row = row_of(SOUND)
+    assert row["outcome"] == honesty.RIGHT
+    assert row["error"] < 1e-6
+
+
+def test_a_wrong_answer_with_success_is_silent():
+    def wrong(trap):
+        return solve_dae(trap.sane, (0.0, trap.t_end), trap.q0, trap.v0, rtol=1e-2, atol=1e-2)
+
+    assert row_of(SOUND, wrong)["outcome"] == honesty.SILENT
+
+
+def test_a_warning_is_saying_so():
+    made = {"status": "REACHED_END", "error": 1.0, "warned": "beware"}
+    assert honesty.outcome(made, SOUND, True) == honesty.SAID
+    assert honesty.outcome(made | {"warned": ""}, SOUND, True) == honesty.SILENT
+    assert honesty.outcome(made | {"error": 1e-9, "warned": ""}, SOUND, True) == honesty.RIGHT
+    assert honesty.outcome(made | {"error": None, "warned": ""}, SOUND, False) == honesty.SILENT
+
+
+def test_a_call_that_does_not_come_back_hangs(monkeypatch):
+    monkeypatch.setattr(honesty, "GRACE", 0.1)
+    short = replace(SOUND, time_limit=0.2)
+    assert honesty.run("x", lambda trap: time.sleep(60.0), short, None)["outcome"] == honesty.HANG
+
+
+@pytest.mark.parametrize("name", ["inconsistent positions", "NaN in the force after 1 s", "one wrong entry of C_q"])
+@pytest.mark.parametrize("method", ["SunRadau5", "DOP853", "BDF"])
+def test_ours_say_so(name, method):
+    assert row_of(TRAPS[name], partial(honesty.own, method))["outcome"] == honesty.SAID
+
+
+def test_sentences_turn_with_the_rows():
+    lines = [
+        {"trap": trap, "mechanism": "chain of 2", "solver": solver, "outcome": honesty.RIGHT, "error": 1e-9}
+        for trap in ("a", "b")
+        for solver in ("BDF (two-loop)", "LSODA, index 1")
+    ]
+    rows = pd.DataFrame(lines)
+
+    def text(rows):
+        tables = {"cells": "", "counts": ""}
+        return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
+
+    assert "None of ours is wrong and silent" in text(rows)
+    rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
+    told = text(rows)
+    assert "Runs of ours that are wrong and silent, or hang: 1." in told
+    assert "No solver notices: b" in told

@@ -1,0 +1,53 @@
+"""The planted errors: some of the faults are caught again, and what is not caught is said."""
+
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from studies import planted_errors
+from studies.faults import Fault, all_faults, python_copy
+from studies.render import render
+from twoloop import mechanisms
+
+FAULTS = {fault.name: fault for fault in all_faults()}
+
+
+def test_there_are_many_and_each_has_its_own_name():
+    assert len(FAULTS) == len(all_faults()) >= 60
+    assert {fault.place for fault in FAULTS.values()} == {
+        "mechanism", "reference", "tableau", "options", "adapter", "report",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "caught_by"),
+    [
+        ("Q_d with the other sign", "start or run refused: ValueError"),
+        ("one mass 0.1 % too large", "reference: q"),
+        ("lam with the other sign", "reference: lam"),
+        ("steps that never grow", "count of evaluations"),
+        ("single precision (ours)", "reference: q"),
+        ("accelerations of the other sign (ours)", "violation: a"),
+    ],
+)
+def test_a_fault_is_caught(name, caught_by):
+    assert planted_errors.row_of(FAULTS[name])["caught_by"] == caught_by
+
+
+def test_a_sound_run_is_not_caught():
+    for sound in (mechanisms.andrews(), mechanisms.driven_crank()):
+        for problem in (sound, replace(sound, system=python_copy(sound.system))):
+            fault = Fault("nothing", "mechanism", problem=problem)
+            assert planted_errors.row_of(fault)["caught_by"] == planted_errors.NONE
+
+
+def test_sentences_turn_with_the_rows():
+    rows = pd.DataFrame([{"fault": f"fault {k}", "place": "tableau", "caught_by": "a test"} for k in range(3)])
+
+    def text(rows):
+        return render("planted_errors", planted_errors.findings_of(rows), {"faults": ""}, stamp="stamp", quick=False)
+
+    assert "All are caught" in text(rows)
+    rows.loc[1, "caught_by"] = planted_errors.NONE
+    assert "2 are caught; no check of those run catches: fault 1." in text(rows)

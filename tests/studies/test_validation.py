@@ -1,0 +1,115 @@
+"""The validation study: what counts as right, what its sentences say, and that it stops where a solver stops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import end_states, validation
+from studies.bench import Run
+from studies.render import number_of_words, render
+from studies.solvers import CATALOGUE
+from twoloop import mechanisms
+
+
+def run_of(problem, solver="Gauss12", tolerance=1e-8, group=""):
+    case = end_states.case_of(problem, judged=bool(group))
+    return end_states.row_of(Run(case, CATALOGUE[solver], tolerance, group, repeats=1))
+
+
+def with_reference(**changed):
+    problem = mechanisms.double_pendulum()
+    return replace(problem, reference=replace(problem.reference, **changed))
+
+
+def test_a_good_run():
+    row = run_of(mechanisms.double_pendulum())
+    assert row["outcome"] == "right"
+    assert min(row["digits_q"], row["digits_v"], row["digits_lam"]) > 8.0
+    assert row["energy"] < 1e-8
+    assert max(row[f"violation_{level}"] for level in "qva") < 1e-9
+
+
+def test_a_reference_that_is_off_makes_a_good_run_wrong():
+    known = mechanisms.double_pendulum().reference
+    row = run_of(with_reference(q=known.q + 1e-5))
+    assert row["outcome"] == "wrong"
+    assert row["digits_q"] == pytest.approx(5.0, abs=0.3)
+
+
+def test_a_velocity_or_multiplier_that_is_not_known_is_not_counted():
+    known = mechanisms.double_pendulum().reference
+    row = run_of(with_reference(lam=None, v=np.full(4, np.nan)))
+    assert row["digits_lam"] is None
+    assert row["digits_v"] is None
+    assert row["digits_q"] > 8.0
+    assert known.lam is not None
+
+
+def test_no_more_digits_than_the_reference_holds():
+    digits = dict.fromkeys(("q", "v", "lam"), 4.0)
+    assert run_of(with_reference(digits=digits))["digits_q"] == 4.0
+
+
+def test_the_condition_of_the_authors_is_judged_over_its_own_time():
+    problem = mechanisms.n_four_bar(1)
+    sound = replace(problem, condition=replace(problem.condition, t_end=0.5, n_outputs=20))
+    row = run_of(sound, group=end_states.JUDGED)
+    assert row["t_end"] == 0.5
+    assert row["condition"] < 1e-5
+    assert row["outcome"] == "right"
+    strict = replace(sound, condition=replace(sound.condition, high=0.0))
+    assert run_of(strict, group=end_states.JUDGED)["outcome"] == "wrong"
+
+
+def test_what_an_adapter_does_not_take_is_not_counted_against_its_solver():
+    row = run_of(mechanisms.knife_edge(), "DOP853, index 1")
+    assert row["outcome"] == "not run"
+    assert "n_a = 1" in row["message"]
+
+
+def made_up(**changed):
+    """Rows of two problems and three solvers at all tolerances, errors as large as the tolerance."""
+    lines = []
+    for case in ("A02, N = 1", "double pendulum"):
+        for solver, family in (("Gauss12", "two-loop"), ("BDF", "two-loop"), ("LSODA, index 1", "SciPy")):
+            for tol in validation.TOLERANCES:
+                line = {"group": "", "case": case, "solver": solver, "family": family, "tol": tol, "t_end": 3.0}
+                line |= {"status": "REACHED_END", "floor": 1e-15, "outcome": "right", "condition": np.nan}
+                line |= {f"error_{level}": tol for level in ("q", "v", "lam")}
+                line |= {f"digits_{level}": -np.log10(tol) for level in ("q", "v", "lam")}
+                line |= {"energy": 1e-9, "n_evaluations": 100.0, **{f"violation_{level}": 1e-15 for level in "qva"}}
+                if (case, solver) in changed.get("where", ()):
+                    line |= changed["what"]
+                lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def text_of(rows):
+    found = validation.findings_of(rows)
+    return render("validation", found, {"solvers": ""}, stamp="stamp", quick=False), found
+
+
+def test_sentences_turn_with_the_rows():
+    text, found = text_of(made_up())
+    assert "Right on every problem at 1e-10: `Gauss12` and `BDF`" in text
+    assert "There is no problem on which another solver is right and none of ours" in text
+    assert "Reached everywhere" in text
+    assert found["solvers"][0]["slope"] == pytest.approx([1.0, 1.0, 1.0])
+    stopped = {"status": "STEP_TOO_SMALL", "outcome": "said so", "error_q": np.nan, "digits_q": np.nan}
+    text, found = text_of(made_up(where=[("A02, N = 1", "Gauss12"), ("A02, N = 1", "BDF")], what=stopped))
+    assert "None of ours is right on every problem" in text
+    assert "Another solver is right and none of ours: A02, N = 1" in text
+    assert "A02, N = 1: `Gauss12` stops with a message." in text
+    wrong = {"outcome": "wrong", "error_q": 1e-3, "digits_q": 3.0}
+    text, found = text_of(made_up(where=[("double pendulum", "BDF")], what=wrong))
+    assert "`BDF` on double pendulum (1e-3)" in text
+    assert found["n_wrong"] == {"ours": 4, "others": 0}
+    assert number_of_words(text) < 1000
+    refused = {"outcome": "not run", "status": "RAISED", "error_q": np.nan, "digits_q": np.nan}
+    text, _ = text_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))
+    assert "refuse to put the problem to the others: double pendulum." in text
+    assert "Ours alone" not in text
+    text, _ = text_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
+    assert "Ours alone: double pendulum." in text
