@@ -63,7 +63,7 @@ def test_between_the_steps_as_good_as_at_them(default_four_bar, exact, method, t
         ("Gauss4", 4, 0.02),
         ("Gauss6", 6, 0.02),
         ("Gauss8", 8, 0.04),
-        ("Gauss10", 10, 0.03),
+        ("Gauss10", 10, 0.0267),
         ("Gauss12", 12, 0.04),
         (RungeKutta(lobatto_iiie(3)), 4, 0.02),
         (RungeKutta(gauss(3), variables="momenta", partition="symmetric"), 6, 0.02),
