@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -115,6 +116,8 @@ def test_restart_after_an_event_follows_the_same_motion(default_four_bar):
 @pytest.mark.parametrize("start", [(1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 def test_the_rules_are_those_of_scipy(oscillator, start, direction, terminal):
     """x = 0 and v = 0 along x'' = -x, one of them zero at the start."""
+    if (terminal or 0) > 1 and tuple(map(int, scipy.__version__.split(".")[:2])) < (1, 12):
+        pytest.skip("SciPy counts terminal events from 1.12 on")
     q, v = start
     ours = [event(lambda t, q, v: q[0], terminal, direction), event(lambda t, q, v: v[0] - 0.5)]
     theirs = [event(lambda t, y: y[0], terminal, direction or 0), event(lambda t, y: y[1] - 0.5)]
