@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install compile table3 reports test test-oldest lint lock clean
+.PHONY: help install peers compile table3 reports test test-oldest lint lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -42,6 +42,12 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(RUN) $(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
+peers: .venv/peers ## the rivals that work_precision compares with where they are installed: heyoka, diffrax, CasADi, extensisq
+
+.venv/peers: requirements-peers.lock $(STAMP)
+	@$(RUN) $(PIP) install -c requirements.lock -r requirements-peers.lock
+	@touch $@
+
 table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes seconds
 	$(RUN) -m studies.table3 $(ARGS)
 
@@ -75,11 +81,14 @@ lint: install ## ruff and mypy
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
 
-lock: ## renew requirements.lock from pyproject.toml; PYTHON=python3.11, the oldest supported
+lock: ## renew both lock files from pyproject.toml; PYTHON=python3.11, the oldest supported
 	@$(FIND_PYTHON); "$$python" -m venv --clear .venv
-	@$(RUN) $(PIP) install ".[references,peers,studies,dev]" hatchling
+	@$(RUN) $(PIP) install ".[references,symbolic,sweeps,docs,studies,dev]" hatchling
 	@{ grep '^#' requirements.lock; $(RUN) -m pip freeze --exclude twoloop; } > requirements.new
 	@mv requirements.new requirements.lock
+	@$(RUN) $(PIP) install -c requirements.lock ".[peers]"
+	@{ grep '^#' requirements-peers.lock; $(RUN) -m pip freeze --exclude twoloop | grep -vxFf requirements.lock; } > requirements.new
+	@mv requirements.new requirements-peers.lock
 
 clean: ## remove caches (numba's too) and builds; .venv and .venv-oldest stay
 	find . -name '.venv*' -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
