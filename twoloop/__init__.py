@@ -4,6 +4,7 @@ from twoloop.bdf import BDF
 from twoloop.callbacks import callback
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
+from twoloop.esdirk import ESDIRK
 from twoloop.joints import Joint
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state
@@ -17,6 +18,7 @@ __version__ = "0.1.0"
 __all__ = [
     "BDF",
     "DOP853",
+    "ESDIRK",
     "ConsistentState",
     "ConstrainedSystem",
     "ConstraintWarning",

@@ -9,6 +9,7 @@ from twoloop.adams import Adams
 from twoloop.bdf import BDF
 from twoloop.checks import check_choice, check_number, shown
 from twoloop.dop853 import DOP853
+from twoloop.esdirk import ESDIRK
 from twoloop.plan import INNER_TOL, LEAST_ERROR, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
@@ -313,6 +314,8 @@ PRESETS: dict[str, Method] = {
     "SunRadau5": RungeKutta(sun_radau_iib(3), outer="auto"),
     **{f"Gauss{2 * s}": RungeKutta(gauss(s)) for s in range(2, 9)},
     "RadauIIA5": RungeKutta(radau_iia(3), outer="newton"),
+    "TRBDF2": ESDIRK("TRBDF2"),
+    "ESDIRK4": ESDIRK("ESDIRK4"),
     "Newmark": Newmark(),
     "BDF": BDF(),
     "DOP853": DOP853(),

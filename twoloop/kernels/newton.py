@@ -117,7 +117,7 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
 
 
 @compiled
-def _derivatives(f, w, options, memory, s, t, q, v, a):
+def derivatives_at(f, w, options, memory, s, t, q, v, a):
     """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
     if f.flags[BANDWIDTH] >= 0:
         return newton_banded.derivatives(f, w, memory, s, t, q, v)
@@ -125,7 +125,7 @@ def _derivatives(f, w, options, memory, s, t, q, v, a):
 
 
 @compiled
-def _factor(f, w, options, memory, s, h):
+def factor_systems(f, w, options, memory, s, h):
     """Factors for steps of h, for every eigenvalue and for gamma0."""
     if f.flags[BANDWIDTH] >= 0:
         code = newton_banded.factor(f, w, options, memory, s, h)
@@ -136,7 +136,7 @@ def _factor(f, w, options, memory, s, h):
 
 
 @compiled
-def _correct(f, w, options, memory, s, residual, A_stage):
+def correct(f, w, options, memory, s, residual, A_stage):
     """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
     n = w.Q.size
     m = w.independent.size
@@ -207,7 +207,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
             for m in w.independent:
                 scale_q = max(scale_q, abs(Q_stage[j, m]))
                 scale_v = max(scale_v, abs(V_stage[j, m]))
-        _correct(f, w, options, memory, s, residual, A_stage)
+        correct(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
             in_q, in_v = Q_stage[j], V_stage[j]  # their numbers are not needed any more
@@ -309,14 +309,14 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 return code, np.inf
             multipliers(f, w, t + 0.5 * h, q_mid, v_mid, a_mid, w.lam)
-            code = _derivatives(f, w, options, memory, s, t + 0.5 * h, q_mid, v_mid, a_mid)
+            code = derivatives_at(f, w, options, memory, s, t + 0.5 * h, q_mid, v_mid, a_mid)
             if code != DONE:
                 return code, np.inf
             memory[HAS_JACOBIAN] = 1.0
             memory[FRESH] = 1.0
             memory[H_FACTORED] = 0.0
         if abs(memory[H_FACTORED] - h) > SAME_STEP * h:
-            code = _factor(f, w, options, memory, s, h)
+            code = factor_systems(f, w, options, memory, s, h)
             if code != DONE:
                 memory[HAS_JACOBIAN] = 0.0
                 return code, np.inf

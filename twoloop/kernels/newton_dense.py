@@ -49,7 +49,7 @@ def _square(numbers, m):
 
 
 @compiled
-def _reduce(w, A, AT, B):
+def reduce(w, A, AT, B):
     """B = T^T A T with T = [I; w.D^T]; AT (n_q, n_dof) is scratch."""
     n, m = AT.shape
     columns = columns_of(w.index)
@@ -88,15 +88,15 @@ def _from_tangents(f, w, memory, s, t, q, v):
         return code
     Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
     N = _square(space(memory, s, n, SYSTEMS), m)
-    _reduce(w, w.M, AT, N)
+    reduce(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
-    _reduce(w, K, AT, Jq)
+    reduce(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
     memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code == DONE and memory[DAMPED] == 1.0:
-        _reduce(w, K, AT, Jv)
+        reduce(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
 
