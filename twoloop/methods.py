@@ -76,7 +76,7 @@ class RungeKutta:
 
     tableau: Tableau
     outer: Literal["auto", "fixed-point", "newton", "paper"] = "fixed-point"
-    error: Literal["richardson", "richardson-paper"] = "richardson"
+    error: Literal["embedded", "richardson", "richardson-paper"] | None = None
     inner_tol: float | None = None
     outer_tol: float | None = None
     variables: Literal["velocities", "momenta"] = "velocities"
@@ -91,7 +91,14 @@ class RungeKutta:
         check_choice("outer", self.outer, ("auto", "fixed-point", "newton", "paper"))
         check_choice("variables", self.variables, ("velocities", "momenta"))
         check_choice("partition", self.partition, ("lasting", "symmetric"))
-        check_choice("error", self.error, ("richardson", "richardson-paper"))
+        if self.error is not None:
+            check_choice("error", self.error, ("embedded", "richardson", "richardson-paper"))
+        if self.error == "embedded" and not self._can_embed():
+            raise ValueError(
+                f"error='embedded' needs a collocation method of three stages or more, variables='velocities' and "
+                f"outer='fixed-point' or 'auto'; given {self.tableau.name}, {self.variables!r}, {self.outer!r}. Take "
+                "error='richardson'"
+            )
         check_choice("outer_test", self.outer_test, ("all", "independent"))
         if self.outer != "fixed-point" and self.variables != "velocities":
             raise ValueError(f"outer={self.outer!r} goes with variables='velocities' only; given {self.variables!r}")
@@ -113,7 +120,7 @@ class RungeKutta:
         """Shown in messages and tables."""
         usual = {"variables": "velocities", "partition": "lasting", "outer_test": "all"}
         changed = [getattr(self, option) for option, value in usual.items() if getattr(self, option) != value]
-        return ", ".join([self.tableau.name, self.outer, self.error, *changed])
+        return ", ".join([self.tableau.name, self.outer, self.estimate, *changed])
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -131,8 +138,9 @@ class RungeKutta:
             tableau.c,
             INNER_TOL if self.inner_tol is None else self.inner_tol,
             outer_tol,
-            1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
+            self._extrapolation(),
             float(self.outer_test == "all"),
+            (tableau.order - tableau.stages) / max(1, tableau.stages - 1),
         )
         exponent, least_error = 1.0 / (tableau.order + 1), LEAST_ERROR
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
@@ -159,6 +167,25 @@ class RungeKutta:
                 step, exponent, least_error = automatic.automatic_step, 1.0, LEAST_ERROR**exponent
         plan = Plan(step, options, memory, exponent, predictive=True, least_error=least_error)
         return replace(plan, symmetric=self.partition == "symmetric", parts=self._parts())
+
+    def _extrapolation(self) -> float:
+        from twoloop.kernels.stages import EMBEDDED
+
+        if self.estimate == "embedded":
+            return EMBEDDED
+        return 1.0 / (2.0**self.tableau.order - 1.0) if self.estimate == "richardson" else 0.0
+
+    @property
+    def estimate(self) -> str:
+        """How the error is estimated: `error`, or what stands for None there."""
+        if self.error is not None:
+            return self.error
+        return "embedded" if self._can_embed() else "richardson"
+
+    def _can_embed(self) -> bool:
+        """Whether the stages lie on the polynomial that the estimate reads, and enough of them."""
+        usual = self.outer in ("auto", "fixed-point") and self.variables == "velocities"
+        return usual and self.tableau.stages > 2 and self.tableau.collocation
 
     def _parts(self) -> int:
         """Parts of a step whose states carry the solution between its ends to the accuracy of the method."""

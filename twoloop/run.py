@@ -362,7 +362,8 @@ class Run:
         stopped = f"Stopped at t = {t:.10g}"
         failure = int(self.clock[a.FAILURE_CODE])
         if code == a.ALL_OUTPUT_DONE:
-            return Status.REACHED_END, f"Reached the end, t = {t:g}."
+            fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
+            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}."
         if code == INTERRUPTED:
             return (
                 Status.INTERRUPTED,

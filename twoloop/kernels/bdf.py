@@ -21,6 +21,7 @@ N_DIFFERENCES = MAX_ORDER + 2  # of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
 MAX_ITERATIONS = 60
 SAFETY = 0.9  # of advance(): the next step is SAFETY over the returned error times this one
+STRICT = 10.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
 BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
 NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
 HOLD = 1.2  # a step that could grow by less keeps its size
@@ -192,7 +193,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
-    norm = _norm(tolerances, y, y1, d, 0.0, d)
+    norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
     # with unequal steps also the interpolation of the history has an error; the larger counts (as in DASSL)
     interpolation = spans[0] / spans[k]
     for j in range(k):
@@ -201,9 +202,9 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
     here = norm * constants[k]
     below, above = np.inf, np.inf
     if k > 1:
-        below = NEIGHBOUR * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
+        below = STRICT * NEIGHBOUR * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
     if k < options[HIGHEST] and depth > k:
-        above = NEIGHBOUR * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
+        above = STRICT * NEIGHBOUR * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
     memory[NEXT_ORDER] = k
     if not error <= 1.0:
         if below < here:

@@ -23,11 +23,24 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import restore_predicted
-from twoloop.kernels.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TEST, OUTER_TOL, interpolate, tableau_of
+from twoloop.kernels.stages import (
+    DECAY,
+    EMBEDDED,
+    EXTRAPOLATION,
+    FARTHEST,
+    INNER_TOL,
+    OUTER_TEST,
+    OUTER_TOL,
+    end_error,
+    interpolate,
+    tableau_of,
+)
 
 MAX_ITERATIONS = 60
 MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
 GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
+SHARE_OF_ENDS = 10.0  # of end_error, as the estimate of a step without half steps: errors then are near the tolerance
+SHARE_BESIDE = 0.01  # ... and beside Richardson's, for jumps between the ends and the stages
 PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
@@ -263,7 +276,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code != DONE:
         return code, np.inf
     error = 0.0
-    if tolerances[ESTIMATE] == 1.0:
+    if tolerances[ESTIMATE] == 1.0 and options[EXTRAPOLATION] != EMBEDDED:
         copy(q1, q_full)
         copy(v1, v_full)
         for j in range(s):
@@ -284,6 +297,9 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
+    if code == DONE and tolerances[ESTIMATE] == 1.0:
+        seen = end_error(tolerances, options[DECAY], c, h, state, new_state, trial, weights, q_mid)
+        error = max(error, (SHARE_OF_ENDS if options[EXTRAPOLATION] == EMBEDDED else SHARE_BESIDE) * seen)
     return code, max(error, w.notes[DEPARTURE])
 
 
