@@ -49,8 +49,8 @@ class ESDIRK:
     matrix, is held to short steps by that at loose tolerances, and is the better one at tight tolerances.
 
     Both formulas are L-stable and end with their last stage. A step is accepted when the estimated error of the
-    positions, from the embedded formula and filtered for stiff components, is within the tolerance; velocities are not
-    tested: vibrations that the steps pass over are damped.
+    positions, from the embedded formula and filtered for stiff components, is within the tolerance. Velocities are
+    tested where asked for: vibrations that the steps pass over are damped.
 
     Parameters
     ----------
@@ -62,6 +62,10 @@ class ESDIRK:
     outer_tol : float, optional
         The outer loop stops when the correction just made changes no independent position by more than this, relative
         to max(|value|, 1). None: 3 min(rtol, atol); with fixed steps 1e-12.
+
+    tested : {"all", "positions"}
+        What the error estimate is taken over: positions and velocities, or positions only. Stiff vibrations that do not
+        matter show in the velocities; "positions" passes over them.
 
     Raises
     ------
@@ -78,15 +82,17 @@ class ESDIRK:
     formula: Literal["TRBDF2", "ESDIRK4"] = "TRBDF2"
     inner_tol: float | None = None
     outer_tol: float | None = None
+    tested: Literal["all", "positions"] = "positions"
 
     def __post_init__(self) -> None:
         check_choice("formula", self.formula, tuple(FORMULAS))
         check_tolerances(self, "inner_tol", "outer_tol")
+        check_choice("tested", self.tested, ("all", "positions"))
 
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        return self.formula
+        return self.formula if self.tested == "positions" else f"{self.formula}, velocities tested"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -100,7 +106,7 @@ class ESDIRK:
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
             kernels.diagonal_step,
-            kernels.diagonal_options(A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol),
+            kernels.diagonal_options(A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol, self.tested == "all"),
             kernels.diagonal_memory(len(embedded), n_q),
             exponent=1.0 / (3.0 if order == 2 else 4.0),
             safety=SAFETY,

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from twoloop.adams import Adams
+from twoloop.auto import Auto
 from twoloop.bdf import BDF
 from twoloop.checks import check_choice, check_number, shown
 from twoloop.dop853 import DOP853
@@ -64,6 +65,9 @@ class RungeKutta:
         mechanisms that swing back the way they came, `RungeKutta(gauss(3), variables="momenta", partition="symmetric")`
         with fixed steps then shows no drift of the energy; where motion does not reverse, as of a turning crank, only
         momenta under one lasting partition do. Step-size control spoils both properties.
+    tested : {"all", "positions"}
+        What the error estimate of outer="newton" is taken over: positions and velocities, or positions only. Stiff
+        vibrations that do not matter show in the velocities; "positions" passes over them.
     outer_test : {"all", "independent"}
         What (32) of outer="paper" is taken over: all coordinates and velocities, after the dependent ones are restored,
         or the independent ones only. The text of the paper says both. Without effect on other outer loops.
@@ -81,6 +85,7 @@ class RungeKutta:
     outer_tol: float | None = None
     variables: Literal["velocities", "momenta"] = "velocities"
     partition: Literal["lasting", "symmetric"] = "lasting"
+    tested: Literal["all", "positions"] = "all"
     outer_test: Literal["all", "independent"] = "all"
 
     def __post_init__(self) -> None:
@@ -99,6 +104,9 @@ class RungeKutta:
                 f"outer='fixed-point' or 'auto'; given {self.tableau.name}, {self.variables!r}, {self.outer!r}. Take "
                 "error='richardson'"
             )
+        check_choice("tested", self.tested, ("all", "positions"))
+        if self.tested == "positions" and self.outer not in ("auto", "newton"):
+            raise ValueError(f"tested='positions' goes with outer='newton' or 'auto' only; given {self.outer!r}")
         check_choice("outer_test", self.outer_test, ("all", "independent"))
         if self.outer != "fixed-point" and self.variables != "velocities":
             raise ValueError(f"outer={self.outer!r} goes with variables='velocities' only; given {self.variables!r}")
@@ -118,7 +126,7 @@ class RungeKutta:
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        usual = {"variables": "velocities", "partition": "lasting", "outer_test": "all"}
+        usual = {"variables": "velocities", "partition": "lasting", "tested": "all", "outer_test": "all"}
         changed = [getattr(self, option) for option, value in usual.items() if getattr(self, option) != value]
         return ", ".join([self.tableau.name, self.outer, self.estimate, *changed])
 
@@ -155,7 +163,7 @@ class RungeKutta:
         elif self.outer in ("auto", "newton"):
             from twoloop.kernels import automatic, newton, newton_memory
 
-            extra = newton.newton_options(tableau.A, tableau.b, tableau.c)
+            extra = newton.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
             options = np.concatenate([options, extra])
             n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
             size = newton_memory.memory_size(n_eigen, tableau.stages, n_q)
@@ -338,6 +346,13 @@ def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float 
 
 
 PRESETS: dict[str, Method] = {
+    "auto": Auto(
+        few=DOP853(),
+        many=Adams(),
+        loose=ESDIRK("TRBDF2"),
+        tight=RungeKutta(radau_iia(3), outer="newton", tested="positions"),
+        fixed=RungeKutta(sun_radau_iib(3), outer="auto"),
+    ),
     "SunRadau5": RungeKutta(sun_radau_iib(3), outer="auto"),
     **{f"Gauss{2 * s}": RungeKutta(gauss(s)) for s in range(2, 9)},
     "RadauIIA5": RungeKutta(radau_iia(3), outer="newton"),

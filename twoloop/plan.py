@@ -27,6 +27,8 @@ class Plan:
     options: Array
     memory: Array
     exponent: float
+    first: Any = None  # the two steps between which `step` chooses, if it does
+    second: Any = None
     safety: float = 0.9
     factor_min: float = 0.2
     factor_max: float = 5.0

@@ -39,7 +39,7 @@ def solve_dae(
     t_span: tuple[float, float],
     q0: ArrayLike,
     v0: ArrayLike,
-    method: str | Method = "SunRadau5",
+    method: str | Method = "auto",
     rtol: float = 1e-8,
     atol: ArrayLike = 1e-8,
     *,
@@ -68,8 +68,9 @@ def solve_dae(
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities (see `consistent_state`).
     method : str or method object
-        "SunRadau5" (default), "Gauss4" ... "Gauss16", "RadauIIA5", "Newmark", "BDF", "DOP853", "PaperIRK",
-        "PaperNewmark", or an object: `RungeKutta(...)`, `Newmark(...)`, `BDF(...)`, `DOP853(...)`.
+        "auto" (default: explicit where nothing is stiff, Newton's method where stiffness is measured, see `Auto`),
+        "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "TRBDF2", "ESDIRK4", "BDF", "Newmark",
+        "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`, `ESDIRK(...)`, `Newmark(...)`, `BDF(...)`, ...
     rtol : float
     atol : float or array_like (n_q,)
         A step is accepted when the largest component of its estimated error over atol + rtol |value| is at most 1:
@@ -86,7 +87,7 @@ def solve_dae(
     first_step : float, optional
         First step to try, s. None: chosen from the velocities and accelerations at the start.
     max_step : float
-        Largest step, s.
+        Largest step, s. A force that acts for less than a step may be passed over unseen: give its duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run whose steps have become a thousand times shorter
         than before, so that the rest would take more than ten million of them, ends with the status STAGNATED.

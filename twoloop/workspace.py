@@ -18,8 +18,8 @@ SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M m
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
-def kit_of(system: ConstrainedSystem, t0: float, q0: Array, step: Any = None) -> common.Kit:
-    """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and a step."""
+def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any) -> common.Kit:
+    """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and steps."""
     from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
 
     flags = system.functions.flags.copy()
@@ -31,7 +31,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, step: Any = None) ->
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[common.BANDWIDTH], flags[common.REDUCED] = bandwidth, 0
-    return common.Kit(system.functions._replace(flags=flags), inner_loop, step)
+    return common.Kit(system.functions._replace(flags=flags), inner_loop, *steps)
 
 
 def workspace(

@@ -162,11 +162,12 @@ def _type_of_work(value: Any, context: Any) -> Any:
 class Kit:
     """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
-    The latter two are compiled once, and not again in what calls them; None where they are not called.
+    The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
+    chooses between two others has these as `first` and `second`.
     """
 
-    def __init__(self, functions: Any, inner: Any = None, step: Any = None):
-        self.functions, self.inner, self.step = functions, inner, step
+    def __init__(self, functions: Any, inner: Any = None, step: Any = None, first: Any = None, second: Any = None):
+        self.functions, self.inner, self.step, self.first, self.second = functions, inner, step, first, second
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -182,7 +183,8 @@ INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
 KIT.add_function("inner", INNER)
 # (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
 STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-KIT.add_function("step", STEP)
+for _name in ("step", "first", "second"):
+    KIT.add_function(_name, STEP)
 
 
 @typeof_impl.register(Kit)

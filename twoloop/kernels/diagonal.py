@@ -53,6 +53,7 @@ from twoloop.kernels.newton_memory import (
     RESIDUAL,
     TRIAL,
     V_MID,
+    VELOCITIES,
     block,
     memory_size,
     vector,
@@ -66,15 +67,18 @@ SHARE_IF_LINEAR = 0.01  # of the tolerance of the outer loop, where it does not 
 KEPT_WHILE = 0.1  # contraction up to which derivatives that were differenced serve on
 
 # `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^
-TAIL = N_SCALARS + 2 + 3 + N_EIGEN_SCALARS + 1 + 2 + 4
+PLACE = N_SCALARS + 2 + 3
+TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
 
 
-def diagonal_options(A: ArrayLike, c: ArrayLike, weights: ArrayLike, inner_tol: float, outer_tol: float) -> NDArray[np.float64]:
+def diagonal_options(
+    A: ArrayLike, c: ArrayLike, weights: ArrayLike, inner_tol: float, outer_tol: float, velocities: bool
+) -> NDArray[np.float64]:
     """The parameter block: A (s, s) with zeros in its first row and gamma on the diagonal below, b its last row."""
     A, c, weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights))
     gamma = A[-1, -1]
     one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
-    newton = np.array([1.0, 0.0, gamma, 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
+    newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
     return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights])
 
 
@@ -199,12 +203,12 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
 
 @compiled
 def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights):
-    """Largest component, over atol + rtol |q|, of the difference of positions to the embedded formula.
+    """Largest component, over atol + rtol |value|, of the difference to the embedded formula.
 
     It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
     """
     n = w.Q.size
-    q, q1 = state[:n], new_state[:n]
+    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     z = h * _gamma(options)
     e_q, e_v = vector(memory, 1, n, E_Q), vector(memory, 1, n, E_V)
     count = w.independent.size
@@ -228,6 +232,9 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
         in_q = e_q[i] + z * e_v[i]
         scale = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
         error = max(error, abs(in_q) / scale)
+        if options[PLACE + VELOCITIES] == 1.0:
+            scale = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
+            error = max(error, abs(e_v[i]) / scale)
     return error
 
 

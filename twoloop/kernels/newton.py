@@ -59,6 +59,7 @@ from twoloop.kernels.newton_memory import (
     TRIAL,
     V_MID,
     V_STAGE,
+    VELOCITIES,
     block,
     complex_vector,
     count_eigenvalues,
@@ -75,8 +76,10 @@ STAGNATION = 0.1  # of the step tolerance: corrections of this size that no long
 STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
 
 
-def newton_options(A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of `options` that Newton's method needs besides stages.options_array.
+def newton_options(
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
+) -> NDArray[np.float64]:
+    """The part of `options` that Newton's method needs besides stages.options_array; `velocities`: those are tested.
 
     Raises
     ------
@@ -92,7 +95,7 @@ def newton_options(A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np
     real = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
     gamma0 = float(values[real[0]].real) if real else float(np.abs(values).min())
-    parts: list[Any] = [[len(real), len(pairs), gamma0], _estimate_weights(b, c, gamma0)]
+    parts: list[Any] = [[len(real), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
     for k in real + pairs:
         row, column = inverse[k], T[:, k]
         parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
@@ -272,7 +275,8 @@ def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
         j = w.independent[i]
         in_q = e_q[i] + h * gamma0 * e_v[i]
         error = max(error, abs(in_q) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
-        error = max(error, abs(e_v[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
+        if options[place + VELOCITIES] == 1.0:
+            error = max(error, abs(e_v[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
     return error
 
 

@@ -7,7 +7,8 @@ from twoloop.kernels.stages import N_SCALARS
 
 # `options` is that of stages.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
 # its real and imaginary part, the row of T^-1 and the column of T that belong to it (s real, s imaginary parts each)
-N_REAL, N_PAIRS, GAMMA0, N_EIGEN_SCALARS = range(4)
+# VELOCITIES: 1 if their error is tested, too
+N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt
 (

@@ -61,10 +61,11 @@ def interpolate(c, theta, A_stage, weights, a):
 def end_error(tolerances, decay, c, h, state, new_state, A_stage, weights, scratch):
     """Error of a step as the stage polynomial of the accelerations shows it at the ends of the step, over (26).
 
-    It misses the accelerations there by d, a term of order h^s, where those of the stages differ by w: the terms fall by
-    (d / w)^(1 / (s - 1)) from order to order if they fall evenly, and that of the method's own order makes the error
-    h d (d / w)^decay, decay = (order - s) / (s - 1). Where they do not fall, as at a jump of the force, even one between
-    the end and the stage beside it, d is not less than w, and the error h d: steps shrink until it does not matter.
+    It misses the accelerations there by d, a term of order h^s, where those of the stages differ by w: the terms fall
+    by (d / w)^(1 / (s - 1)) from order to order if they fall evenly, and that of the method's own order makes the error
+    h d (d / w)^decay, decay = (order - s) / (s - 1). Where they do not fall, as at a jump of the force, even one
+    between the end and the stage beside it, d is not less than w, and the error h d: steps shrink until it does not
+    matter.
     """
     s, n = A_stage.shape
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

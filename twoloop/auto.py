@@ -1,0 +1,70 @@
+"""Auto(...): the default method, which chooses others and goes from one to the other."""
+
+from dataclasses import dataclass, replace
+
+from twoloop.plan import Method, Plan, least_tolerance
+
+MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method
+LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
+LIMIT_FEW, LIMIT_MANY = 2.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
+SAFETY = 0.8
+
+
+@dataclass(frozen=True)
+class Auto:
+    """Explicit steps where nothing is stiff, Newton's method where stiffness is measured; both ways during a run.
+
+    A run begins with `few`, or with `many` where there are 16 coordinates or more and evaluations are the cost. Every
+    600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where the
+    steps have come near the limit of stability that it sets, the implicit method is tried for 15 steps and kept if a
+    second of motion costs it less, counted in evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, else
+    `tight`. It is left the same way. Counts decide, not times: a run can be repeated.
+
+    While the implicit method runs, errors of positions are within the tolerances; those of velocities are not tested.
+    With constant steps it is `fixed` throughout.
+
+    Parameters
+    ----------
+    few, many : method object
+        Explicit methods, for few and for many coordinates.
+    loose, tight : method object
+        Implicit methods, for loose and for tight tolerances.
+    fixed : method object
+        For constant steps.
+    """
+
+    few: Method
+    many: Method
+    loose: Method
+    tight: Method
+    fixed: Method
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return "auto"
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        if fixed:
+            return self.fixed.plan(n_q, rtol, atol, True)
+        from twoloop.kernels import switching
+
+        explicit, limit = (self.few, LIMIT_FEW) if n_q < MANY else (self.many, LIMIT_MANY)
+        implicit = self.loose if least_tolerance(rtol, atol) >= LOOSE else self.tight
+        plans = [method.plan(n_q, rtol, atol, False) for method in (explicit, implicit)]
+        each = [[plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse] for plan in plans]
+        first, second = plans
+        options = switching.switching_options(limit, 3.0 + n_q / 8.0, each, first.options, second.options)
+        return replace(
+            first,
+            step=switching.switching_step,
+            options=options,
+            memory=switching.switching_memory(n_q, first.memory, second.memory),
+            exponent=1.0,
+            safety=SAFETY,
+            factor_min=min(plan.factor_min for plan in plans),
+            factor_max=max(plan.factor_max for plan in plans),
+            first=first.step,
+            second=second.step,
+        )

@@ -1,0 +1,242 @@
+"""Two methods in one run: an explicit one, and Newton's where stiffness would make its steps tiny.
+
+Now and then the largest rate of the motion, rho, the root of the largest eigenvalue of dF/dq or that of dF/dv, F being
+the accelerations, is found by a few power iterations, one evaluation each. While the explicit method takes steps of
+h rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be
+the reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
+second of motion costs it less. It is left in the same way, after a trial of the explicit method, where its own steps
+have come below that limit. What is not kept is next tried after twice as many looks.
+
+Both methods are called by their addresses, f.first and f.second, and are compiled once, where they are.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.kernels.calls import evaluate
+from twoloop.kernels.common import (
+    DONE,
+    ESTIMATE,
+    N_EVALUATIONS,
+    N_JACOBIANS,
+    REUSE,
+    STEP,
+    compiled,
+    inlined,
+    kernel,
+)
+from twoloop.kernels.linalg import copy
+
+SAFETY_OF_ALL = 0.8  # of advance(); no method of a pair has less
+EARLY = 100.0  # evaluations before the first look at the rate
+INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
+ITERATIONS = 4
+DISPLACEMENT = 1e-6  # of the largest coordinate, for derivatives along a direction
+INNER_TOL = 1e-8  # of the positions; their error is squared
+NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
+SEED = 1e-3  # what a component of a direction begins with, of the largest
+BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
+STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
+MEAN = 0.8  # weight of the steps before in the mean step
+SETTLE = 5.0  # accepted steps of a trial before its price is taken
+WINDOW = 10.0  # accepted steps over which it is
+GAIN = 1.2  # what a method on trial must be cheaper by
+PATIENCE = 4.0  # looks before the next trial
+
+EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
+
+# places in `options`: of the pair, then SAFETY ... REUSE_OF of the first and of the second method; then their options
+# LIMIT: h rho from which on the implicit method is tried
+LIMIT, MATRIX_COST, SIZE_1, N_PAIR = range(4)
+SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, N_OF_EACH = range(6)
+N_OPTIONS = N_PAIR + 2 * N_OF_EACH
+
+# places in `memory`: advance() sets LAST_ACCEPTED; behind the scalars two directions (n_q), then the two memories
+(
+    LAST_ACCEPTED,
+    PHASE,
+    STEPS,  # accepted in this phase
+    LOOK_AT,  # evaluations at which to look again
+    LOOKS_TO_WAIT,
+    WAIT,
+    T_BEGIN,
+    COST_BEGIN,
+    PRICE,  # of the method before the trial
+    RATE,  # the last one found, 1 / s
+    FIRST_MEMORY,
+    H_MEAN,
+    N_TRIALS,
+    N_SCALARS,
+) = range(14)
+
+
+def switching_options(
+    limit: float, matrix_cost: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
+) -> NDArray[np.float64]:
+    """`options`: of the pair, the cost of a Newton matrix in evaluations, then five numbers of each, then their own."""
+    first = np.asarray(first, dtype=np.float64)
+    scalars = [limit, matrix_cost, float(first.size)]
+    return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
+
+
+def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+    """`memory` for methods with these memories."""
+    first, second = np.asarray(first), np.asarray(second)
+    scalars = np.zeros(N_SCALARS)
+    scalars[LOOK_AT], scalars[WAIT], scalars[FIRST_MEMORY] = EARLY, PATIENCE, first.size
+    directions = np.concatenate([0.3 + 0.1 * (np.arange(n_q) % 7)] * 2)
+    return np.concatenate([scalars, directions, first, second])
+
+
+@inlined
+def _memories(memory, n):
+    split = N_SCALARS + 2 * n + int(memory[FIRST_MEMORY])
+    return memory[N_SCALARS + 2 * n : split], memory[split:]
+
+
+@compiled
+def _along(f, w, t, state, direction, by_v, Q, V, A):
+    """How much larger dF/dq or dF/dv makes a direction of the independents, whose image of length 1 replaces it."""
+    n = Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    places = w.independent_v if by_v else w.independent
+    largest = 1.0
+    for m in range(n):
+        largest = max(largest, abs(v[m]) if by_v else abs(q[m]))
+    size = DISPLACEMENT * largest
+    copy(q, Q)
+    copy(v, V)
+    moved = V if by_v else Q
+    for i in places:
+        moved[i] += size * direction[i]
+    if evaluate(f, w, t, Q, V, INNER_TOL, A) != DONE:
+        return 0.0
+    image = 0.0
+    for i in places:
+        image = max(image, abs(A[i] - a[i]))
+    if not (image > 0.0 and np.isfinite(image)):
+        return 0.0
+    for i in places:
+        direction[i] = (A[i] - a[i]) / image
+    return image / size
+
+
+@compiled
+def _largest_rate(f, w, memory, t, state, new_state):
+    """The largest rate at a state, 1/s; `new_state` is scratch."""
+    n = w.Q.size
+    by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
+    Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
+    squared = damping = 0.0
+    for _ in range(ITERATIONS):
+        squared = _along(f, w, t, state, by_q, False, Q, V, A)
+    for _ in range(ITERATIONS):
+        damping = _along(f, w, t, state, by_v, True, Q, V, A)
+        if damping * memory[H_MEAN] < NEGLIGIBLE:
+            break
+    for m in range(n):  # coordinates that were independent at no look, or have no part in it, are begun anew
+        if by_q[m] == 0.0:
+            by_q[m] = SEED
+        if by_v[m] == 0.0:
+            by_v[m] = SEED
+    return max(np.sqrt(squared), damping)
+
+
+@compiled
+def _cost(w, options):
+    """What the run has cost so far, in evaluations."""
+    return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
+
+
+@compiled
+def _enter(w, options, memory, n, phase, t):
+    """Begin another phase; its method knows nothing of the steps before."""
+    memory[PHASE] = phase
+    memory[STEPS] = 0.0
+    memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
+
+
+@compiled
+def _settle_trial(w, options, memory, n, t):
+    """Whether the method on trial is kept; returns the phase to begin, or -1."""
+    if memory[STEPS] == SETTLE:
+        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    if memory[STEPS] < SETTLE + WINDOW:
+        return -1
+    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    keeps = price * GAIN <= memory[PRICE]
+    memory[WAIT] = PATIENCE if keeps else 2.0 * memory[WAIT]
+    memory[LOOKS_TO_WAIT] = memory[WAIT]
+    if memory[PHASE] == ON_TRIAL:
+        return IMPLICIT if keeps else EXPLICIT
+    return EXPLICIT if keeps else IMPLICIT
+
+
+@compiled
+def _look(f, w, options, memory, t, state, new_state):
+    """Whether the other method is due for a trial; returns the phase to begin, or -1."""
+    memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
+    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
+    memory[LOOKS_TO_WAIT] -= 1.0
+    share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
+    if memory[LOOKS_TO_WAIT] > 0.0:
+        return -1
+    if (memory[PHASE] == EXPLICIT and share > 1.0) or (memory[PHASE] == IMPLICIT and share < BELOW):
+        memory[PRICE] = price
+        memory[N_TRIALS] += 1.0
+        return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
+    return -1
+
+
+@compiled
+def _restart(memory):
+    """A method's memory as at the beginning of a run."""
+    for i in range(memory.size):
+        memory[i] = 0.0
+
+
+@kernel(STEP)
+def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt by one of the two; the error is returned such that advance() takes the step which that method wants.
+
+    A method of the second kind begins anew each time; its memory is all zeros then.
+    """
+    n = w.Q.size
+    first, second = _memories(memory, n)
+    if memory[LAST_ACCEPTED] == 1.0 and tolerances[ESTIMATE] == 1.0:
+        memory[STEPS] += 1.0
+        phase = -1
+        if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
+            phase = _settle_trial(w, options, memory, n, t)
+        elif w.counters[N_EVALUATIONS] >= memory[LOOK_AT]:
+            phase = _look(f, w, options, memory, t, state, new_state)
+        if phase >= 0:
+            was_explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
+            is_explicit = phase in (EXPLICIT, BACK_ON_TRIAL)
+            _enter(w, options, memory, n, phase, t)
+            if was_explicit != is_explicit:
+                _restart(first if is_explicit else second)
+    explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
+    begin = N_OPTIONS + int(options[SIZE_1])
+    each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
+    w.notes[REUSE] = each[REUSE_OF]
+    if explicit:
+        first[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
+        code, error = f.first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
+    else:
+        second[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
+        code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
+    memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
+    if code != DONE or not np.isfinite(error):
+        return code, error
+    if memory[PHASE] == ON_TRIAL:
+        error *= STRICT
+    factor = each[FACTOR_MAX]
+    if error > 0.0:
+        factor = min(factor, max(each[FACTOR_MIN], each[SAFETY] * error ** -each[EXPONENT]))
+    if error > 1.0:
+        return code, max(1.0 + 1e-9, SAFETY_OF_ALL / factor)
+    return code, min(1.0, SAFETY_OF_ALL / factor)
