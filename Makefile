@@ -58,8 +58,8 @@ reports: install ## all studies into reports/
 compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "import twoloop.kernels.calls"
 	@$(RUN) -c "import twoloop.kernels.newton" & \
-	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, adams, bridge, advance, dense" && wait $$! && \
-	$(RUN) -c "import twoloop.kernels.automatic"
+	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, adams, bridge, advance, dense, diagonal" && wait $$! && \
+	$(RUN) -c "import twoloop.kernels.switching"
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)

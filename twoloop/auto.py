@@ -7,7 +7,31 @@ from twoloop.plan import Method, Plan, least_tolerance
 MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
 LIMIT_FEW, LIMIT_MANY = 2.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
-SAFETY = 0.8
+MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
+
+
+def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
+    """The plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
+
+    `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried.
+    """
+    from twoloop.kernels import switching as kernels
+
+    plans = (first, second)
+    each = [[plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse] for plan in plans]
+    return replace(
+        first,
+        step=kernels.switching_step,
+        options=kernels.switching_options(limit, MATRIX_COST + n_q / 8.0, each, first.options, second.options),
+        memory=kernels.switching_memory(n_q, first.memory, second.memory),
+        exponent=1.0,
+        safety=kernels.SAFETY_OF_ALL,
+        factor_min=min(plan.factor_min for plan in plans),
+        factor_max=max(plan.factor_max for plan in plans),
+        predictive=False,
+        first=first.step,
+        second=second.step,
+    )
 
 
 @dataclass(frozen=True)
@@ -48,23 +72,7 @@ class Auto:
         """Make the method ready for a run of n_q coordinates."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
-        from twoloop.kernels import switching
-
         explicit, limit = (self.few, LIMIT_FEW) if n_q < MANY else (self.many, LIMIT_MANY)
         implicit = self.loose if least_tolerance(rtol, atol) >= LOOSE else self.tight
-        plans = [method.plan(n_q, rtol, atol, False) for method in (explicit, implicit)]
-        each = [[plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse] for plan in plans]
-        first, second = plans
-        options = switching.switching_options(limit, 3.0 + n_q / 8.0, each, first.options, second.options)
-        return replace(
-            first,
-            step=switching.switching_step,
-            options=options,
-            memory=switching.switching_memory(n_q, first.memory, second.memory),
-            exponent=1.0,
-            safety=SAFETY,
-            factor_min=min(plan.factor_min for plan in plans),
-            factor_max=max(plan.factor_max for plan in plans),
-            first=first.step,
-            second=second.step,
-        )
+        first, second = (method.plan(n_q, rtol, atol, False) for method in (explicit, implicit))
+        return switching(first, second, limit, n_q)

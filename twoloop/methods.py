@@ -6,15 +6,16 @@ from typing import Literal
 import numpy as np
 
 from twoloop.adams import Adams
-from twoloop.auto import Auto
+from twoloop.auto import Auto, switching
 from twoloop.bdf import BDF
 from twoloop.checks import check_choice, check_number, shown
 from twoloop.dop853 import DOP853
 from twoloop.esdirk import ESDIRK
-from twoloop.plan import INNER_TOL, LEAST_ERROR, Method, Plan, check_tolerances, outer_tolerance
+from twoloop.plan import INNER_TOL, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
+LIMIT_OF_FIXED_POINT = 1.5  # h rho from which on the fixed-point iteration converges slowly: Newton's method is tried
 ILL_CONDITIONED = 1e8  # eigenvectors of A, as in kernels/newton.py; one over it: an eigenvalue that counts as zero
 NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
 # highest order for which a step is divided into so many parts: with fewer the error between steps is more than a few
@@ -38,8 +39,8 @@ class RungeKutta:
         side, kept while it converges fast. For stiff problems, where fixed-point iteration needs h w_max below a
         constant. Its error estimate is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error` has no
         effect.
-        "auto": "fixed-point" until that converges slowly and Newton's method, on trial, takes three times fewer
-        evaluations for a second of motion; and back again.
+        "auto": "fixed-point" until steps have come near where that no longer converges, and Newton's method, on trial,
+        costs less for a second of motion; and back again, see `Auto`.
         "paper": fixed-point iteration on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
         The step size follows the error and, but with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
@@ -150,31 +151,37 @@ class RungeKutta:
             float(self.outer_test == "all"),
             (tableau.order - tableau.stages) / max(1, tableau.stages - 1),
         )
-        exponent, least_error = 1.0 / (tableau.order + 1), LEAST_ERROR
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
+        plan = Plan(kernels.runge_kutta_step, options, memory, 1.0 / (tableau.order + 1))
         if self.outer == "paper":
-            plan = Plan(kernels.paper_step, options, memory, exponent)
-            return replace(plan, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0, lands=True)
-        step = kernels.runge_kutta_step
+            step = kernels.paper_step
+            return replace(
+                plan, step=step, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0, lands=True
+            )
+        plan = replace(plan, predictive=True, symmetric=self.partition == "symmetric", parts=self._parts())
         if self.variables == "momenta":
             from twoloop.kernels import momenta
 
-            memory, step = np.zeros(momenta.memory_size(tableau.stages, n_q)), momenta.momenta_step
-        elif self.outer in ("auto", "newton"):
-            from twoloop.kernels import automatic, newton, newton_memory
+            return replace(plan, step=momenta.momenta_step, memory=np.zeros(momenta.memory_size(tableau.stages, n_q)))
+        if self.outer == "fixed-point":
+            return plan
+        newton = self._newton_plan(plan, n_q)
+        return newton if self.outer == "newton" else switching(plan, newton, LIMIT_OF_FIXED_POINT, n_q)
 
-            extra = newton.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
-            options = np.concatenate([options, extra])
-            n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
-            size = newton_memory.memory_size(n_eigen, tableau.stages, n_q)
-            newton_exponent = 1.0 / (tableau.stages + 1)
-            if self.outer == "newton":
-                memory, step, exponent = np.zeros(size), newton.newton_step, newton_exponent
-            else:
-                memory = automatic.automatic_memory(memory.size, size, exponent, newton_exponent)
-                step, exponent, least_error = automatic.automatic_step, 1.0, LEAST_ERROR**exponent
-        plan = Plan(step, options, memory, exponent, predictive=True, least_error=least_error)
-        return replace(plan, symmetric=self.partition == "symmetric", parts=self._parts())
+    def _newton_plan(self, plan: Plan, n_q: int) -> Plan:
+        """The same with Newton's method as the outer loop."""
+        from twoloop.kernels import newton, newton_memory
+
+        tableau = self.tableau
+        extra = newton.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
+        n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
+        return replace(
+            plan,
+            step=newton.newton_step,
+            options=np.concatenate([plan.options, extra]),
+            memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
+            exponent=1.0 / (tableau.stages + 1),
+        )
 
     def _extrapolation(self) -> float:
         from twoloop.kernels.stages import EMBEDDED

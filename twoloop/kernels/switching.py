@@ -19,6 +19,7 @@ from twoloop.kernels.common import (
     ESTIMATE,
     N_EVALUATIONS,
     N_JACOBIANS,
+    OUTER_DIVERGED,
     REUSE,
     STEP,
     compiled,
@@ -206,8 +207,8 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """
     n = w.Q.size
     first, second = _memories(memory, n)
+    memory[STEPS] += memory[LAST_ACCEPTED]
     if memory[LAST_ACCEPTED] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        memory[STEPS] += 1.0
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _settle_trial(w, options, memory, n, t)
@@ -226,6 +227,10 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if explicit:
         first[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
         code, error = f.first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
+        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0:  # a constant step cannot become shorter
+            _enter(w, options, memory, n, IMPLICIT, t)
+            _restart(second)
+            code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
         second[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
         code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
