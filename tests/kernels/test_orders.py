@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.problems import moving_pivot, moving_pivot_state, worst
-from twoloop import BDF, DOP853, Newmark, RungeKutta, solve_dae
+from twoloop import BDF, DOP853, ESDIRK, Newmark, RungeKutta, solve_dae
 from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 START = (0.4, 0.0)  # the angle stays below half a radian, and so the independent coordinate the same
@@ -25,6 +25,8 @@ METHODS = {
     "newmark(1/2)": (Newmark(beta=0.5), 2),
     "newmark(1/4, gamma=0.6)": (Newmark(beta=0.25, gamma=0.6), 1),
     "dop853": (DOP853(), 8),
+    "tr-bdf2": (ESDIRK("TRBDF2"), 2),
+    "esdirk4": (ESDIRK("ESDIRK4"), 4),
     **{f"bdf({k})": (BDF(max_order=k), k) for k in range(1, 6)},
 }
 

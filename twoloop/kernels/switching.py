@@ -36,6 +36,9 @@ DISPLACEMENT = 1e-6  # of the largest coordinate, for derivatives along a direct
 INNER_TOL = 1e-8  # of the positions; their error is squared
 NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
 SEED = 1e-3  # what a component of a direction begins with, of the largest
+SURELY = 2.0  # times LIMIT: where the step is next to the limit of stability
+TRIAL_COST = 100.0  # evaluations, with derivatives that are given
+PROPORTION = 10.0  # of the cost so far to that of a trial that may be in vain
 BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
 STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
 MEAN = 0.8  # weight of the steps before in the mean step
@@ -185,7 +188,9 @@ def _look(f, w, options, memory, t, state, new_state):
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
-    if (memory[PHASE] == EXPLICIT and share > 1.0) or (memory[PHASE] == IMPLICIT and share < BELOW):
+    # a trial costs some evaluations, and where derivatives are differenced more: not much of what the run has cost
+    due = share > SURELY or (share > 1.0 and _cost(w, options) > PROPORTION * (TRIAL_COST + 4.0 * w.independent.size))
+    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
         return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL

@@ -1,0 +1,104 @@
+"""Diagonally implicit stages: the tableaux, stiff problems with and without tangents, the estimate."""
+
+import numpy as np
+import pytest
+
+from tests.problems import worst
+from twoloop import ESDIRK, ConstrainedSystem, RungeKutta, solve_dae
+from twoloop.esdirk import FORMULAS
+from twoloop.mechanisms import four_bar, moderately_stiff_beam
+from twoloop.mechanisms.ancf_beam import tip_height
+from twoloop.tableaux import radau_iia
+
+TIMES = np.linspace(0.1, 1.0, 10)
+
+
+@pytest.fixture(scope="module")
+def beam():
+    problem = moderately_stiff_beam()
+    method = RungeKutta(radau_iia(4), outer="newton", tested="positions")
+    fine = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, 1e-6, 1e-6, t_eval=TIMES)
+    return problem, tip_height(fine.q)
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_order_conditions(formula):
+    make, order = FORMULAS[formula]
+    A, embedded = make()
+    b, c = A[-1], A.sum(axis=1)
+    conditions = [(b.sum(), 1), (b @ c, 1 / 2)]
+    if order == 4:
+        conditions += [(b @ c**2, 1 / 3), (b @ A @ c, 1 / 6), (b @ c**3, 1 / 4), ((b * c) @ A @ c, 1 / 8)]
+        conditions += [(b @ A @ c**2, 1 / 12), (b @ A @ A @ c, 1 / 24)]
+    conditions += [(embedded.sum(), 1), (embedded @ c, 1 / 2), (embedded @ c**2, 1 / 3), (embedded @ A @ c, 1 / 6)]
+    assert np.abs(np.subtract(*zip(*conditions, strict=True))).max() < 1e-14
+    assert abs(embedded - b).max() > 0.01
+    assert np.ptp(np.diagonal(A)[1:]) < 1e-15 and A[0].max() == 0.0
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_stability_function_vanishes_at_infinity(formula):
+    A, _ = FORMULAS[formula][0]()
+    R = lambda z: 1.0 + z * A[-1] @ np.linalg.solve(np.eye(len(A)) - z * A, np.ones(len(A)))  # noqa: E731
+    assert abs(R(-1e8)) < 1e-6
+    assert max(abs(R(1j * y)) for y in np.logspace(-2, 4, 50)) < 1.0 + 1e-12
+
+
+@pytest.mark.parametrize(("formula", "limit"), [("TRBDF2", 3e-3), ("ESDIRK4", 1.5e-3)])
+def test_stiff_beam_takes_few_iterations(beam, formula, limit):
+    problem, truth = beam
+    method = ESDIRK(formula, outer_tol=1e-4)
+    result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, step_size=0.01, t_eval=TIMES)
+    assert result.success
+    assert np.abs(tip_height(result.q) - truth).max() < limit
+    stages = {"TRBDF2": 2, "ESDIRK4": 5}[formula] * 100
+    assert result.stats.n_outer < 2.2 * stages
+    assert result.stats.n_jacobians == result.stats.n_outer  # each iterate has its own
+
+
+def test_error_of_the_stiff_beam_goes_with_the_tolerance(beam):
+    problem, truth = beam
+    errors, evaluations = [], []
+    for tol in (1e-3, 1e-5):
+        result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "TRBDF2", tol, tol, t_eval=TIMES)
+        errors.append(np.abs(tip_height(result.q) - truth).max())
+        evaluations.append(result.stats.n_evaluations)
+    assert errors[0] < 50e-3 and errors[1] < 1e-3
+    assert errors[1] < errors[0] / 5
+    assert evaluations[1] < 3000  # an explicit method needs 70,000
+
+
+def test_without_tangents_the_jacobian_is_kept_and_the_solution_the_same():
+    problem = four_bar()
+    tight = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "Gauss12", 1e-12, 1e-12)
+    for formula, error in (("TRBDF2", 1e-3), ("ESDIRK4", 5e-5)):
+        result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, formula, 1e-7, 1e-7)
+        assert worst(result.q[:, -1], tight.q[:, -1]) < error
+        assert result.stats.n_jacobians < 0.3 * result.stats.n_outer
+
+
+def test_damping_without_a_derivative_by_position():
+    """v' = -k v with k = 1e6, beside a free coordinate: J_v is all there is."""
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=0,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([-1e6 * (v[0] - np.cos(t)), -q[1]]),
+        constraint=None,
+        jacobian=None,
+        compile=True,
+    )
+    result = solve_dae(system, (0.0, 2.0), [0.0, 1.0], [1.0, 0.0], "TRBDF2", 1e-5, 1e-5)
+    assert worst(result.q[:, -1], [np.sin(2.0), np.cos(2.0)]) < 3e-3
+    assert result.stats.n_evaluations < 5000
+
+
+def test_velocities_are_tested_where_asked_for():
+    problem = four_bar()
+    tight = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, "Gauss12", 1e-12, 1e-12)
+    off = []
+    for tested in ("positions", "all"):
+        method = ESDIRK(tested=tested)
+        result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, 1e-5, 1e-5)
+        off.append(worst(result.v[:, -1], tight.v[:, -1]))
+    assert off[1] < 0.5 * off[0]

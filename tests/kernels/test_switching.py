@@ -1,0 +1,88 @@
+"""`auto`: which method runs when, that stiffness is found and left, and what the choice costs."""
+
+import numpy as np
+import pytest
+
+from tests.problems import worst
+from twoloop import ConstrainedSystem, solve_dae
+from twoloop.mechanisms import closed_chain, four_bar, moderately_stiff_beam
+from twoloop.mechanisms.ancf_beam import tip_height
+
+
+def spring(stiffness_of):
+    """A mass on a rigid rod, and a second one on a spring from the first, whose stiffness depends on time."""
+
+    def force(t, q, v):
+        d, u = q[2:] - q[:2], v[2:] - v[:2]
+        length = np.sqrt(d[0] * d[0] + d[1] * d[1])
+        k = stiffness_of(t)
+        pull = (k * (length - 1.0) + 2e-3 * k * (d[0] * u[0] + d[1] * u[1]) / length) / length
+        return np.array([pull * d[0], pull * d[1] - 9.81, -pull * d[0], -pull * d[1] - 9.81])
+
+    return ConstrainedSystem.from_python(
+        n_q=4,
+        n_c=1,
+        mass=np.eye(4),
+        force=force,
+        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
+        gamma=lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])]),
+    )
+
+
+START = ([1.0, 0.0, 2.0, 0.0], np.zeros(4))
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
+def test_where_nothing_is_stiff_the_steps_are_those_of_the_explicit_method(tol):
+    for problem, explicit in ((four_bar(), "DOP853"), (closed_chain(20), "Adams")):
+        one, other = (
+            solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tol, tol)
+            for method in ("auto", explicit)
+        )
+        assert one.stats.n_jacobians < 30  # a trial at most
+        assert one.stats.n_evaluations < 1.2 * other.stats.n_evaluations + 50
+        assert worst(one.q[:, -1], other.q[:, -1]) < 100 * tol
+
+
+def test_stiffness_is_found_and_costs_few_evaluations():
+    problem = moderately_stiff_beam()
+    runs = {
+        tol: solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "auto", tol, tol) for tol in (1e-3, 1e-5)
+    }
+    explicit = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", 1e-3, 1e-3)
+    for result in runs.values():
+        assert result.success and result.stats.n_jacobians > 100
+        assert result.stats.n_evaluations < explicit.stats.n_evaluations  # of a tenth of the time
+    assert abs(np.subtract(*(tip_height(run.q)[-1] for run in runs.values()))) < 0.05
+
+
+def test_it_goes_both_ways_during_a_run():
+    """A damped spring that is stiff between 1 s and 3 s only."""
+    system = spring(lambda t: 1e7 if 1.0 < t < 3.0 else 20.0)
+    result = solve_dae(system, (0.0, 8.0), *START, "auto", 1e-5, 1e-5, max_step=0.2)
+    assert result.success
+    assert result.stats.n_jacobians > 100
+    by_time = [np.median(result.h[(result.t[1:] > a) & (result.t[1:] <= b)]) for a, b in ((1.5, 2.9), (5.0, 8.0))]
+    assert min(by_time) > 4e-4  # explicit steps of the stiff part are 1.5e-4 at most
+    first = np.searchsorted(result.t, 3.5)
+    rest = solve_dae(system, (3.5, 8.0), result.q[:, first], result.v[:, first], "DOP853", 1e-9, 1e-9)
+    again = solve_dae(system, (3.5, 8.0), result.q[:, first], result.v[:, first], "auto", 1e-5, 1e-5)
+    assert again.stats.n_jacobians < 30
+    assert worst(again.q[:, -1], rest.q[:, -1]) < 2e-2  # DOP853 alone: 5e-3
+
+
+def test_a_run_can_be_repeated():
+    problem = moderately_stiff_beam()
+    runs = [solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, rtol=1e-4, atol=1e-4) for _ in range(2)]
+    assert np.array_equal(runs[0].q, runs[1].q)
+    assert runs[0].stats.n_evaluations == runs[1].stats.n_evaluations
+
+
+def test_constant_steps_are_those_of_the_symplectic_method():
+    problem = four_bar()
+    one, other = (
+        solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, step_size=0.01)
+        for method in ("auto", "SunRadau5")
+    )
+    assert np.array_equal(one.q, other.q)
