@@ -17,6 +17,7 @@ from twoloop.kernels.calls import evaluate
 from twoloop.kernels.common import (
     DONE,
     ESTIMATE,
+    FORCE_BY_Q_GIVEN,
     N_EVALUATIONS,
     N_JACOBIANS,
     OUTER_DIVERGED,
@@ -36,9 +37,8 @@ DISPLACEMENT = 1e-6  # of the largest coordinate, for derivatives along a direct
 INNER_TOL = 1e-8  # of the positions; their error is squared
 NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
 SEED = 1e-3  # what a component of a direction begins with, of the largest
-SURELY = 2.0  # times LIMIT: where the step is next to the limit of stability
-TRIAL_COST = 100.0  # evaluations, with derivatives that are given
-PROPORTION = 10.0  # of the cost so far to that of a trial that may be in vain
+SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
+EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
 BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
 STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
 MEAN = 0.8  # weight of the steps before in the mean step
@@ -188,8 +188,9 @@ def _look(f, w, options, memory, t, state, new_state):
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
-    # a trial costs some evaluations, and where derivatives are differenced more: not much of what the run has cost
-    due = share > SURELY or (share > 1.0 and _cost(w, options) > PROPORTION * (TRIAL_COST + 4.0 * w.independent.size))
+    # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
+    cheap = f.flags[FORCE_BY_Q_GIVEN] == 1 or _cost(w, options) > EARN * w.independent.size
+    due = share > SURELY or (share > 1.0 and cheap)
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
