@@ -4,6 +4,7 @@ from twoloop.bdf import BDF
 from twoloop.callbacks import callback
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state
@@ -20,6 +21,7 @@ __all__ = [
     "ConsistentState",
     "ConstrainedSystem",
     "ConstraintWarning",
+    "Drawing",
     "Joint",
     "Newmark",
     "Result",

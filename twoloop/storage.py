@@ -50,8 +50,8 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     path : str or path
         The file.
     system : ConstrainedSystem, optional
-        The system that was solved; only with it `result.sol` and `result.reactions` can be evaluated. None:
-        `result.sol` is None.
+        The system that was solved; only with it `result.sol`, `result.reactions`, `result.energy`, `result.plot` and
+        `result.animate` have all that they need. None: `result.sol` is None.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         message=words["message"],
         stats=Statistics(**words["stats"]),
         rank=words["rank"],
-        system=system if system is not None and system.joints else None,
+        system=system,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 
