@@ -11,6 +11,7 @@ from twoloop.projection import ConsistentState, consistent_state
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
 from twoloop.storage import load
+from twoloop.sweeps import sweep
 from twoloop.system import ConstrainedSystem
 
 __version__ = "0.1.0"
@@ -34,4 +35,5 @@ __all__ = [
     "paper_irk",
     "paper_newmark",
     "solve_dae",
+    "sweep",
 ]
