@@ -20,8 +20,8 @@ from twoloop.mechanisms import Problem, four_bar
 Array = NDArray[np.float64]
 
 SEED = 2016
-N_RUNS, N_QUICK = 10_000, 40
-N_SCALING, N_SCALING_QUICK = 1_000, 20
+N_RUNS, N_QUICK = 10_000, 20
+N_SCALING, N_SCALING_QUICK = 1_000, 10
 SPAN = (0.0, 6.0)
 RANGES = {"L1": (0.8, 1.5), "L2": (1.0, 2.0), "L3": (0.8, 1.6), "ground": (2.0, 3.0), "theta3": (-1.0, 1.0)}
 AT_REST = 1e-4  # of the largest velocity of a run: below it the linkage has turned back

@@ -146,9 +146,9 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
     sweep(linkage, ANGLES[:2], **options)
     with pytest.raises(ValueError, match=r"holds runs of .*linkage.*; this sweep is of .*rtol=1e-05.*another file"):
         sweep(linkage, ANGLES[:2], rtol=1e-5, **options)
-    with pytest.raises(ValueError, match=r"holds other parameters: run 1 has {'theta3': 0.1}, {'theta3': 0.2}"):
+    with pytest.raises(ValueError, match=r"holds other runs: 1 has {'theta3': 0.1}, {'theta3': 0.2}"):
         sweep(linkage, [ANGLES[0], {"theta3": 0.2}], **options)
-    with pytest.raises(ValueError, match="run 1 has .*not asked for"):
+    with pytest.raises(ValueError, match=r"runs: 1 has .*not asked for"):
         sweep(linkage, ANGLES[:1], **options)
     pd.DataFrame({"x": [1]}).to_parquet(out)
     with pytest.raises(ValueError, match="holds something else"):
@@ -194,7 +194,7 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
             (linkage, ANGLES),
             {"measure": lambda p, r: {"theta3": 1}, "parallel": "threads"},
             TypeError,
-            "columns of other names than the row has already; it returned 'theta3'",
+            "columns that the row has not already; it returned 'theta3'",
         ),
     ],
 )

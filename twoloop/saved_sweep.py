@@ -63,7 +63,5 @@ def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: str) -
         if number >= len(given) or any(row.get(name) != value for name, value in given[number].items()):
             asked = given[number] if number < len(given) else "not asked for"
             of_file = {name: row.get(name) for name in given[0]}
-            raise ValueError(
-                f"out, {str(path)!r}, holds other parameters: run {number} has {of_file}, {asked}. {advice}"
-            )
+            raise ValueError(f"out, {str(path)!r}, holds other runs: {number} has {of_file}, {asked}. {advice}")
     return rows

@@ -201,9 +201,7 @@ def _check_measured(measured: Any, known: set[str]) -> Row:
         raise TypeError(f"measure must return a mapping of columns; it returned {shown(measured)}")
     twice = sorted(set(measured) & known)
     if twice:
-        raise TypeError(
-            f"measure must return columns of other names than the row has already; it returned {twice[0]!r}"
-        )
+        raise TypeError(f"measure must return columns that the row has not already; it returned {twice[0]!r}")
     return dict(measured)
 
 
@@ -231,7 +229,7 @@ def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
         for name, value in each.items():
             if not isinstance(value, (bool, int, float, str, np.generic)):
                 raise TypeError(
-                    f"parameters[{number}][{name!r}] must be a number, a string, True or False, as it becomes a column; "
+                    f"parameters[{number}][{name!r}] must be a number, a string, True or False, a cell of a table; "
                     f"given {shown(value)}. Give the parts one by one, and let problem_of put them together"
                 )
         try:
