@@ -2,6 +2,7 @@
 
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
+from twoloop.citations import citation
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
 from twoloop.drawing import Drawing
@@ -30,6 +31,7 @@ __all__ = [
     "Statistics",
     "Status",
     "callback",
+    "citation",
     "consistent_state",
     "load",
     "paper_irk",

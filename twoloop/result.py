@@ -136,6 +136,8 @@ class Result:
         The system: `reactions` and `plot` evaluate its rows, and its `Problem` told it names, energy and drawing. None
         where a foreign solver ran, a file was read without the system, or the result comes from another process, and
         the system's functions (such as lambdas) cannot be pickled.
+    method : str
+        Name of the method with its options; "" of a foreign solver. `twoloop.citation` says what to cite for it.
     """
 
     t: Array
@@ -157,6 +159,7 @@ class Result:
     q_events: list[Array] | None = None
     v_events: list[Array] | None = None
     system: ConstrainedSystem | None = None
+    method: str = ""
 
     @property
     def success(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -169,7 +170,8 @@ def solve_dae(
         run.control[run.a.MAX_STEPS] = max_steps
     with _progress_bar(progress, method.name, t0, t1) as report:
         wanted = Wanted(times, plan.lands or step_size is not None, bool(dense_output), event_functions)
-        return run.go(t1, wanted, report, time_limit, check_derivatives)
+        result = run.go(t1, wanted, report, time_limit, check_derivatives)
+    return replace(result, method=method.name)
 
 
 def _check_method(method: str | Method) -> Method:
