@@ -182,6 +182,8 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
         ),
         ((linkage, ANGLES), {"workers": 0}, ValueError, "workers must be at least 1"),
         ((linkage, ANGLES), {"tol": 1e-3}, TypeError, "sweep has no argument 'tol', nor has solve_dae; options are"),
+        ((linkage, ANGLES), {"method": "Guass8"}, ValueError, r"method must be one of .*given 'Guass8'"),
+        ((linkage, ANGLES), {"rtol": 0.0}, ValueError, "rtol must be positive"),
         ((linkage, ANGLES), {"measure": lambda p, r: {}}, TypeError, "measure cannot be sent to another process"),
         ((linkage, ANGLES), {"measure": len, "parallel": "threads"}, TypeError, r"len\(\) takes exactly one argument"),
         (

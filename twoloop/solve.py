@@ -129,7 +129,7 @@ def solve_dae(
     if progress is not None:
         check_flag("progress", progress)
     check_flag("check_derivatives", check_derivatives)
-    method = _check_method(method)
+    method = check_method(method)
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)
@@ -174,7 +174,8 @@ def solve_dae(
     return replace(result, method=method.name)
 
 
-def _check_method(method: str | Method) -> Method:
+def check_method(method: str | Method) -> Method:
+    """The method of a name, or the object itself, or what is wrong with it."""
     known = ", ".join(PRESETS)
     if isinstance(method, str):
         if method not in PRESETS:

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from twoloop import saved_sweep
-from twoloop.checks import check_choice, check_flag, check_size, shown
+from twoloop.checks import check_choice, check_flag, check_positive, check_size, shown
 from twoloop.optional import needed
 from twoloop.result import Result, Status
-from twoloop.solve import solve_dae
+from twoloop.solve import check_method, solve_dae
 
 if TYPE_CHECKING:
     from twoloop.mechanisms.problem import Problem
@@ -245,6 +245,9 @@ def _check_options(options: dict[str, Any]) -> dict[str, Any]:
     unknown = [name for name in options if name not in known]
     if unknown:
         raise TypeError(f"sweep has no argument {unknown[0]!r}, nor has solve_dae; options are {', '.join(known)}")
+    check_method(options.get("method", "SunRadau5"))
+    for name in {"rtol", "time_limit"} & set(options):
+        check_positive(name, options[name])
     return options
 
 
