@@ -91,6 +91,10 @@ def test_the_page_of_a_planar_mechanism(swung, tmp_path):
     assert lengths == pytest.approx(np.ones(76), abs=1e-3)
     for frame, t in zip(frames[::15], np.linspace(0.0, 1.0, 76)[::15], strict=True):
         assert frame[1 - scene["fixed"][0]] == pytest.approx(pendulum().motion(t)[0], abs=1e-3)
+    (bob,) = np.array(scene["paths"])  # four points for each frame
+    assert bob.shape == (301, 2)
+    assert np.linalg.norm(bob, axis=1) == pytest.approx(np.ones(301), abs=1e-3)
+    np.testing.assert_array_equal(bob[::4], frames[:, 1 - scene["fixed"][0]])
     assert "http" not in path.read_text(encoding="utf-8")  # needs no other file
 
 

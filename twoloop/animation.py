@@ -27,6 +27,7 @@ AZIMUTH, ELEVATION = -60.0, 22.0  # degrees, from where a spatial mechanism is s
 WIDTH, HEIGHTS, MARGIN = 480, (200, 480), 28  # pixels
 COLORS = 64  # of a GIF
 FINER = 2  # pictures are drawn this much larger and reduced: lines have smooth edges
+FINER_PATHS = 4  # points of a path for each frame
 STILL = 1e-3  # of the extent: a point that moves less is fixed
 JOINTS_MOST = 12  # points of a planar mechanism that are drawn as circles
 BAR, TRACE, FIXED, PAPER = "#1f4e79", "#e07b39", "#444444", "#ffffff"
@@ -43,6 +44,8 @@ class Scene:
     times : ndarray (n,)
         Of the frames, s.
     points : ndarray (n_points, 2 or 3, n)
+    paths : ndarray (n_traces, 2 or 3, FINER_PATHS (n - 1) + 1)
+        Of the points whose paths are drawn.
     bars, traces, fixed, joints : list
         Pairs of points that a line joins, and points whose paths are drawn, that stay, that are drawn as circles.
     """
@@ -50,6 +53,7 @@ class Scene:
     name: str
     times: Array
     points: Array
+    paths: Array
     bars: list[tuple[int, int]]
     traces: list[int]
     fixed: list[int]
@@ -83,13 +87,16 @@ def animate(result: Result, path: str | os.PathLike[str], seconds: float | None)
 def _scene(result: Result, n_frames: int) -> Scene:
     drawing = result._known("drawing")
     times = np.linspace(result.t[0], result.t[-1], n_frames)
-    points = drawing.at(_positions(result, times))
+    fine = np.linspace(result.t[0], result.t[-1], FINER_PATHS * (n_frames - 1) + 1)
+    all_points = drawing.at(_positions(result, fine))
+    points = all_points[..., ::FINER_PATHS]
     moved = np.ptp(points, axis=2).max(axis=1)
     fixed = np.flatnonzero(moved <= STILL * np.ptp(points, axis=(0, 2)).max()).tolist()
     planar = points.shape[1] == 2 and len(points) <= JOINTS_MOST
     joints = [k for k in range(len(points)) if k not in fixed and (planar or k in drawing.traces)]
     name = "" if result.system is None else result.system.name
-    return Scene(name, times, points, list(drawing.bars), list(drawing.traces), fixed, joints)
+    paths = all_points[list(drawing.traces)]
+    return Scene(name, times, points, paths, list(drawing.bars), list(drawing.traces), fixed, joints)
 
 
 def _positions(result: Result, times: Array) -> Array:
@@ -107,6 +114,8 @@ def page(scene: Scene) -> str:
     data = {
         "times": [float(f"{t:.6g}") for t in scene.times],
         "frames": np.moveaxis(np.round(scene.points, decimals), 2, 0).tolist(),
+        "paths": np.moveaxis(np.round(scene.paths, decimals), 2, 1).tolist(),
+        "perFrame": FINER_PATHS,
         "bars": scene.bars,
         "traces": scene.traces,
         "fixed": scene.fixed,
@@ -135,36 +144,40 @@ def projected(points: Array) -> Array:
 def pictures(scene: Scene) -> list[Any]:
     """A picture of Pillow for each frame."""
     image, draw = (needed(f"PIL.{module}", "pillow", "a GIF or a film") for module in ("Image", "ImageDraw"))
-    seen = projected(scene.points)
-    low, high = seen.min(axis=(0, 2)), seen.max(axis=(0, 2))
+    seen, paths = projected(scene.points), projected(scene.paths)
+    both = np.concatenate([np.moveaxis(each, 1, 0).reshape(2, -1) for each in (seen, paths)], axis=1)
+    low, high = both.min(axis=1), both.max(axis=1)
     spans = np.maximum(high - low, 1e-12)
     height = int(np.clip((WIDTH - 2 * MARGIN) * spans[1] / spans[0] + 2 * MARGIN, *HEIGHTS)) // 2 * 2
     size = np.array([WIDTH, height])
     scale = ((size - 2 * MARGIN) / spans).min()
     flip = np.array([1.0, -1.0])
-    pixels = 0.5 * size[:, None] + flip[:, None] * scale * (seen - 0.5 * (low + high)[:, None])
+    pixels, trails = (
+        FINER * (0.5 * size[:, None] + flip[:, None] * scale * (each - 0.5 * (low + high)[:, None]))
+        for each in (seen, paths)
+    )
     made = []
     for frame, t in enumerate(scene.times):
         picture = image.new("RGB", (FINER * WIDTH, FINER * height), PAPER)
         pen = draw.Draw(picture)
-        _paint(pen, scene, FINER * pixels[..., : frame + 1])
+        _paint(pen, scene, pixels[..., frame], trails[..., : FINER_PATHS * frame + 1])
         pen.text((FINER * 8, FINER * 6), f"{scene.name}   t = {t:.3g} s", fill=FIXED, font_size=FINER * 13)
         made.append(picture.resize((WIDTH, height), image.Resampling.LANCZOS))
     return made
 
 
-def _paint(pen: Any, scene: Scene, pixels: Array) -> None:
-    """Draw a frame, the last of `pixels` (n_points, 2, n); the paths lead there from the first."""
+def _paint(pen: Any, scene: Scene, pixels: Array, trails: Array) -> None:
+    """Draw a frame: points (n_points, 2), and the paths (n_traces, 2, m) up to it."""
 
     def dot(point: int, radius: float, shape: str, **colors: str) -> None:
-        x, y = pixels[point, :, -1]
+        x, y = pixels[point]
         getattr(pen, shape)((x - radius, y - radius, x + radius, y + radius), **colors)
 
-    for trace in scene.traces:
-        pen.line([tuple(point) for point in pixels[trace].T], fill=TRACE, width=FINER, joint="curve")
+    for trail in trails:
+        pen.line([tuple(point) for point in trail.T], fill=TRACE, width=FINER, joint="curve")
     thick = FINER * (3 if scene.points.shape[1] == 2 else 2)
     for bar in scene.bars:
-        pen.line([tuple(pixels[end, :, -1]) for end in bar], fill=BAR, width=thick)
+        pen.line([tuple(pixels[end]) for end in bar], fill=BAR, width=thick)
     for point in scene.fixed:
         dot(point, FINER * 4, "rectangle", fill=FIXED)
     for point in scene.joints:

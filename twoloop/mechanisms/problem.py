@@ -167,7 +167,7 @@ class Problem:
     invariants: Mapping[str, Callable[[Any, Array, Array], Any]] = field(default_factory=dict)
     condition: Condition | None = None
     coordinates: tuple[str, ...] = ()
-    drawing: Drawing | None = None
+    drawing: Drawing | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         unknown = [tag for tag in self.tags if tag not in TAGS]
