@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from studies import figures, study
 from studies.cli import StudyError
 from studies.render import render, table
-from studies.store import Output
+from studies.store import Output, sources
 from twoloop import Result, sweep
 from twoloop.mechanisms import Problem, four_bar
 
@@ -39,7 +39,7 @@ def drawn(n: int) -> list[dict[str, Any]]:
     rng = np.random.default_rng(SEED)
     made = []
     for _ in range(n):
-        values = {name: float(rng.uniform(*limits)) for name, limits in RANGES.items()}
+        values = {name: round(float(rng.uniform(*limits)), 4) for name, limits in RANGES.items()}
         made.append({**values, "branch": int(rng.choice((-1, 1)))})
     return made
 
@@ -58,30 +58,36 @@ def measured(problem: Problem, result: Result) -> dict[str, Any]:
     rests = result.t_events[0][(speeds < AT_REST * np.abs(result.v).max()) & (result.t_events[0] > 0.0)]
     known = len(rests) > 1
     return {
-        "energy_error": np.abs(energy - energy[0]).max() / kinetic.max(),
-        "half": rests[0] if known else np.nan,
-        "period": rests[1] if known else np.nan,
+        "energy_error": _short(np.abs(energy - energy[0]).max() / kinetic.max(), 4),
+        "half": _short(rests[0], 12) if known else np.nan,
+        "period": _short(rests[1], 12) if known else np.nan,
         "n_evaluations": result.stats.n_evaluations,
     }
+
+
+def _short(value: float, digits: int) -> float:
+    """With so many digits: a file of ten thousand rows should hold no others."""
+    return float(f"{value:.{digits}g}")
 
 
 def make(output: Output) -> pd.DataFrame:
     """The rows of all linkages, then one of each way to sweep, with its wall-clock time."""
     quick = output.call.quick
     ways = WAYS[2:] if quick else WAYS  # new processes take seconds to start: not for a quick run
-    began = time.perf_counter()
+    options: dict[str, Any] = {"measure": measured, "t_span": SPAN, "events": turning}
+    # what an interrupted run leaves is of no use to other sources
+    kept = output.file(f"sweep_linkages.{sources()[:16]}.partial.parquet")
     given = drawn(N_QUICK if quick else N_RUNS)
-    rows = sweep(linkage, given, measure=measured, workers=2, parallel=ways[0][0], t_span=SPAN, events=turning)
-    parts = [rows.assign(group="linkages", wall=time.perf_counter() - began)]
+    rows = sweep(linkage, given, **options, workers=2, parallel=ways[0][0], out=kept)
+    rows["message"] = rows["message"].where(rows["status"] != "REACHED_END", "")
+    parts = [rows.drop(columns="seconds").assign(group="linkages")]
     for parallel, workers in ways:
         chosen = drawn(N_SCALING_QUICK if quick else N_SCALING)
         began = time.perf_counter()
-        timed = sweep(
-            linkage, chosen, measure=measured, workers=workers, parallel=parallel, t_span=SPAN, events=turning
-        )
-        wall = time.perf_counter() - began
-        row = {"group": "scaling", "parallel": parallel, "workers": workers, "wall": wall, "n_runs": len(timed)}
-        parts.append(pd.DataFrame([row]))
+        timed = sweep(linkage, chosen, **options, workers=workers, parallel=parallel)
+        row = {"group": "scaling", "parallel": parallel, "workers": workers, "n_runs": len(timed)}
+        parts.append(pd.DataFrame([row | {"wall": time.perf_counter() - began}]))
+    kept.unlink()
     return pd.concat(parts, ignore_index=True)
 
 
@@ -92,7 +98,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     if not len(done):
         raise StudyError("no linkage reached the end; the rows say why")
     failed = linkages[linkages["status"] != "REACHED_END"]
-    causes = failed["message"].str.startswith("ValueError: the linkage cannot be assembled")
+    causes = failed["message"].astype(str).str.startswith("ValueError: the linkage cannot be assembled")
     periodic = done[done["period"].notna()]
     worst = done.loc[done["energy_error"].idxmax()]
     scaling = rows[rows["group"] == "scaling"]
@@ -104,8 +110,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "n_done": len(done),
         "n_unassembled": int(causes.sum()),
         "others": failed[~causes]["status"].value_counts().to_dict(),
-        "wall": float(linkages["wall"].iloc[0]),
-        "runs_per_second": len(linkages) / float(linkages["wall"].iloc[0]),
+        "runs_per_second": int(scaling["n_runs"].iloc[0]) / min(wall.values()),
         "t_end": SPAN[1],
         "energy": _quantiles(done["energy_error"]),
         "worst": {name: float(worst[name]) for name in (*RANGES, "branch", "energy_error")},

@@ -15,9 +15,8 @@ ASSEMBLE = "ValueError: the linkage cannot be assembled with theta3 = 1"
 
 def made_up(**changes):
     """Rows of three linkages and of the four ways to sweep."""
-    linkages = pd.DataFrame([{**each, "seconds": 0.02} for each in study.drawn(3)]).assign(
+    linkages = pd.DataFrame(study.drawn(3)).assign(
         group="linkages",
-        wall=100.0,
         status=["REACHED_END", "REACHED_END", "ERROR"],
         message=["", "", ASSEMBLE],
         energy_error=[1e-9, 3e-9, np.nan],
@@ -62,6 +61,7 @@ def test_findings_are_of_the_rows():
     assert found["return"]["worst"] == pytest.approx(0.001 / 1.001)
     assert found["ratios"] == {"processes": 2.0, "threads": 1.45}
     assert found["scales"] is True
+    assert found["runs_per_second"] == pytest.approx(500 / 15.0)
     with pytest.raises(StudyError, match="no linkage reached the end"):
         study.findings_of(made_up(status="RANK_LOST"))
 
@@ -79,6 +79,7 @@ def test_sentences_follow_the_rows():
 def test_the_quick_study(tmp_path):
     study.main(["--quick", "--out", str(tmp_path)])
     report = (tmp_path / "sweep_linkages.md").read_text()
+    assert not list(tmp_path.glob("*.parquet"))  # of unfinished runs only
     assert "Quick run" in report and "Processes are compared in the full run only" in report
     study.main(["--quick", "--redraw", "--out", str(tmp_path)])
     redrawn = (tmp_path / "sweep_linkages.md").read_text()
