@@ -1,7 +1,5 @@
 """Work-precision report of a mechanism of your own: our methods beside IDA and SciPy's solvers."""
 
-import importlib.util
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from studies.render import number, power, render, table
 from studies.solvers import CATALOGUE, COMPARED
 from studies.store import Output
 from twoloop.mechanisms import Problem
+from twoloop.user_file import problem_from
 
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
@@ -29,26 +28,10 @@ def load_problem(where: str) -> Problem:
     StudyError
         If there is no such file or function, or it does not return a `Problem`.
     """
-    file, _, function = where.rpartition(":")
-    path = Path(file)
-    if not (file and function.isidentifier()):
-        raise StudyError(f"give FILE.py:FUNCTION, such as crane.py:crane; given {where}")
-    if not path.is_file():
-        raise StudyError(f"there is no file {path.resolve()}")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise StudyError(f"{path} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    sys.path.insert(0, str(path.parent.resolve()))  # for files beside it
-    spec.loader.exec_module(module)
-    maker = getattr(module, function, None)
-    if not callable(maker):
-        raise StudyError(f"{path} has no function {function}")
-    problem = maker()
-    if not isinstance(problem, Problem):
-        raise StudyError(f"{where} must return a twoloop.mechanisms.Problem; it returned {type(problem).__name__}")
-    return problem
+    try:
+        return problem_from(where)
+    except ValueError as error:
+        raise StudyError(str(error)) from None
 
 
 def runs_of(case: Case, solvers: Sequence[str], quick: bool) -> list[Run]:

@@ -10,10 +10,10 @@ from studies.cli import StudyError
 from studies.render import number, power, render
 from studies.store import Output
 
-# claims reads the others' rows
+# claims and compare_page read the others' rows
 STUDIES = (
     *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam"),
-    *("validation", "honesty", "planted_errors", "claims"),
+    *("validation", "honesty", "planted_errors", "sweep_linkages", "claims", "compare_page"),
 )
 CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen
     ("smooth",): "smooth, rigid",
@@ -143,7 +143,8 @@ def first_screen(folder: Path, quick: bool) -> str:
     studies = []
     for name in STUDIES:
         about = (importlib.import_module(f"studies.{name}").__doc__ or "").splitlines()[0].rstrip(".").split(":")[0]
-        files = [f"{name}.{suffix}" for suffix in ("md", "png") if (folder / f"{name}.{suffix}").is_file()]
+        names = ("compare.html",) if name == "compare_page" else (f"{name}.md", f"{name}.png")
+        files = [each for each in names if (folder / each).is_file()]
         studies.append({"name": name, "about": about, "file": files[0] if files else None})
     figure = (folder / "energy_cost.png").is_file()
     found = findings(folder)

@@ -15,15 +15,6 @@ from twoloop.mechanisms import Problem, four_bar
 INSTANTS = 9
 
 
-def _joints(problem: Problem, q):  # type: ignore[no-untyped-def]
-    """The joints from O to A, (2, 4), from the bars' ends."""
-    points = np.zeros((2, 4))
-    for i, name in enumerate(("L1", "L2", "L3")):
-        half = 0.5 * problem.parameters[name]
-        points[:, i + 1] = q[3 * i] + half * np.cos(q[3 * i + 2]), q[3 * i + 1] + half * np.sin(q[3 * i + 2])
-    return points
-
-
 def draw(axes: plt.Axes, problem: Problem) -> None:
     """Draw the bars at equal intervals over half a period, from the start (dark) to the other position of rest."""
     half = 0.5 * MinimalFourBar.from_parameters(problem.parameters).period
@@ -32,7 +23,7 @@ def draw(axes: plt.Axes, problem: Problem) -> None:
     fine = solve_dae(problem.system, (0.0, half), problem.q0, problem.v0, t_eval=np.linspace(0.0, half, 200))
     axes.plot(fine.q[6], fine.q[7], color=figures.RED, lw=1.2, label="centre of bar 3")
     for k in range(INSTANTS):
-        x, y = _joints(problem, result.q[:, k])
+        x, y = problem.drawing.at(result.q[:, k]).T  # type: ignore[union-attr]
         shade = plt.cm.viridis(0.9 * k / (INSTANTS - 1))
         axes.plot(x, y, "-o", color=shade, lw=2.4 if k == 0 else 1.3, ms=3.5)
         if k == 0:

@@ -68,6 +68,8 @@ def test_impacts(names):
     assert max(arc.sol(np.linspace(arc.t[0], arc.t[-1], 200)).q[8].max() for arc in arcs) < 1.0 + 1e-12
 
 
-def test_the_code_of_the_readme():
+def test_the_code_of_the_readme(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     for block in blocks("README.md"):
         exec(block, {})
+    assert {path.name for path in tmp_path.iterdir()} == {"run.png", "run.html"}

@@ -2,15 +2,18 @@
 
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
+from twoloop.citations import citation
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
 from twoloop.esdirk import ESDIRK
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state
 from twoloop.result import Result, Statistics, Status
 from twoloop.solve import solve_dae
 from twoloop.storage import load
+from twoloop.sweeps import sweep
 from twoloop.system import ConstrainedSystem
 
 __version__ = "0.1.0"
@@ -22,6 +25,7 @@ __all__ = [
     "ConsistentState",
     "ConstrainedSystem",
     "ConstraintWarning",
+    "Drawing",
     "Joint",
     "Newmark",
     "Result",
@@ -29,9 +33,11 @@ __all__ = [
     "Statistics",
     "Status",
     "callback",
+    "citation",
     "consistent_state",
     "load",
     "paper_irk",
     "paper_newmark",
     "solve_dae",
+    "sweep",
 ]

@@ -73,6 +73,20 @@ def compile_kept(
     return dispatcher
 
 
+def folder_of(package: types.ModuleType) -> Path | None:
+    """Where numba keeps the machine code of a package; None where no folder can be written."""
+
+    def anything() -> None:
+        pass
+
+    code = anything.__code__.replace(co_filename=str(package.__file__))
+    anything.__code__ = code
+    try:
+        return Path(FunctionCache(anything).cache_path)
+    except RuntimeError:
+        return None
+
+
 def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
     """A function within a function, or a lambda, under a name that no other has; any other function as it is.
 

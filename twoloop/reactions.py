@@ -46,7 +46,7 @@ class Reaction:
 def reaction(result: Result, name: str) -> Reaction:
     """Reaction of a named joint, see `Result.reactions`."""
     check_text("name", name)
-    if result.system is None:
+    if result.system is None or not result.system.joints:
         raise ValueError(
             "reactions need joints, and this result has none. Name them in the system, joints=[twoloop.Joint(...)] "
             "(ready mechanisms have theirs in problem.joints); to a result in a file give the system: "

@@ -3,14 +3,17 @@
 from __future__ import annotations  # Reaction and its kin are imported when they are asked for
 
 import os
+import pickle
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.dense import DenseSolution
+from twoloop.description import Description
 from twoloop.system import ConstrainedSystem
 
 if TYPE_CHECKING:
@@ -130,7 +133,11 @@ class Result:
         For each event function the times (n_events,) of its events, and coordinates and velocities (n_events, n_q)
         there. None: no events were asked for.
     system : ConstrainedSystem or None
-        The system, where it has joints; `reactions` evaluates its rows.
+        The system: `reactions` and `plot` evaluate its rows, and its `Problem` told it names, energy and drawing. None
+        where a foreign solver ran, a file was read without the system, or the result comes from another process, and
+        the system's functions (such as lambdas) cannot be pickled.
+    method : str
+        Name of the method with its options; "" of a foreign solver. `twoloop.citation` says what to cite for it.
     """
 
     t: Array
@@ -152,11 +159,128 @@ class Result:
     q_events: list[Array] | None = None
     v_events: list[Array] | None = None
     system: ConstrainedSystem | None = None
+    method: str = ""
 
     @property
     def success(self) -> bool:
         """Whether the run reached its end or an event."""
         return self.status >= 0
+
+    @property
+    def description(self) -> Description:
+        """Names, energy and drawing, as far as the `Problem` of the system told them."""
+        return Description() if self.system is None else self.system.description
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates with their units; q0, q1, ... where the problem has none."""
+        return self.description.coordinates or tuple(f"q{k}" for k in range(len(self.q)))
+
+    @property
+    def energy(self) -> Array:
+        """Energy at the times `t`, J, (n_t,).
+
+        Raises
+        ------
+        ValueError
+            If no energy is known: the system was solved without a `Problem`, or the result has no system.
+        """
+        return np.asarray(self._known("energy")(self.t, self.q, self.v))
+
+    def _known(self, what: str) -> Any:
+        """The energy or the drawing, or what to do to have it."""
+        found = getattr(self.description, what)
+        if found is None:
+            raise ValueError(
+                f"this result knows no {what}: put the system into a problem, twoloop.mechanisms.Problem(..., "
+                f"system=system, {what}=...), and solve problem.system. To a result in a file, or of another solver, "
+                "give the system: twoloop.load(path, problem.system), dataclasses.replace(result, "
+                "system=problem.system)"
+            )
+        return found
+
+    def to_dataframe(self) -> Any:
+        """The run as a table of pandas: a row an instant.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Indexed by "t (s)". Columns: coordinates by their names, such as "x of crank (m)", their velocities "x of
+            crank, velocity (m/s)" and accelerations, the multipliers lam0, lam1, ..., and, where it is known, "energy
+            (J)".
+
+        Raises
+        ------
+        ImportError
+            If pandas is not installed.
+        """
+        from twoloop.dataframe import to_dataframe
+
+        return to_dataframe(self)
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the coordinates, the energy and the violation of the constraints over time; needs no display.
+
+        A panel for each unit of the coordinates; the energy less that at the start where it is an invariant; the
+        largest violation of positions and of velocities at each time of `t`. What is not known is left out.
+
+        Parameters
+        ----------
+        path : str or path, optional
+            Where to save the figure as well, in a format of matplotlib, by the ending.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed.
+        ValueError
+            If the result has no output.
+        """
+        from twoloop.plotting import plot
+
+        return plot(self, path)
+
+    def animate(self, path: str | os.PathLike[str], seconds: float | None = None) -> Path:
+        """Write the mechanism in its motion, as its problem's `drawing` says; needs no display.
+
+        Between the stored times the motion is that of `sol`, or without it a polynomial through q, v and a: with
+        `t_eval`, take times close enough for that.
+
+        Parameters
+        ----------
+        path : str or path
+            A file that ends in .html (one page without further files, in which a spatial mechanism can be turned with
+            the mouse), .gif (needs Pillow) or .mp4 (needs Pillow and the program ffmpeg).
+        seconds : float, optional
+            How long the animation lasts. None: as long as the run, but from 3 to 12 s.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        ImportError, RuntimeError
+            If Pillow or ffmpeg is missing where it is needed.
+        TypeError, ValueError
+            If an argument is wrong, no drawing is known, or the run has fewer than two times.
+        """
+        from twoloop.animation import animate
+
+        return animate(self, path, seconds)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        try:
+            pickle.dumps(self.system)
+        except TypeError:  # of functions without a name of their own
+            state["system"] = None
+        return state
 
     def reactions(self, name: str) -> Reaction:
         """Force and torque of a joint on its body at the times `t`.

@@ -289,7 +289,7 @@ class Run:
             t_events=t_events,
             q_events=q_events,
             v_events=v_events,
-            system=system if system.joints else None,
+            system=system,
         )
 
     def _recorder(self, wanted: Wanted) -> Recorder:

@@ -4,6 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,7 @@ def solve_dae(
     if progress is not None:
         check_flag("progress", progress)
     check_flag("check_derivatives", check_derivatives)
-    method = _check_method(method)
+    method = check_method(method)
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)
@@ -170,10 +171,12 @@ def solve_dae(
         run.control[run.a.MAX_STEPS] = max_steps
     with _progress_bar(progress, method.name, t0, t1) as report:
         wanted = Wanted(times, plan.lands or step_size is not None, bool(dense_output), event_functions)
-        return run.go(t1, wanted, report, time_limit, check_derivatives)
+        result = run.go(t1, wanted, report, time_limit, check_derivatives)
+    return replace(result, method=method.name)
 
 
-def _check_method(method: str | Method) -> Method:
+def check_method(method: str | Method) -> Method:
+    """The method of a name, or the object itself, or what is wrong with it."""
     known = ", ".join(PRESETS)
     if isinstance(method, str):
         if method not in PRESETS:

@@ -31,7 +31,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
     for name in OF_EVENTS:
         arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
     words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
-    words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events}
+    words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
     if result.sol is not None:
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
@@ -50,8 +50,8 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     path : str or path
         The file.
     system : ConstrainedSystem, optional
-        The system that was solved; only with it `result.sol` and `result.reactions` can be evaluated. None:
-        `result.sol` is None.
+        The system that was solved; only with it `result.sol`, `result.reactions`, `result.energy`, `result.plot` and
+        `result.animate` have all that they need. None: `result.sol` is None.
 
     Returns
     -------
@@ -92,7 +92,8 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         message=words["message"],
         stats=Statistics(**words["stats"]),
         rank=words["rank"],
-        system=system if system is not None and system.joints else None,
+        system=system,
+        method=words.get("method", ""),  # older files have none
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 

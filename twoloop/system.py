@@ -22,6 +22,7 @@ from twoloop.adapters import (
 from twoloop.bounds import check_callback
 from twoloop.callbacks import KINDS, STATE, stand_in
 from twoloop.checks import check_number, check_real, check_size
+from twoloop.description import Description
 from twoloop.jacobian import differenced_jacobian
 from twoloop.joints import Joint, check_joints
 from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
@@ -94,6 +95,7 @@ class ConstrainedSystem:
         self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
         self.name = name
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
+        self.description = Description()  # a Problem puts its own in its place
         self.parameters = check_real("parameters", parameters)
         if self.parameters.ndim != 1 or not np.isfinite(self.parameters).all():
             raise ValueError(f"parameters must be a vector of finite numbers; given {parameters!r}")
@@ -296,11 +298,21 @@ class ConstrainedSystem:
         else:
             options |= {"constant_mass": self.constant_mass, "parameters": self.parameters}
         functions = {kind: packed(self.name, kind, function) for kind, function in (plain or self.given).items()}
-        return _made_again, (type(self), bool(plain), options, functions, self.functions.flags)
+        known = self.description
+        if known.energy is not None:
+            packed(self.name, "energy", known.energy)
+        if known.drawing is not None:
+            packed(self.name, "points of the drawing", known.drawing.points)
+        return _made_again, (type(self), bool(plain), options, functions, self.functions.flags, known)
 
 
 def _made_again(
-    cls: type[ConstrainedSystem], plain: bool, options: dict[str, Any], packed: dict[str, Any], flags: Array
+    cls: type[ConstrainedSystem],
+    plain: bool,
+    options: dict[str, Any],
+    packed: dict[str, Any],
+    flags: Array,
+    known: Description,
 ) -> ConstrainedSystem:
     """The system that was pickled, of the functions that this process finds by the same names."""
     functions = {kind: unpacked(function) for kind, function in packed.items()}
@@ -308,6 +320,7 @@ def _made_again(
         functions["mass"] = functions["mass"].matrix
     system = (cls.from_python if plain else cls)(**options, **functions)
     system.functions.flags[:] = flags
+    system.description = known
     return system
 
 

@@ -10,6 +10,7 @@ stiff in bending as Euler and Bernoulli say, however fine the mesh. This is part
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from twoloop.callbacks import callback
 from twoloop.checks import check_number, check_positive, check_size
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
 from twoloop.mechanisms.ancf_element import (
     FALL,
@@ -33,6 +35,7 @@ from twoloop.mechanisms.ancf_element import (
     force,
     mass,
 )
+from twoloop.mechanisms.points import LinearPoints
 from twoloop.mechanisms.problem import Array, Problem
 from twoloop.system import ConstrainedSystem
 
@@ -46,6 +49,7 @@ __all__ = [
 ]
 
 GRAVITY = 9.81  # m/s^2
+N_DRAWN = 8  # pieces of the line that an element is drawn as
 STARTS = {"node": "only the base node moving (start='node')", "beam": "all of it moving (start='beam')"}
 
 # p: the parameters of the elements, then those of the base's motion
@@ -209,6 +213,7 @@ def ancf_beam(
         v0=v0.ravel(),
         t_span=(0.0, 2.0),
         energy=Energy(M, p),
+        drawing=_centre_line(n_elements, l),
         parameters={"n_elements": n_elements, "start": start, **parameters},
         note=f"start assumed, the paper's text does not tell it: straight along x, gravity across it, {STARTS[start]}",
         source="L. Zhang and Zhang, Nonlinear Dynamics (2016), Sect. 4.2; Hussein, Negrut and Shabana (2008)",
@@ -221,6 +226,26 @@ def ancf_beam(
             for part in ("x (m)", "y (m)", "x slope", "y slope", "x director", "y director")
         ),
     )
+
+
+def _centre_line(n_elements: int, l: float) -> Drawing:
+    """The beam's middle as a line of `N_DRAWN` pieces an element: cubic, and linear in the coordinates."""
+    n = n_elements * N_DRAWN
+    matrix = np.zeros((n + 1, 2, 6 * (n_elements + 1)))
+    for k in range(n + 1):
+        element = min(k // N_DRAWN, n_elements - 1)
+        xi = k / N_DRAWN - element
+        shapes = {
+            0: 1.0 - 3.0 * xi**2 + 2.0 * xi**3,
+            2: l * (xi - 2.0 * xi**2 + xi**3),
+            6: 3.0 * xi**2 - 2.0 * xi**3,
+            8: l * (xi**3 - xi**2),
+        }
+        for place, shape in shapes.items():
+            for axis in range(2):
+                matrix[k, axis, 6 * element + place + axis] = shape
+    points = LinearPoints(matrix, np.zeros(matrix.shape[:2]))
+    return Drawing(points, tuple(pairwise(range(n + 1))), (n,))
 
 
 def very_flexible_beam(n_elements: int = 4, start: str = "node") -> Problem:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.drawing import Drawing
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
@@ -130,6 +131,29 @@ class Energy:
         return kinetic + 0.5 * SPRING * (length - LENGTH) ** 2 - TORQUE * q[0]
 
 
+# of the joints below: crank, coupler, the triangle of body 3, the spring, and the two bars of each further loop
+BARS = ((0, 1), (1, 2), (2, 3), (2, 4), (3, 4), (4, 5), (2, 6), (6, 7), (2, 8), (8, 7))
+
+
+def joints(q: Array) -> Array:
+    """Where the bodies meet: (9, 2) or (9, 2, n_t)."""
+
+    def along(angle: Any) -> Array:
+        return np.stack([np.cos(angle), np.sin(angle)])
+
+    def across(angle: Any) -> Array:
+        return np.stack([np.sin(angle), -np.cos(angle)])
+
+    def fixed(x: float, y: float) -> Array:
+        return np.stack([np.full_like(q[0], x), np.full_like(q[0], y)])
+
+    origin, a, b, c = fixed(0.0, 0.0), fixed(XA, YA), fixed(XB, YB), fixed(XC, YC)
+    crank = RR * along(q[0])
+    shared = crank - D * along(q[0] + q[1])
+    spring = b + SD * along(q[2]) + SC * across(q[2])
+    return np.stack([origin, crank, shared, b, spring, c, a + ZT * along(q[4]), a, a + U * across(q[6])])
+
+
 def andrews() -> Problem:
     """The mechanism from rest, as published, over 0.03 s."""
     q0 = np.array(
@@ -160,6 +184,7 @@ def andrews() -> Problem:
         v0=np.zeros(7),
         t_span=(0.0, 0.03),
         energy=Energy(),
+        drawing=Drawing(joints, BARS, (1, 2, 6, 8)),
         parameters=PARAMETERS,
         note="The energy counts the potential of the constant torque and is conserved.",
         reference=computed("Andrews' squeezing mechanism"),

@@ -9,10 +9,12 @@ import numpy as np
 
 from twoloop.joints import Joint
 from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.points import box
 from twoloop.mechanisms.problem import Array, Problem
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
 
 GRAVITY = 9.81
+WIDTH = 0.1  # m, of the bars
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float)
 AXES = np.eye(3)[[1, 2, 0, 1, 2, 0]]  # of the hinges at the corners
 BARS = np.roll(CORNERS, -1, axis=0) - CORNERS
@@ -27,9 +29,15 @@ def _vector(bar: int, k: int) -> Vector:
     return [{12 * bar + 3 * k + i: 1.0} for i in range(3)]
 
 
+def _place(bar: int, point: Array) -> Vector:
+    """A point of a bar, from its centre along its axes."""
+    parts = (1.0, *point.tolist())
+    return [{12 * bar + 3 * k + i: part for k, part in enumerate(parts) if part} for i in range(3)]
+
+
 def _end(bar: int, s: float) -> Vector:
     """The point at s, from -0.5 to 0.5, along a bar."""
-    return [{12 * bar + i: 1.0, 12 * bar + 3 + i: s} for i in range(3)]
+    return _place(bar, np.array([s, 0.0, 0.0]))
 
 
 def _carried(bar: int, direction: Array) -> Vector:
@@ -68,6 +76,11 @@ def _rows() -> QuadraticSystem:
             if across @ axis == 0.0:
                 numbers.append(rows.row(*_dot(of_one, _carried(hinge, across) if hinge < 5 else fixed(*across))))
         rows.joints.append(_joint(hinge, numbers))
+    corners, edges = box((1.0, WIDTH, WIDTH))
+    for bar in range(5):
+        for i, j in edges:
+            rows.line(_place(bar, corners[i]), _place(bar, corners[j]))
+        rows.line(_end(bar, -0.5), _end(bar, 0.5))
     return rows
 
 
@@ -83,7 +96,8 @@ def bricard() -> Problem:
         v0=np.zeros(60),
         t_span=(0.0, 2.0),
         energy=rows.energy,
-        parameters={"length": 1.0, "width": 0.1, "mass": 1.0, "gravity": GRAVITY},
+        drawing=rows.drawing(_end(1, 0.5)),
+        parameters={"length": 1.0, "width": WIDTH, "mass": 1.0, "gravity": GRAVITY},
         note="The run of the benchmark is 10 s long.",
         reference=computed("A04 Bricard"),
         source=(

@@ -7,8 +7,9 @@ import cmath
 
 import numpy as np
 
+from twoloop.description import body_names
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.planar import GROUND, PlanarBodies, body_names, states
+from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
 from twoloop.mechanisms.problem import Problem
 
 GRAVITY = 9.81
@@ -35,6 +36,7 @@ def driven_crank() -> Problem:
         v0=states((0.5 * pin_v, turn), (pin_v + 1j * RATE * half, RATE)),
         t_span=(0.0, 3.0),
         energy=rows.energy,
+        drawing=rows.drawing,
         parameters={
             "crank": CRANK,
             "rod": ROD,

@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike
 
 from twoloop.callbacks import callback
 from twoloop.checks import check_finite, check_vector
+from twoloop.description import body_names
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
-from twoloop.mechanisms.planar import body_names
+from twoloop.mechanisms.points import GROUND, BodyPoints
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
 
@@ -200,6 +202,7 @@ def four_bar(
         v0=np.zeros(9),
         t_span=(0.0, 100.0),
         energy=Energy(lengths_array),
+        drawing=_drawing(L1, L2, L3, ground),
         parameters={
             "L1": L1,
             "L2": L2,
@@ -235,6 +238,11 @@ def _joints(L1: float, L2: float, L3: float, ground: float) -> list[Joint]:
         Joint("2-3", (4, 5), *bars[2], point=(-0.5 * L3, 0.0), equations=E),
         Joint("A", (6, 7), *bars[2], point=(ground, 0.0), in_space=True, equations=E),
     ]
+
+
+def _drawing(L1: float, L2: float, L3: float, ground: float) -> Drawing:
+    points = np.array([[0.0, 0.0], [0.5 * L1, 0.0], [-0.5 * L3, 0.0], [ground, 0.0]])
+    return Drawing(BodyPoints((GROUND, 0, 2, GROUND), points), ((0, 1), (1, 2), (2, 3)), (1, 2))
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:

@@ -57,6 +57,7 @@ def governor() -> Problem:
         v0=v0,
         t_span=(0.0, 10.0),
         energy=rows.energy,
+        drawing=rows.drawing,
         parameters={"stiffness": STIFFNESS, "damping": DAMPING, "rate": RATE, "gravity": GRAVITY},
         reference=computed("A05 governor"),
         source=(

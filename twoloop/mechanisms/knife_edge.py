@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
+from twoloop.mechanisms.points import BodyPoints
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
 
@@ -78,6 +80,7 @@ def knife_edge() -> Problem:
         v0=v0,
         t_span=(0.0, 10.0),
         energy=energy,
+        drawing=Drawing(BodyPoints((0, 0, 0), np.array([[-0.3, 0.0], [0.3, 0.0], [0.0, 0.0]])), ((0, 1),), (2,)),
         parameters={"mass": MASS, "inertia": INERTIA, "slope": SLOPE, "spin": SPIN, "gravity": GRAVITY},
         note="Mass, inertia, slope and spin were chosen for this project.",
         reference=Reference(

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.special import ellipj, ellipk
 
 from twoloop.checks import check_size
-from twoloop.mechanisms.planar import GROUND, PlanarBodies, body_names
+from twoloop.description import body_names
+from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.mechanisms.problem import Array, Condition, Problem, Reference
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 
@@ -75,6 +76,8 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
     motion = Synchronous(n, coordinates)
     q0, v0 = motion(0.0)
     q, v = motion(10.0)
+    tips = [point(2 * i) for i in range(n + 1)]
+    drawing = rows.drawing(*tips) if isinstance(rows, QuadraticSystem) else rows.drawing
     # B0 is the tip of the first crank, twice as far from the ground joint as the centre of that crank
     return Problem(
         name=name,
@@ -83,6 +86,7 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
         v0=v0,
         t_span=(0.0, 10.0),
         energy=rows.energy,
+        drawing=drawing,
         parameters={"n": n, "length": 1.0, "mass": 1.0, "gravity": GRAVITY},
         note="Solved along the synchronous branch; the length of the usual run is that of MBSbenchmarksInOpenSim.",
         reference=Reference(

@@ -8,7 +8,7 @@ from scipy.special import ellipj, ellipk
 
 from twoloop.checks import check_finite
 from twoloop.mechanisms.problem import Array, Condition, Problem, Reference
-from twoloop.mechanisms.quadratic import QuadraticSystem, fixed
+from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 
 CVODE_GRAVITY = 13.7503716360407456549801915596211144  # (2 K(m = 1/2))^2: a quarter of the period is 1/2
 
@@ -54,6 +54,7 @@ def _pendulum(name: str, gravity: float, side: int, end: float, **known: object)
         v0=np.zeros(2),
         t_span=(0.0, end),
         energy=rows.energy,
+        drawing=rows.drawing(point(0)),
         parameters={"length": 1.0, "mass": 1.0, "gravity": gravity},
         reference=Reference(
             t=end,

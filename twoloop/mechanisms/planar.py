@@ -11,13 +11,16 @@ ground is body -1.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numba
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint, unused
+from twoloop.mechanisms.points import Sketch
 from twoloop.mechanisms.problem import Array
 from twoloop.system import ConstrainedSystem
 
@@ -195,6 +198,7 @@ class PlanarBodies:
         self.gravity, self.n_c = gravity, 0
         self._joints: list[list[float]] = []
         self._named: list[Joint] = []
+        self._pins: list[tuple[int, tuple[float, float], int, tuple[float, float]]] = []
 
     def _add(
         self, kind: float, rows: int, numbers: list[float], name: str, body: int, point: tuple[float, float]
@@ -215,6 +219,7 @@ class PlanarBodies:
 
     def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
         """Two rows: point a of body i is point b of body j (or of the ground); returns the first one's number."""
+        self._pins.append((i, a, j, b))
         return self._add(PIN, 2, [i, *a, j, *b, 0.0], *self._between("pin", i, a, j, b))
 
     def distance(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float], length: float) -> int:
@@ -256,12 +261,32 @@ class PlanarBodies:
         """Energy as a function of t, q and v."""
         return Energy(self.masses, self.inertias, self.gravity)
 
+    @property
+    def drawing(self) -> Drawing:
+        """Bodies as lines between their pins; with one pin a uniform rod, or a square where that is the centre."""
+        sketch = Sketch()
+        ends: list[list[tuple[float, float]]] = [[] for _ in self.names]
+        for i, a, j, b in self._pins:
+            for body, point in ((i, a), (j, b)):
+                if body == GROUND:
+                    sketch.point(body, point)
+                elif point not in ends[body]:
+                    ends[body].append(point)
+        for body, points in enumerate(ends):
+            if len(points) == 1 and points[0] != (0.0, 0.0):
+                points.append((-points[0][0], -points[0][1]))
+                sketch.trace(body, points[1])
+            if len(points) < 2:
+                side = np.sqrt(6.0 * self.inertias[body] / self.masses[body])  # of the square of that inertia
+                sketch.add_box(body, (side, side))
+            for first, second in pairwise(points):
+                sketch.line((body, first), (body, second))
+        for i, a, j, _ in self._pins:
+            if GROUND not in (i, j):
+                sketch.trace(i, a)
+        return sketch.drawing
+
 
 def states(*bodies: tuple[complex, float]) -> Array:
     """Coordinates (3 n,) of bodies, each given as x + i y and an angle; velocities likewise."""
     return np.array([[z.real, z.imag, angle] for z, angle in bodies]).ravel()
-
-
-def body_names(*bodies: str) -> tuple[str, ...]:
-    """Names of the coordinates of bodies."""
-    return tuple(f"{part} of {body}" for body in bodies for part in ("x (m)", "y (m)", "angle (rad)"))

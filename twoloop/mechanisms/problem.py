@@ -1,5 +1,6 @@
 """What every ready problem offers."""
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.description import Description, name_and_unit
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
 from twoloop.system import ConstrainedSystem
 
@@ -106,6 +109,7 @@ class Problem:
     ----------
     name : str
     system : ConstrainedSystem
+        A copy of the one given, which knows the names, the energy and the drawing: results take them from it.
     q0, v0 : ndarray (n_q,)
         Consistent start.
     t_span : (float, float)
@@ -135,7 +139,14 @@ class Problem:
     condition : Condition or None
         The pass rule of the benchmark's authors, where they have one.
     coordinates : tuple of str
-        Names of the coordinates with their units.
+        Names of the coordinates with their units, such as "x of crank (m)"; results name their columns by them.
+    drawing : Drawing or None
+        What `Result.animate` draws.
+
+    Raises
+    ------
+    ValueError
+        If a tag is unknown, `coordinates` are not n_q different names, or the drawing does not fit the start.
     """
 
     name: str
@@ -156,11 +167,30 @@ class Problem:
     invariants: Mapping[str, Callable[[Any, Array, Array], Any]] = field(default_factory=dict)
     condition: Condition | None = None
     coordinates: tuple[str, ...] = ()
+    drawing: Drawing | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         unknown = [tag for tag in self.tags if tag not in TAGS]
         if unknown:
             raise ValueError(f"tags must be of {', '.join(TAGS)}; given {unknown[0]!r}")
+        n_q, given = self.system.n_q, self.coordinates
+        if given and not len(given) == len(set(given)) == n_q:
+            raise ValueError(f"coordinates must be n_q = {n_q} different names, or none; given {given!r}")
+        if self.drawing is not None:
+            self.drawing.at(np.asarray(self.q0, dtype=float))
+        system = copy.copy(self.system)
+        system.description = Description(tuple(given), self.energy, self.conserved, self.drawing)
+        object.__setattr__(self, "system", system)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates without their units."""
+        return tuple(name_and_unit(each)[0] for each in self.coordinates)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the coordinates; "" for numbers without one."""
+        return tuple(name_and_unit(each)[1] for each in self.coordinates)
 
     @property
     def joints(self) -> tuple[Joint, ...]:

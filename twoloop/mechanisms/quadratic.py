@@ -15,7 +15,9 @@ import numba
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint
+from twoloop.mechanisms.points import LinearPoints
 from twoloop.mechanisms.problem import Array
 from twoloop.system import ConstrainedSystem
 
@@ -101,6 +103,7 @@ class QuadraticSystem:
     def __init__(self, mass: Array, force: Array):
         self.mass, self.force = np.asarray(mass, dtype=float), np.asarray(force, dtype=float)
         self.joints: list[Joint] = []
+        self._lines: list[tuple[Sequence[Scalar], Sequence[Scalar]]] = []
         self._constants: list[float] = []
         self._linear: list[tuple[float, ...]] = []
         self._quadratic: list[tuple[float, ...]] = []
@@ -123,8 +126,13 @@ class QuadraticSystem:
 
     def distance(self, first: Sequence[Scalar], second: Sequence[Scalar], length: float) -> int:
         """A row: half the squared distance of two points, each a list of scalars, is half the squared length."""
+        self.line(second, first)
         parts = [(0.5, difference(a, b), difference(a, b)) for a, b in zip(first, second, strict=True)]
         return self.row(*parts, (-0.5 * length**2, ONE, ONE))
+
+    def line(self, first: Sequence[Scalar], second: Sequence[Scalar]) -> None:
+        """A line of the drawing between two points; `distance` and `link` draw theirs."""
+        self._lines.append((first, second))
 
     def link(self, name: str, i: int, other: Sequence[Scalar], length: float) -> int:
         """A row, and a joint of this name: the point mass at q[i], q[i + 1] keeps its distance from another point."""
@@ -156,6 +164,27 @@ class QuadraticSystem:
     def energy(self) -> Energy:
         """Energy as a function of t, q and v."""
         return Energy(self.mass, self.force)
+
+    def drawing(self, *traced: Sequence[Scalar]) -> Drawing:
+        """The lines so far, and the paths of the points given."""
+        points: list[Sequence[Scalar]] = []
+
+        def number(place: Sequence[Scalar]) -> int:
+            if place not in points:
+                points.append(place)
+            return points.index(place)
+
+        bars = tuple((number(first), number(second)) for first, second in self._lines)
+        traces = tuple(number(place) for place in traced)
+        matrix = np.zeros((len(points), len(points[0]), self.force.size))
+        constant = np.zeros(matrix.shape[:2])
+        for k, place in enumerate(points):
+            for axis, scalar in enumerate(place):
+                constant[k, axis] = scalar.get(None, 0.0)
+                for i, coefficient in scalar.items():
+                    if i is not None:
+                        matrix[k, axis, i] = coefficient
+        return Drawing(LinearPoints(matrix, constant), bars, traces)
 
 
 def difference(a: Scalar, b: Scalar) -> Scalar:

@@ -5,11 +5,13 @@ the point of contact is at rest along x and y.
 """
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.drawing import Drawing
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.problem import Array, Problem
 from twoloop.system import ConstrainedSystem
@@ -17,6 +19,7 @@ from twoloop.system import ConstrainedSystem
 GRAVITY = 9.81
 MASS, RADIUS = 2.0, 0.4  # kg, m
 ACROSS, AXIAL = 0.25 * MASS * RADIUS**2, 0.5 * MASS * RADIUS**2  # moments of inertia about a diameter and the axis
+N_RIM = 24  # points of the drawing
 ANGLES = (0.1, 0.3, 0.0)  # yaw, lean, spin at the start, rad
 AHEAD, UPRIGHT, TURN = 0.6, 1.5, -9.0  # angular velocity about the direction ahead, the upright diameter, the axis
 
@@ -81,6 +84,16 @@ def energy(t: Any, q: Array, v: Array) -> Any:
     return 0.5 * (MASS * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2) + spin) + MASS * GRAVITY * q[2]
 
 
+def rim(q: Array) -> Array:
+    """Points of the rim, which turn with the disc, and the point of contact: (N_RIM + 1, 3) or (N_RIM + 1, 3, n_t)."""
+    sy, cy, s, c = np.sin(q[3]), np.cos(q[3]), np.sin(q[4]), np.cos(q[4])
+    ahead = np.stack([cy, sy, np.zeros_like(cy)])
+    upright = np.stack([s * sy, -s * cy, c])
+    angles = [q[5] + 2.0 * np.pi * k / N_RIM for k in range(N_RIM)]
+    turned = [RADIUS * (np.cos(angle) * ahead + np.sin(angle) * upright) for angle in angles]
+    return np.stack([q[:3] + arm for arm in (*turned, -RADIUS * upright)])
+
+
 def rolling_disc() -> Problem:
     """A disc of 2 kg and 0.4 m that leans by 0.3 rad at the start, and wobbles as it rolls."""
     yaw, lean, _ = ANGLES
@@ -108,6 +121,7 @@ def rolling_disc() -> Problem:
         v0=np.array([x, y, -RADIUS * math.sin(lean) * AHEAD, turn, AHEAD, TURN + turn * math.sin(lean)]),
         t_span=(0.0, 2.0),
         energy=energy,
+        drawing=Drawing(rim, (*pairwise((*range(N_RIM), 0)), (0, N_RIM // 2), (N_RIM // 4, 3 * N_RIM // 4)), (N_RIM,)),
         parameters={"mass": MASS, "radius": RADIUS, "gravity": GRAVITY, "angles": ANGLES},
         note="Mass, radius and start were chosen for this project.",
         reference=computed("rolling disc"),

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from twoloop.description import body_names
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.planar import GROUND, PlanarBodies, body_names, states
+from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
 from twoloop.mechanisms.problem import Array, Problem, Reference
 
 GRAVITY = 9.81
@@ -65,6 +66,7 @@ def redundant_slider_crank() -> Problem:
         v0=v0,
         t_span=(0.0, 2.0),
         energy=rows.energy,
+        drawing=rows.drawing,
         parameters=PARAMETERS,
         reference=computed("redundant slider-crank"),
         source=SOURCE,
@@ -113,6 +115,7 @@ def driven_slider_crank() -> Problem:
         v0=v0,
         t_span=(0.0, 2.0),
         energy=rows.energy,
+        drawing=rows.drawing,
         parameters={**PARAMETERS, "drive": DRIVE},
         reference=Reference(
             t=2.0,

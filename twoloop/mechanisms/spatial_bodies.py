@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.drawing import Drawing
 from twoloop.joints import Joint, unused
 from twoloop.mechanisms import spatial
+from twoloop.mechanisms.points import Sketch
 from twoloop.mechanisms.problem import Array
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
@@ -38,6 +40,7 @@ class SpatialBodies:
         self._joints: list[list[float]] = []
         self._named: list[Joint] = []  # rows not counting the normalisations
         self._springs: list[list[float]] = []
+        self._drawn: list[tuple[int, int, Array]] = []  # bodies of a joint, and its point at the start
 
     def body(
         self,
@@ -99,6 +102,8 @@ class SpatialBodies:
 
     def _name(self, kind: str, i: int, j: int, point: ArrayLike, first: int) -> None:
         """Name the rows since `first`: a joint that acts on body i, or, where that is the ground, on body j."""
+        if kind != "prismatic":  # whose point stays on neither body
+            self._drawn.append((i, j, np.asarray(point, dtype=float)))
         body, other = (j, i) if i == GROUND else (i, j)
         name = f"{kind} {self._names[body]}-{'ground' if other == GROUND else self._names[other]}"
         rows, place = tuple(range(first, self.n_joint_rows)), 7 * body
@@ -179,6 +184,30 @@ class SpatialBodies:
     def energy(self) -> "Energy":
         """Energy as a function of t, q and v."""
         return Energy(np.array(self._bodies), self.gravity, np.array(self._springs).reshape(-1, spatial.SPRING))
+
+    @property
+    def drawing(self) -> Drawing:
+        """Each body as the box of its mass and moments, with lines from the centre to its joints; springs as lines.
+
+        Paths are those of joints between two bodies, and of the centres of bodies with a single joint.
+        """
+        sketch = Sketch()
+        for body, (mass, *moments) in enumerate(self._bodies):
+            squares = 6.0 * (sum(moments) - 2.0 * np.array(moments)) / mass
+            sketch.add_box(body, np.sqrt(np.maximum(squares, 0.0)))
+            if sum(body in (i, j) for i, j, _ in self._drawn) == 1:
+                sketch.trace(body, np.zeros(3))
+        for i, j, point in self._drawn:
+            for body in (i, j):
+                if body == GROUND:
+                    sketch.point(body, point)
+                else:
+                    sketch.line((body, np.zeros(3)), (body, self._from_centre(body, point)))
+            if GROUND not in (i, j):
+                sketch.trace(i, self._from_centre(i, point))
+        for spring in self._springs:
+            sketch.line((int(spring[0]), spring[1:4]), (int(spring[4]), spring[5:8]))
+        return sketch.drawing
 
     def momentum(self, point: ArrayLike, axis: ArrayLike) -> "Momentum":
         """Angular momentum about an axis of space through a point, as a function of t, q and v."""

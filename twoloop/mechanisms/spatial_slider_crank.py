@@ -49,6 +49,7 @@ def spatial_slider_crank() -> Problem:
         v0=v0,
         t_span=(0.0, 5.0),
         energy=rows.energy,
+        drawing=rows.drawing,
         parameters={"crank": CRANK, "rod": ROD, "A": tuple(A), "masses": MASSES, "inertias": INERTIAS},
         note=(
             "The cross of the joint at the slider is such that the rod starts with the angular velocity (1.92, -0.96, "

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.callbacks import callback
+from twoloop.drawing import Drawing
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.problem import Array, Problem, Reference
 from twoloop.system import ConstrainedSystem
@@ -68,6 +69,14 @@ class Energy:
         return kinetic + 0.5 * k * (length - l0) ** 2 - F * (q[1] + np.cos(q[2]))
 
 
+def joints(q: Array) -> Array:
+    """Crank's centre, crank pin, slider, both ends of the spring: (5, 2) or (5, 2, n_t)."""
+    zero = np.zeros_like(q[0])
+    pin = PARAMETERS["a"] * np.stack([np.cos(q[0]), np.sin(q[0])])
+    slider = np.stack([q[1], zero])
+    return np.stack([np.stack([zero, zero]), pin, slider, 0.5 * pin, 0.5 * (pin + slider)])
+
+
 def sundials_slider_crank() -> Problem:
     """The mechanism from rest, its crank upright, over 10 s."""
     p = np.array(list(PARAMETERS.values()))
@@ -91,6 +100,7 @@ def sundials_slider_crank() -> Problem:
         v0=np.zeros(3),
         t_span=(0.0, 10.0),
         energy=Energy(p),
+        drawing=Drawing(joints, ((0, 1), (1, 2), (3, 4)), (1, 4)),
         parameters=PARAMETERS,
         reference=computed("SUNDIALS slider-crank"),
         published=Reference(

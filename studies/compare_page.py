@@ -1,0 +1,114 @@
+"""A page to compare solvers in a browser: mechanism, error measure, cost and solvers to choose from, of saved rows."""
+
+import html
+import json
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from studies import figures, study, tables
+from studies.cli import StudyError
+from studies.render import TEMPLATES
+from studies.store import Output, plain
+
+FILE = "compare.html"
+SOURCES = {  # study: its columns under the names of the page
+    "work_precision": {},
+    "validation": {"cpu_time": "cpu_s"},
+}
+MEASURES = {
+    "error_q": "largest position error (m, rad)",
+    "error_v": "largest velocity error",
+    "error_lam": "largest error of the multipliers",
+    "energy": "energy error (J)",
+    "violation_q": "largest violation of positions, |C|",
+    "violation_v": "largest violation of velocities",
+}
+COSTS = {"cpu_s": "CPU time (s)", "n_evaluations": "evaluations"}
+DIGITS = 4  # significant, of what the page holds; the CSV files have all
+
+
+def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+    """One row a run of all studies in a folder, and the stamps of these.
+
+    Raises
+    ------
+    StudyError
+        If there are no rows at all, or a file is damaged.
+    """
+    parts, stamps = [], {}
+    for name, columns in SOURCES.items():
+        path = folder / f"{name}.csv"
+        if not path.is_file():
+            continue
+        try:
+            first, rest = path.read_text().split("\n", 1)
+            rows = pd.read_csv(StringIO(rest)).rename(columns=columns)
+            rows = tables.medians(rows) if "repeat" in rows else rows
+            parts.append(rows.assign(mechanism=rows["case"].astype(str), study=name))
+        except (ValueError, KeyError) as error:
+            raise StudyError(f"{path} is damaged ({error}); make it again by python -m studies.{name}") from None
+        stamps[name] = first.removeprefix("# ")
+    if not parts:
+        raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
+    return pd.concat(parts, ignore_index=True), stamps
+
+
+def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
+    """What the page is given: mechanisms, solvers with their looks, and the runs as lists."""
+    solvers = []
+    for name, runs in rows.groupby("solver", sort=False):
+        first = runs.iloc[0]
+        look = figures.style(str(name), first["family"])
+        solvers.append({"name": name, "ours": first["family"] == "two-loop", "color": look["color"]})
+    numbers = {solver["name"]: k for k, solver in enumerate(solvers)}
+    mechanisms = [
+        {"name": f"{name} ({of})", "floor": float(runs["floor"].max())}
+        for (of, name), runs in rows.groupby(["study", "mechanism"], sort=False)
+    ]
+    places = {each["name"]: k for k, each in enumerate(mechanisms)}
+    columns = [*COSTS, *MEASURES]
+    runs = []
+    for _, row in rows.iterrows():
+        values = [_rounded(abs(row[name])) if name in row and pd.notna(row[name]) else None for name in columns]
+        done = row["status"] == "REACHED_END"
+        said = "" if done else f"{row['status']}: {str(row['message']).split('. ')[0]}"
+        mechanism = places[f"{row['mechanism']} ({row['study']})"]
+        runs.append([mechanism, numbers[row["solver"]], tables.setting(row), row["called_from"], *values, said])
+    return {
+        "mechanisms": mechanisms,
+        "solvers": solvers,
+        "columns": ["mechanism", "solver", "setting", "called", *columns, "said"],
+        "measures": MEASURES,
+        "costs": COSTS,
+        "runs": runs,
+        "stamps": stamps,
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def page(data: dict[str, Any]) -> str:
+    """The page, without further files."""
+    text = json.dumps(plain(data), separators=(",", ":"), ensure_ascii=False).replace("</", "<\\/")
+    stamps = "".join(f"<li>{html.escape(name)}: {html.escape(stamp)}</li>" for name, stamp in data["stamps"].items())
+    template = (TEMPLATES / FILE).read_text(encoding="utf-8")
+    return template.replace("STAMPS", stamps).replace("DATA", text, 1)
+
+
+def _work(output: Output) -> None:
+    output.write(FILE, page(page_data(*read(output.path))))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Write compare.html from the rows in the folder."""
+    study.run("compare_page", __doc__, words, _work)
+
+
+if __name__ == "__main__":
+    main()

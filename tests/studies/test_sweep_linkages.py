@@ -1,0 +1,86 @@
+"""The study of random linkages: its measures against closed forms, its sentences against rows that are made up."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import sweep_linkages as study
+from studies.cli import StudyError
+from studies.render import render
+from twoloop import sweep
+from twoloop.mechanisms import four_bar
+
+ASSEMBLE = "ValueError: the linkage cannot be assembled with theta3 = 1"
+
+
+def made_up(**changes):
+    """Rows of three linkages and of the four ways to sweep."""
+    linkages = pd.DataFrame(study.drawn(3)).assign(
+        group="linkages",
+        status=["REACHED_END", "REACHED_END", "ERROR"],
+        message=["", "", ASSEMBLE],
+        energy_error=[1e-9, 3e-9, np.nan],
+        half=[1.0, 0.5, np.nan],
+        period=[2.0, 1.001, np.nan],
+    )
+    walls = {"processes": (30.0, 15.0), "threads": (29.0, 20.0), **changes.pop("walls", {})}
+    scaling = [
+        {"group": "scaling", "parallel": way, "workers": k + 1, "wall": wall, "n_runs": 500}
+        for way, times in walls.items()
+        for k, wall in enumerate(times)
+    ]
+    return pd.concat([linkages.assign(**changes), pd.DataFrame(scaling)], ignore_index=True)
+
+
+def said(rows):
+    tables = {"scaling": ""}
+    return render("sweep_linkages", study.findings_of(rows), tables, stamp="stamp", quick=False)
+
+
+def test_the_default_linkage_has_the_period_of_its_reference():
+    start = {"L1": 1.0, "L2": 2.0, "L3": 1.5, "ground": 3.0, "theta3": 0.0, "branch": -1}
+    rows = sweep(
+        study.linkage, [start], measure=study.measured, parallel="threads", t_span=study.SPAN, events=study.turning
+    )
+    assert rows.loc[0, "period"] == pytest.approx(four_bar().reference.period, rel=1e-7)
+    assert rows.loc[0, "half"] == pytest.approx(0.5 * four_bar().reference.period, rel=1e-7)
+    assert 1e-12 < rows.loc[0, "energy_error"] < 1e-7
+
+
+def test_draws_are_always_the_same_and_within_their_ranges():
+    one, more = study.drawn(5), study.drawn(9)
+    assert one == more[:5]
+    assert all(low <= each[name] <= high for each in more for name, (low, high) in study.RANGES.items())
+    assert {each["branch"] for each in more} == {-1, 1}
+
+
+def test_findings_are_of_the_rows():
+    found = study.findings_of(made_up())
+    assert (found["n"], found["n_done"], found["n_unassembled"], found["others"]) == (3, 2, 1, {})
+    assert found["worst"]["L1"] == study.drawn(3)[1]["L1"]
+    assert found["return"]["worst"] == pytest.approx(0.001 / 1.001)
+    assert found["ratios"] == {"processes": 2.0, "threads": 1.45}
+    assert found["scales"] is True
+    assert found["runs_per_second"] == pytest.approx(500 / 15.0)
+    with pytest.raises(StudyError, match="no linkage reached the end"):
+        study.findings_of(made_up(status="RANK_LOST"))
+
+
+def test_sentences_follow_the_rows():
+    text = said(made_up())
+    assert "None failed otherwise" in text and "Processes scale by 1.8 or more" in text and "Threads scale less" in text
+    text = said(made_up(walls={"processes": (30.0, 20.0), "threads": (30.0, 16.0)}))
+    assert "Processes scale by less than 1.8" in text and "Threads scale no less than processes" in text
+    text = said(made_up(status=["REACHED_END", "STAGNATED", "ERROR"]))
+    assert "1 ended with STAGNATED" in text and "None failed" not in text
+    assert "No linkage came back" in said(made_up(period=np.nan, half=np.nan))
+
+
+def test_the_quick_study(tmp_path):
+    study.main(["--quick", "--out", str(tmp_path)])
+    report = (tmp_path / "sweep_linkages.md").read_text()
+    assert not list(tmp_path.glob("*.parquet"))  # of unfinished runs only
+    assert "Quick run" in report and "Processes are compared in the full run only" in report
+    study.main(["--quick", "--redraw", "--out", str(tmp_path)])
+    redrawn = (tmp_path / "sweep_linkages.md").read_text()
+    assert redrawn.split("\n", 4)[4] == report.split("\n", 4)[4]

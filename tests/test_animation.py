@@ -1,0 +1,179 @@
+"""Animations: pages, GIFs and films of results. No browser is needed: the script of a page runs under node."""
+
+import json
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.problems import swing
+from twoloop import solve_dae
+from twoloop.animation import projected
+from twoloop.mechanisms import pendulum, spatial_slider_crank
+
+# a document with what the page asks of it; counts what is drawn, and lets time pass frame by frame
+DOCUMENT = """
+const elements = {};
+let drawn = [], due = null, listeners = {};
+const brush = new Proxy({}, {
+  get: (known, name) => known[name] ?? ((...numbers) => drawn.push([name, ...numbers])),
+  set: (known, name, value) => { known[name] = value; return true; }
+});
+const element = name => ({
+  width: 1440, height: 960, getContext: () => brush,
+  addEventListener: (what, act) => { listeners[name + "." + what] = act; }
+});
+globalThis.document = { getElementById: name => elements[name] ??= element(name) };
+globalThis.addEventListener = (what, act) => { listeners[what] = act; };
+globalThis.requestAnimationFrame = act => { due = act; };
+"""
+PLAYED = """
+const said = {first: elements.time.textContent, drawn: [...drawn]};
+due(0);
+due(1000);
+said.second = elements.time.textContent;
+listeners["play.click"]();
+due(2000);
+said.paused = elements.time.textContent;
+elements.frame.value = "3";
+listeners["frame.input"]();
+said.chosen = elements.time.textContent;
+if (listeners["view.pointerdown"]) {
+  drawn = [];
+  listeners["view.pointerdown"]({clientX: 0, clientY: 0});
+  listeners["view.pointermove"]({clientX: 100, clientY: 20});
+  said.turned = drawn;
+}
+console.log(JSON.stringify(said));
+"""
+
+
+@pytest.fixture(scope="module")
+def swung():
+    problem = pendulum()
+    return solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+
+
+@pytest.fixture(scope="module")
+def crank():
+    problem = spatial_slider_crank()
+    return solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, dense_output=True)
+
+
+def scene_of(path):
+    return json.loads(re.search(r"const scene = (.*);\n", path.read_text(encoding="utf-8"))[1])
+
+
+def played(path):
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    script = re.search(r"<script>(.*)</script>", path.read_text(encoding="utf-8"), re.DOTALL)[1]
+    done = subprocess.run([node, "-"], input=f"{DOCUMENT}{script}{PLAYED}", capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_page_of_a_planar_mechanism(swung, tmp_path):
+    path = swung.animate(tmp_path / "swing.html")
+    scene = scene_of(path)
+    frames = np.array(scene["frames"])
+    assert frames.shape == (76, 2, 2)  # 3 s of 25 pictures, and the last
+    assert scene["times"][::75] == [0.0, 1.0]
+    assert len(scene["fixed"]) == 1
+    lengths = np.linalg.norm(frames[:, 1] - frames[:, 0], axis=1)
+    assert lengths == pytest.approx(np.ones(76), abs=1e-3)
+    for frame, t in zip(frames[::15], np.linspace(0.0, 1.0, 76)[::15], strict=True):
+        assert frame[1 - scene["fixed"][0]] == pytest.approx(pendulum().motion(t)[0], abs=1e-3)
+    (bob,) = np.array(scene["paths"])  # four points for each frame
+    assert bob.shape == (301, 2)
+    assert np.linalg.norm(bob, axis=1) == pytest.approx(np.ones(301), abs=1e-3)
+    np.testing.assert_array_equal(bob[::4], frames[:, 1 - scene["fixed"][0]])
+    assert "http" not in path.read_text(encoding="utf-8")  # needs no other file
+
+
+def test_the_script_of_a_planar_page(swung, tmp_path):
+    said = played(swung.animate(tmp_path / "swing.html"))
+    assert [said[when] for when in ("first", "second", "paused", "chosen")] == [
+        "t = 0.00 s",
+        "t = 0.333 s",  # after a second of three
+        "t = 0.333 s",
+        "t = 0.0400 s",
+    ]
+    calls = [name for name, *_ in said["drawn"]]
+    assert calls.count("fillRect") == 1 and calls.count("arc") == 1 and "lineTo" in calls
+    assert all(x is not None for _, *numbers in said["drawn"] for x in numbers)  # NaN is null in JSON
+    (_, x, y, _, _), *_ = [call for call in said["drawn"] if call[0] == "fillRect"]
+    assert 0 < x < 1440 and 0 < y < 960
+
+
+def test_a_spatial_page_can_be_turned(crank, tmp_path):
+    said = played(crank.animate(tmp_path / "crank.html", seconds=1.0))
+    lines = [call for call in said["turned"] if call[0] == "lineTo"]
+    assert lines and all(0 < x < 1440 and 0 < y < 960 for _, x, y in lines)
+    first = [call for call in said["drawn"] if call[0] == "lineTo"]
+    assert first[0] != lines[0]
+
+
+def test_a_gif(swung, tmp_path):
+    path = swung.animate(tmp_path / "swing.gif", seconds=1.0)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 26
+        assert picture.info["duration"] == 40
+        first = np.array(picture.convert("RGB"), dtype=int)
+        picture.seek(20)
+        later = np.array(picture.convert("RGB"), dtype=int)
+    assert (np.abs(first - later).sum(axis=2) > 100).sum() > 500  # it moved
+    assert (first.sum(axis=2) < 500).sum() > 500  # and is not a blank page
+
+
+def test_a_film_is_what_ffmpeg_gets(crank, tmp_path, monkeypatch):
+    """A program in the place of ffmpeg, which this machine may not have, writes down what it was given."""
+    program = tmp_path / "ffmpeg"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\n"
+        "open(sys.argv[-1], 'w').write(f'{len(sys.stdin.buffer.read())} ' + ' '.join(sys.argv[1:]))\n"
+    )
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    n_bytes, *words = crank.animate(tmp_path / "crank.mp4", seconds=0.2).read_text().split()
+    width, height = map(int, words[words.index("-s") + 1].split("x"))
+    assert int(n_bytes) == 6 * width * height * 3
+    program.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('no codec')\n")
+    with pytest.raises(RuntimeError, match=r"ffmpeg could not write.*no codec"):
+        crank.animate(tmp_path / "crank.mp4", seconds=0.2)
+    program.unlink()
+    with pytest.raises(RuntimeError, match=r"needs the program ffmpeg.*or write \.gif, \.html"):
+        crank.animate(tmp_path / "crank.mp4", seconds=0.2)
+
+
+def test_seen_from_the_front_and_above():
+    axes = projected(np.eye(3)[:, :, None])[..., 0]
+    assert axes[2, 0] == 0.0 and axes[2, 1] > 0.9  # z points upwards
+    assert axes[0, 0] > 0.0 and axes[1, 0] > 0.0  # x and y to the right
+
+
+def test_between_stored_times_with_and_without_the_dense_solution(crank, tmp_path):
+    with_sol, without = (
+        np.array(scene_of(each.animate(tmp_path / f"{k}.html"))["frames"])
+        for k, each in enumerate((crank, replace(crank, sol=None)))
+    )
+    assert np.abs(with_sol - without).max() < 1e-4
+
+
+def test_what_cannot_be_animated(swung, tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in .html, .gif, .mp4; given '.*swing.avi'"):
+        swung.animate(tmp_path / "swing.avi")
+    with pytest.raises(ValueError, match="seconds must be positive"):
+        swung.animate(tmp_path / "swing.gif", seconds=0.0)
+    with pytest.raises(ValueError, match=r"this result knows no drawing: put the system into a problem"):
+        swing().animate(tmp_path / "swing.gif")
+    short = replace(swung, t=swung.t[:1], q=swung.q[:, :1], v=swung.v[:, :1], a=swung.a[:, :1])
+    with pytest.raises(ValueError, match="two times at least; this one has 1"):
+        short.animate(tmp_path / "swing.gif")

@@ -1,0 +1,74 @@
+"""BibTeX for results: the paper always, the sources of the method, and no entry twice."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import twoloop
+from tests.problems import swing
+from twoloop import Result, RungeKutta, Statistics, Status, citation, load
+from twoloop.citations import ENTRIES, METHODS
+from twoloop.methods import PRESETS
+from twoloop.tableaux import gauss, lobatto_iiie
+
+ROOT = Path(__file__).parents[1]
+
+
+def keys(text):
+    return re.findall(r"^@\w+\{(\w+),$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_has_a_source_of_its_own(name):
+    result = swing(0.1, method=name)
+    text, cited = citation(result), keys(citation(result))
+    assert f'(method="{name}")' in text.splitlines()[0]
+    assert cited[0] == "zhang2016twoloop" and cited[-1] == "twoloop" and len(cited) > 2
+    assert len(cited) == len(set(cited))
+    assert twoloop.__version__ in text
+
+
+@pytest.mark.parametrize(
+    ("method", "cited"),
+    [
+        (RungeKutta(gauss(3), variables="momenta"), ["butcher1964", "hairer2006"]),
+        (RungeKutta(gauss(3), outer="newton"), ["butcher1964", "hairer1996"]),
+        (RungeKutta(lobatto_iiie(3), variables="momenta"), ["hairer2006"]),
+    ],
+)
+def test_options_that_have_sources(method, cited):
+    assert keys(citation(swing(0.1, method=method, step_size=0.01)))[1:-1] == cited
+
+
+@pytest.mark.parametrize("entry", ENTRIES.values(), ids=ENTRIES)
+def test_entries_are_well_formed(entry):
+    assert entry.count("{") == entry.count("}")
+    fields = dict(re.findall(r"^  (\w+) = \{(.*)\},?$", entry, re.MULTILINE))
+    assert {"title", "author", "year"} <= set(fields)
+    assert entry.splitlines()[-1] == "}" and len(fields) == len(entry.splitlines()) - 2
+
+
+def test_entries_are_all_used_and_agree_with_the_citation_file():
+    assert {key for known in METHODS.values() for key in known} | {"paper"} == set(ENTRIES)
+    given = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(r"doi: (\S+)", given)[1] in ENTRIES["paper"]
+    assert re.search(r"year: (\d+)", given)[1] in ENTRIES["paper"]
+    plain = ENTRIES["paper"].replace("{", "").replace("}", "").replace("--", "–")
+    assert re.search(r"type: article\n    title: (.*)", given)[1] in plain
+
+
+def test_a_result_from_a_file_is_cited_alike(tmp_path):
+    result = swing(0.1, method="Gauss8")
+    result.save(tmp_path / "run.npz")
+    assert citation(load(tmp_path / "run.npz")) == citation(result)
+
+
+def test_what_cannot_be_cited():
+    with pytest.raises(TypeError, match="citation needs a result of solve_dae; given str"):
+        citation("Gauss8")
+    row = np.zeros((1, 2))
+    foreign = Result(row[0], row, row, row, row, row[0], Status.REACHED_END, "", Statistics())
+    with pytest.raises(ValueError, match="this result was made by another solver"):
+        citation(foreign)

@@ -1,0 +1,220 @@
+"""Many runs at once: the same numbers as one by one, failures as rows, and going on after an interruption."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import twoloop
+from tests.problems import pendulum as bare_pendulum
+from twoloop import saved_sweep, solve_dae, sweep, sweeps
+from twoloop.mechanisms import Problem, four_bar, pendulum
+
+ANGLES = [{"theta3": angle} for angle in (0.0, 0.1, 2.0, -0.2, 0.3, 0.05)]  # 2.0 cannot be assembled
+MADE = []  # by `counted`, of threads
+
+
+def linkage(theta3):
+    return four_bar(theta3=theta3)
+
+
+def counted(theta3):
+    MADE.append(theta3)
+    return four_bar(theta3=theta3)
+
+
+def interrupted(theta3):
+    if theta3 == -0.2:
+        raise KeyboardInterrupt
+    return four_bar(theta3=theta3)
+
+
+def heights(problem, result):
+    return {"lowest": result.q[1::3].min(), "system": problem.system.name}
+
+
+def fussy(problem, result):
+    if result.q[8, 0] > 0.04:
+        raise RuntimeError("too steep")
+    return {"steps": result.stats.n_accepted}
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return sweep(linkage, ANGLES, measure=heights, workers=1, t_span=(0.0, 0.3), rtol=1e-6)
+
+
+def test_rows_are_those_of_single_runs(rows):
+    assert list(rows.columns) == ["theta3", "status", "message", "seconds", "lowest", "system"]
+    assert rows.index.tolist() == list(range(6)) and rows.index.name == "run"
+    assert rows["theta3"].tolist() == [each["theta3"] for each in ANGLES]
+    for number in (0, 1, 3, 4, 5):
+        problem = linkage(**ANGLES[number])
+        alone = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-6)
+        assert rows.loc[number, "lowest"] == alone.q[1::3].min()
+        assert rows.loc[number, "status"] == "REACHED_END"
+        assert rows.loc[number, "system"] == "four-bar"
+
+
+def test_a_failure_is_a_row(rows):
+    assert rows.loc[2, "status"] == "ERROR"
+    assert rows.loc[2, "message"].startswith("ValueError: the linkage cannot be assembled with theta3 = 2")
+    assert np.isnan(rows.loc[2, "lowest"])
+    stopped = sweep(linkage, ANGLES[:2], parallel="threads", t_span=(0.0, 1.0), max_steps=5)
+    assert stopped["status"].tolist() == ["MAX_STEPS", "MAX_STEPS"]
+    assert stopped["n_accepted"].tolist() == [5, 5]
+
+
+def test_threads_give_the_same_numbers(rows):
+    other = sweep(linkage, ANGLES, measure=heights, workers=2, parallel="threads", t_span=(0.0, 0.3), rtol=1e-6)
+    pd.testing.assert_frame_equal(other.drop(columns="seconds"), rows.drop(columns="seconds"))
+
+
+def test_a_dask_cluster_gives_the_same_numbers(rows):
+    distributed = pytest.importorskip("dask.distributed")
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        other = sweep(linkage, ANGLES, measure=heights, client=client, t_span=(0.0, 0.3), rtol=1e-6)
+    pd.testing.assert_frame_equal(other.drop(columns="seconds"), rows.drop(columns="seconds"))
+
+
+def test_by_default_ends_and_energy_are_measured():
+    rows = sweep(pendulum, [{"start": -1.0}, {"start": 1.0}], workers=1, parallel="threads", t_span=(0.0, 1.0))
+    assert rows["t"].tolist() == [1.0, 1.0]
+    assert rows["energy_error"].between(1e-14, 1e-6).all()
+    assert (rows["n_evaluations"] > rows["n_accepted"]).all()
+
+
+def test_of_a_mechanism_of_ones_own_in_threads():
+    """Lambdas travel to no process; threads take them. Each system has its own functions."""
+
+    def swinging(gravity):
+        system = bare_pendulum(force=lambda t, q, v: np.array([0.0, -gravity]))
+        energy = lambda t, q, v: 0.5 * (v * v).sum(axis=0) + gravity * q[1]  # noqa: E731
+        return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.2), energy)
+
+    gravities = [{"gravity": g} for g in (1.0, 2.0, 3.0, 4.0)]
+    rows = sweep(
+        swinging, gravities, parallel="threads", workers=2, measure=lambda problem, result: {"y": result.q[1, -1]}
+    )
+    # y is close to -g t^2 / 2 while the swing is short
+    assert rows["y"].to_numpy() == pytest.approx(-0.02 * np.arange(1.0, 5.0), rel=1e-2)
+    with pytest.raises(TypeError, match=r"problem_of cannot be sent to another process: .*parallel='threads'"):
+        sweep(swinging, gravities)
+
+
+# --- going on
+
+
+def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
+    out = tmp_path / "rows.parquet"
+    options = {"parallel": "threads", "workers": 1, "t_span": (0.0, 0.1), "out": out}
+    monkeypatch.setattr(saved_sweep, "settings", lambda work: "the same")  # of both functions
+    with pytest.raises(KeyboardInterrupt):
+        sweep(interrupted, ANGLES, **options)
+    kept = pd.read_parquet(out)
+    assert 0 < len(kept) < len(ANGLES) and "INTERRUPTED" not in set(kept["status"])
+    MADE.clear()
+    rows = sweep(counted, ANGLES, **options)
+    assert sorted(MADE) == sorted(each["theta3"] for k, each in enumerate(ANGLES) if k not in kept.index)
+    assert len(rows) == len(ANGLES) and (rows.loc[kept.index, "seconds"] == kept["seconds"]).all()
+    MADE.clear()
+    again = sweep(counted, ANGLES, **options)
+    assert MADE == []
+    pd.testing.assert_frame_equal(again, rows)
+    more = sweep(counted, [*ANGLES, {"theta3": 0.15}], **options)
+    assert MADE == [0.15] and len(more) == 7
+
+
+def test_rows_are_saved_while_it_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "SAVE_EVERY", 0.0)
+    lengths, write = [], saved_sweep.write
+
+    def watched(table, *others):
+        lengths.append(len(table))
+        write(table, *others)
+
+    monkeypatch.setattr(saved_sweep, "write", watched)
+    sweep(linkage, ANGLES[:2], parallel="threads", workers=1, t_span=(0.0, 0.1), out=tmp_path / "rows.parquet")
+    assert lengths == [1, 2, 2]
+
+
+def test_rows_of_another_sweep_are_refused(tmp_path):
+    out = tmp_path / "rows.parquet"
+    options = {"parallel": "threads", "t_span": (0.0, 0.1), "out": out}
+    sweep(linkage, ANGLES[:2], **options)
+    with pytest.raises(ValueError, match=r"holds runs of .*linkage.*; this sweep is of .*rtol=1e-05.*another file"):
+        sweep(linkage, ANGLES[:2], rtol=1e-5, **options)
+    with pytest.raises(ValueError, match=r"holds other runs: 1 has {'theta3': 0.1}, {'theta3': 0.2}"):
+        sweep(linkage, [ANGLES[0], {"theta3": 0.2}], **options)
+    with pytest.raises(ValueError, match=r"runs: 1 has .*not asked for"):
+        sweep(linkage, ANGLES[:1], **options)
+    pd.DataFrame({"x": [1]}).to_parquet(out)
+    with pytest.raises(ValueError, match="holds something else"):
+        sweep(linkage, ANGLES[:2], **options)
+    out.write_text("no table")
+    with pytest.raises(ValueError, match="cannot be read"):
+        sweep(linkage, ANGLES[:2], **options)
+    with pytest.raises(ValueError, match="out must be a file in a folder that exists"):
+        sweep(linkage, ANGLES[:2], t_span=(0.0, 0.1), out=tmp_path / "nowhere" / "rows.parquet")
+
+
+# --- mistakes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "words"),
+    [
+        ((None, ANGLES), {}, TypeError, "problem_of must be a function that returns a Problem; given None"),
+        ((linkage, {"theta3": [0.1]}), {}, TypeError, "parameters must be a list of mappings, one for each run"),
+        ((linkage, []), {}, ValueError, "parameters must be of one run at least"),
+        ((linkage, [0.1]), {}, TypeError, r"parameters\[0\] must be a mapping of names to values; given 0.1"),
+        ((linkage, [{"theta3": 0.1}, {"x": 1}]), {}, ValueError, r"all have the same names; .*\[1\] \['x'\]"),
+        ((linkage, [{"angle": 0.1}]), {}, TypeError, r"problem_of does not take parameters\[0\]: .*'theta3'"),
+        ((linkage, [{"theta3": (1.0, 2.0)}]), {}, TypeError, r"\['theta3'\] must be a number, a string.*one by one"),
+        ((lambda status: None, [{"status": 1}]), {}, ValueError, "must not be named as the columns.*'status'"),
+        (
+            (linkage, ANGLES),
+            {"parallel": "fork"},
+            ValueError,
+            "parallel must be 'processes' or 'threads'; given 'fork'",
+        ),
+        ((linkage, ANGLES), {"workers": 0}, ValueError, "workers must be at least 1"),
+        ((linkage, ANGLES), {"tol": 1e-3}, TypeError, "sweep has no argument 'tol', nor has solve_dae; options are"),
+        ((linkage, ANGLES), {"method": "Guass8"}, ValueError, r"method must be one of .*given 'Guass8'"),
+        ((linkage, ANGLES), {"rtol": 0.0}, ValueError, "rtol must be positive"),
+        ((linkage, ANGLES), {"measure": lambda p, r: {}}, TypeError, "measure cannot be sent to another process"),
+        ((linkage, ANGLES), {"measure": len, "parallel": "threads"}, TypeError, r"len\(\) takes exactly one argument"),
+        (
+            (linkage, ANGLES),
+            {"measure": lambda p, r: 1.0, "parallel": "threads"},
+            TypeError,
+            "measure must return a mapping of columns; it returned 1.0",
+        ),
+        (
+            (linkage, ANGLES),
+            {"measure": lambda p, r: {"theta3": 1}, "parallel": "threads"},
+            TypeError,
+            "columns that the row has not already; it returned 'theta3'",
+        ),
+    ],
+)
+def test_mistakes_come_through_at_once(arguments, options, error, words):
+    with pytest.raises(error, match=words):
+        sweep(*arguments, **{"t_span": (0.0, 0.01)} | options)
+
+
+def test_a_later_run_that_raises_is_a_row():
+    rows = sweep(linkage, ANGLES[:2], measure=fussy, parallel="threads", t_span=(0.0, 0.01))
+    assert rows["status"].tolist() == ["REACHED_END", "ERROR"]
+    assert rows.loc[1, "message"] == "RuntimeError: too steep"
+
+
+def test_a_bar(capsys):
+    sweep(linkage, ANGLES[:2], parallel="threads", t_span=(0.0, 0.01), progress=True)
+    assert "2 runs" in capsys.readouterr().out
+
+
+def test_it_is_the_function():
+    assert callable(twoloop.sweep)

@@ -1,0 +1,160 @@
+"""Results as tables and figures: names, energy, violation; and results in other processes."""
+
+import multiprocessing
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import twoloop
+from tests.problems import pendulum, run, swing
+from twoloop import solve_dae
+from twoloop.mechanisms import knife_edge, rolling_disc
+from twoloop.plotting import violation
+
+
+@pytest.fixture(scope="module")
+def result(default_four_bar):
+    return run(default_four_bar, 0.5)
+
+
+def test_a_table_with_the_names_of_the_mechanism(result, default_four_bar):
+    table = result.to_dataframe()
+    assert table.index.name == "t (s)"
+    assert len(table.columns) == 3 * 9 + 8 + 1
+    np.testing.assert_array_equal(table.index, result.t)
+    np.testing.assert_array_equal(table["angle (rad) of bar 3"], result.q[8])
+    np.testing.assert_array_equal(table["angle of bar 3, velocity (rad/s)"], result.v[8])
+    np.testing.assert_array_equal(table["x of bar 1, acceleration (m/s^2)"], result.a[0])
+    np.testing.assert_array_equal(table["lam7"], result.lam[7])
+    np.testing.assert_array_equal(table["energy (J)"], default_four_bar.energy(result.t, result.q, result.v))
+
+
+def test_a_table_without_names():
+    table = swing().to_dataframe()
+    assert list(table.columns) == ["q0", "q1", *(f"q{k}, {what}" for what in ("velocity (1/s)", "acceleration (1/s^2)") for k in (0, 1)), "lam0"]  # fmt: skip # noqa: E501
+
+
+def test_energy_needs_a_problem(result, default_four_bar):
+    assert result.energy.shape == result.t.shape
+    assert np.ptp(result.energy) < 1e-6
+    with pytest.raises(ValueError, match=r"this result knows no energy: put the system into a problem"):
+        assert swing().energy is None
+    foreign = replace(result, system=None)
+    with pytest.raises(ValueError, match=r"dataclasses.replace\(result, system=problem.system\)"):
+        assert foreign.energy is None
+    np.testing.assert_array_equal(replace(foreign, system=default_four_bar.system).energy, result.energy)
+
+
+def test_a_result_from_a_file_knows_what_its_system_knows(result, default_four_bar, tmp_path):
+    result.save(tmp_path / "run.npz")
+    assert twoloop.load(tmp_path / "run.npz").coordinates[0] == "q0"
+    table, other = result.to_dataframe(), twoloop.load(tmp_path / "run.npz", default_four_bar.system).to_dataframe()
+    assert list(other.columns) == list(table.columns)
+    np.testing.assert_allclose(other, table, rtol=1e-13)  # of another layout in memory, the energy is rounded otherwise
+
+
+def test_problems_do_not_share_what_they_say_of_one_system():
+    system = pendulum()
+    given = twoloop.mechanisms.pendulum()
+    one, other = (
+        twoloop.mechanisms.Problem("x", system, given.q0, given.v0, (0.0, 1.0), given.energy, coordinates=names)
+        for names in (("x", "y"), ("along", "up"))
+    )
+    assert one.system.description.coordinates == ("x", "y")
+    assert other.system.description.coordinates == ("along", "up")
+    assert system.description.coordinates == ()
+
+
+# --- figures
+
+
+def test_panels_for_units_energy_and_violation(result, tmp_path):
+    figure = result.plot(tmp_path / "run.png")
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+    labels = [panel.get_ylabel() for panel in figure.axes]
+    assert labels == ["q (m)", "q (rad)", "energy − start (J)", "largest violation"]
+    assert len(figure.axes[0].lines) == 6
+    np.testing.assert_array_equal(figure.axes[1].lines[2].get_ydata(), result.q[8])
+    np.testing.assert_array_equal(figure.axes[2].lines[0].get_ydata(), result.energy - result.energy[0])
+
+
+def test_what_is_not_known_is_left_out():
+    assert [panel.get_ylabel() for panel in swing().plot().axes] == ["q", "largest violation"]
+    assert [panel.get_ylabel() for panel in replace(swing(), system=None).plot().axes] == ["q"]
+    failed = swing(max_steps=3)
+    assert failed.plot().get_suptitle() == "pendulum: MAX_STEPS"
+    with pytest.raises(ValueError, match="plot needs a result with output; this one has none"):
+        replace(failed, t=failed.t[:0]).plot()
+
+
+def test_violation_is_that_of_the_rows(result, default_four_bar):
+    q, v = result.q.copy(), result.v.copy()
+    q[0, 3] += 1e-3
+    v[1, 5] += 1e-2
+    positions, velocities = violation(replace(result, q=q, v=v))
+    assert positions[3] == pytest.approx(1e-3) and velocities[5] == pytest.approx(1e-2)
+    assert np.delete(positions, 3).max() < 1e-12 and np.delete(velocities, [3, 5]).max() < 1e-12
+
+
+@pytest.mark.parametrize("make", [knife_edge, rolling_disc])
+def test_nonholonomic_rows_are_plotted_too(make):
+    problem = make()
+    done = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+    positions, velocities = violation(done)
+    assert positions.shape == velocities.shape == done.t.shape
+    assert len(done.plot().axes) == len(set(problem.units)) + 2
+
+
+# --- packages that may be missing, and other processes
+
+
+def test_missing_packages_say_how_to_install_them(tmp_path):
+    source = """
+import sys
+sys.modules |= dict.fromkeys(("pandas", "matplotlib", "PIL"))
+from twoloop import solve_dae
+from twoloop.mechanisms import pendulum
+p = pendulum()
+result = solve_dae(p.system, (0.0, 0.1), p.q0, p.v0)
+result.animate(sys.argv[1])  # a page needs none of them
+for call in (result.to_dataframe, result.plot, lambda: result.animate("x.gif")):
+    try:
+        call()
+    except ImportError as error:
+        print(error)
+"""
+    root = Path(__file__).parents[1]
+    command = [sys.executable, "-c", source, str(tmp_path / "page.html")]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=300)
+    said = [f"needs the package {package}: pip install {package}" for package in ("pandas", "matplotlib", "pillow")]
+    assert [line[-len(words) :] for line, words in zip(done.stdout.splitlines(), said, strict=True)] == said, (
+        done.stderr
+    )
+
+
+def end(result):
+    return result.energy[-1], result.system.name
+
+
+def test_results_travel_with_their_system(result):
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(end, (result,)) == (result.energy[-1], "four-bar")
+
+
+def test_results_of_lambdas_travel_without_their_system():
+    done = solve_dae(pendulum(force=lambda t, q, v: np.array([0.0, -1.0])), (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0])
+    other = pickle.loads(pickle.dumps(done))
+    assert other.system is None and done.system is not None
+    np.testing.assert_array_equal(other.q, done.q)
+
+
+def test_an_energy_without_a_name_says_so():
+    given = twoloop.mechanisms.pendulum()
+    problem = replace(given, energy=lambda t, q, v: 0.0)
+    with pytest.raises(TypeError, match=r"energy of 'A01 pendulum', .*<lambda>, cannot be pickled"):
+        pickle.dumps(problem.system)

@@ -1,0 +1,149 @@
+"""python -m twoloop: what is installed, compile everything, solve a mechanism from a file."""
+
+import argparse
+import os
+import pkgutil
+import platform
+import sys
+import time
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from twoloop import Result, __version__, kernels, solve_dae
+from twoloop.caches import folder_of
+from twoloop.methods import PRESETS
+from twoloop.user_file import problem_from
+
+NEEDED = ("numpy", "scipy", "numba")
+OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask")
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+TABLES, PICTURES, ANIMATIONS = (".csv", ".parquet"), (".png", ".svg", ".pdf"), (".html", ".gif", ".mp4")
+ENDINGS = (*TABLES, *PICTURES, *ANIMATIONS, ".npz")
+
+
+def info() -> None:
+    """Print versions, where compiled code is kept, and threads."""
+
+    def installed(package: str) -> str:
+        try:
+            return version(package)
+        except PackageNotFoundError:
+            return "not installed"
+
+    print(f"twoloop {__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
+    print(f"needed:   {', '.join(f'{package} {installed(package)}' for package in NEEDED)}")
+    print(f"optional: {', '.join(f'{package} {installed(package)}' for package in OPTIONAL)}")
+    folder = folder_of(kernels)
+    if folder is None:
+        print("cache:    none: no folder can be written; set NUMBA_CACHE_DIR to one that can")
+    else:
+        files = list(folder.glob("*.nbc"))
+        size = sum(file.stat().st_size for file in files)
+        state = f"{len(files)} compiled functions, {size / 1e6:.1f} MB" if files else "empty: python -m twoloop compile"
+        print(f"cache:    {folder} ({state})")
+    limits = ", ".join(f"{name}={os.environ.get(name, 'not set')}" for name in THREADS)
+    print(f"threads:  {os.cpu_count()} cores; a run uses one, and its linear algebra what {limits} allow")
+
+
+def compile_all() -> None:
+    """Compile every kernel, or read it from the cache, one line for each file."""
+    names = sorted(module.name for module in pkgutil.iter_modules(kernels.__path__))
+    began = time.perf_counter()
+    for number, name in enumerate(names, 1):
+        print(f"{number:3d} of {len(names)}  {name:20s}", end="", flush=True)
+        before = time.perf_counter()
+        import_module(f"{kernels.__name__}.{name}")
+        print(f"{time.perf_counter() - before:7.1f} s", flush=True)
+    print(f"ready after {time.perf_counter() - began:.1f} s")
+
+
+def solve(given: argparse.Namespace) -> None:
+    """Solve a problem of a file, say how the run ended, and write what was asked for.
+
+    Raises
+    ------
+    ValueError
+        If an argument is wrong, or a file cannot be written as asked.
+    """
+    files = [Path(name) for name in given.out]
+    for file in files:
+        if file.suffix.lower() not in ENDINGS:
+            raise ValueError(f"--out takes files that end in {', '.join(ENDINGS)}; given {str(file)!r}")
+        if not file.parent.is_dir():
+            raise ValueError(f"--out: there is no folder {file.parent.resolve()}")
+    problem = problem_from(given.where)
+    if problem.drawing is None and any(file.suffix.lower() in ANIMATIONS for file in files):
+        raise ValueError(f"{given.where} makes a problem without a drawing: give it drawing=twoloop.Drawing(...)")
+    t_span = (problem.t_span[0], problem.t_span[1] if given.t_end is None else given.t_end)
+    result = solve_dae(
+        problem.system,
+        t_span,
+        problem.q0,
+        problem.v0,
+        method=given.method,
+        rtol=given.rtol,
+        atol=given.atol,
+        progress=sys.stderr.isatty(),
+    )
+    counts = result.stats
+    print(f"{problem.name}, {given.method}: {result.status.name}. {result.message}")
+    print(f"{counts.n_accepted} steps, {counts.n_evaluations} evaluations, {counts.cpu_time:.3g} s")
+    for file in files:
+        write(result, file)
+        print(f"wrote {file}")
+    if not result.success:
+        raise SystemExit(1)
+
+
+def write(result: Result, file: Path) -> None:
+    """Write a result to a file of the kind that its ending says."""
+    ending = file.suffix.lower()
+    if ending == ".csv":
+        result.to_dataframe().to_csv(file)
+    elif ending == ".parquet":
+        result.to_dataframe().to_parquet(file)
+    elif ending == ".npz":
+        result.save(file)
+    elif ending in PICTURES:
+        result.plot(file)
+    else:
+        result.animate(file)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(prog="python -m twoloop", description=__doc__)
+    commands = made.add_subparsers(dest="command", required=True)
+    commands.add_parser("info", help="versions, where compiled code is kept, threads")
+    commands.add_parser("compile", help="compile all kernels now: the first run then starts at once")
+    one = commands.add_parser("solve", help="solve a mechanism and write tables, figures, animations")
+    one.add_argument("where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem")
+    one.add_argument("--method", default="SunRadau5", choices=list(PRESETS), metavar="NAME", help=", ".join(PRESETS))
+    one.add_argument("--rtol", type=float, default=1e-8, help="default: 1e-8")
+    one.add_argument("--atol", type=float, default=1e-8, help="default: 1e-8")
+    one.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
+    one.add_argument("--out", nargs="+", default=[], metavar="FILE", help=f"files, by ending: {', '.join(ENDINGS)}")
+    return made
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run a command; a wrong argument ends the process with one line and a status that is not 0."""
+    given = parser().parse_args(words)
+    try:
+        if given.command == "info":
+            info()
+        elif given.command == "compile":
+            compile_all()
+        else:
+            solve(given)
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Points of bodies for drawings, by the coordinates that the ready mechanisms have."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from twoloop.drawing import Drawing
+from twoloop.mechanisms.problem import Array
+from twoloop.mechanisms.rotation import rotated
+
+GROUND = -1
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPoints:
+    """Points that are linear in the coordinates.
+
+    Attributes
+    ----------
+    matrix : ndarray (n_points, 2 or 3, n_q)
+    constant : ndarray (n_points, 2 or 3)
+    """
+
+    matrix: Array
+    constant: Array
+
+    def __call__(self, q: Array) -> Any:
+        """The points at q (n_q,) or (n_q, n_t)."""
+        return np.tensordot(self.matrix, q, 1) + self.constant.reshape(*self.constant.shape, *(1,) * (q.ndim - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class BodyPoints:
+    """Points of bodies whose coordinates are x, y and an angle (2-D), or x, y, z and four Euler parameters (3-D).
+
+    Attributes
+    ----------
+    bodies : sequence of int
+        The body of each point; -1 is the ground.
+    points : ndarray (n_points, 2 or 3)
+        In the axes of the body, from its centre.
+    """
+
+    bodies: Sequence[int]
+    points: Array
+
+    def __call__(self, q: Array) -> Any:
+        """The points at q (n_q,) or (n_q, n_t)."""
+        return np.stack([self._place(q, *each) for each in zip(self.bodies, self.points, strict=True)])
+
+    def _place(self, q: Array, body: int, point: Array) -> Array:
+        if body == GROUND:
+            return point.reshape(-1, *(1,) * (q.ndim - 1)) + np.zeros(q.shape[1:])
+        if len(point) == 2:
+            x, y, angle = q[3 * body : 3 * body + 3]
+            s, c = np.sin(angle), np.cos(angle)
+            return np.stack([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
+        state = q[7 * body : 7 * body + 7]
+        return state[:3] + np.stack(rotated.py_func(*state[3:], *point))
+
+
+def box(size: Any) -> tuple[Array, list[tuple[int, int]]]:
+    """Corners (8, 3) of a box of edges (3,) about its centre, or (4, 2) of a rectangle, and its edges as pairs."""
+    dimension = len(size)
+    corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * dimension, indexing="ij")).reshape(dimension, -1).T
+    edges = [(i, j) for i in range(len(corners)) for j in range(i) if np.count_nonzero(corners[i] != corners[j]) == 1]
+    return corners * np.asarray(size), edges
+
+
+class Sketch:
+    """Collects points of bodies and lines between them."""
+
+    def __init__(self) -> None:
+        self.bodies: list[int] = []
+        self.points: list[Array] = []
+        self.bars: list[tuple[int, int]] = []
+        self.traces: list[int] = []
+
+    def point(self, body: int, point: Any) -> int:
+        """The number of a point, new or known."""
+        place = np.asarray(point, dtype=float)
+        for number, (other, known) in enumerate(zip(self.bodies, self.points, strict=True)):
+            if other == body and np.abs(known - place).max() < 1e-12:
+                return number
+        self.bodies.append(body)
+        self.points.append(place)
+        return len(self.bodies) - 1
+
+    def line(self, first: tuple[int, Any], second: tuple[int, Any]) -> None:
+        """A line between two points, each a body and a place on it."""
+        bar = (self.point(*first), self.point(*second))
+        if bar[0] != bar[1] and bar not in self.bars:
+            self.bars.append(bar)
+
+    def add_box(self, body: int, size: Any) -> None:
+        """A box, or a rectangle, about the centre of a body; edges without a length are left out."""
+        corners, edges = box(size)
+        for i, j in edges:
+            self.line((body, corners[i]), (body, corners[j]))
+
+    def trace(self, body: int, point: Any) -> None:
+        """The path of a point."""
+        number = self.point(body, point)
+        if number not in self.traces:
+            self.traces.append(number)
+
+    @property
+    def drawing(self) -> Drawing:
+        """What was collected."""
+        return Drawing(BodyPoints(tuple(self.bodies), np.array(self.points)), tuple(self.bars), tuple(self.traces))
