@@ -46,6 +46,7 @@ class Equations:
 
     def source(self, tangents: bool) -> str:
         """The generated code: a function for each callback, and the energy."""
+        tangents = tangents and not self.W  # Newton's method takes none beside non-holonomic rows
         arrays = self._callbacks() | (self._tangents() if tangents else {})
         constant = self.constant_mass
         parts = [f"CONSTANT_MASS = {constant}\nBANDWIDTH = {_bandwidth(arrays) if constant and tangents else None}\n"]
