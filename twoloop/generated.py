@@ -7,6 +7,8 @@ without it.
 import hashlib
 import linecache
 import math
+import sys
+import types
 import uuid
 from dataclasses import dataclass
 from functools import cache
@@ -84,10 +86,12 @@ def _functions(code: GeneratedCode) -> dict[str, Any]:
     path, text = _path(code.key), f"{_head(code.source)}\n{code.source}"
     if GeneratedCode.stored(code.key) != code:
         _write(path, text)
-    names: dict[str, Any] = {"__name__": f"twoloop_equations_{code.key}", "math": math, "np": np, "GENERATED": code}
-    exec(compile(text, str(path), "exec"), names)
+    module = types.ModuleType(f"twoloop_equations_{code.key}")
+    vars(module).update(math=math, np=np, GENERATED=code)
+    sys.modules[module.__name__] = module  # numba reads no machine code of functions whose module it cannot import
+    exec(compile(text, str(path), "exec"), vars(module))
     linecache.checkcache(str(path))
-    return names
+    return vars(module)
 
 
 @cache
