@@ -1,15 +1,14 @@
 """Equations of motion in plain symbols, and every derivative that the callbacks need."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import sympy
 from sympy import Expr, Symbol
 
-from twoloop.symbolic.printing import Entries, callback_source, energy_source
+from twoloop.symbolic.differentiation import ZERO, Entries, filled
+from twoloop.symbolic.printing import callback_source, energy_source
 from twoloop.symbolic.reading import Reader
-
-ZERO = sympy.S.Zero
 
 
 @dataclass(frozen=True)
@@ -54,34 +53,34 @@ class Equations:
         return "\n\n".join([*parts, energy_source(self.energy)])
 
     def _callbacks(self) -> dict[str, list[Entries]]:
-        x, n = self.symbols, range(len(self.symbols.q))
+        x, d, n = self.symbols, self.symbols.differentiation, range(len(self.symbols.q))
         found = {
-            "mass": [_filled(((i, j), self.M[min(i, j), max(i, j)]) for i in n for j in n)],
-            "force": [_filled(enumerate(self.Q))],
+            "mass": [filled(((i, j), self.M[min(i, j), max(i, j)]) for i in n for j in n)],
+            "force": [filled(enumerate(self.Q))],
         }
         if self.C:
-            rows, rate = derivatives(self.C, x.q), [each.diff(x.t) for each in self.C]
+            rows, rate = d.rows(self.C, x.q), [d.by(each, x.t) for each in self.C]
             moving = [rate[i] + sum(rows.get((i, j), ZERO) * x.v[j] for j in n) for i in range(len(self.C))]
-            C, Ct, Qd = (_filled(enumerate(each)) for each in (self.C, rate, accelerations(moving, x)))
+            C, Ct, Qd = (filled(enumerate(each)) for each in (self.C, rate, accelerations(moving, x)))
             found |= {"constraint": [C], "jacobian": [rows]} | ({"constraint_rate": [Ct]} if Ct else {})
             found |= {"gamma": [Qd], "kinematics": [C, rows, Ct, Qd]}
         if self.W:
             still = dict.fromkeys(x.v, ZERO)
-            b = _filled((i, each.xreplace(still)) for i, each in enumerate(self.W))
-            found |= {"nonholonomic": [derivatives(self.W, x.v)]} | ({"nonholonomic_rate": [b]} if b else {})
-            found["nonholonomic_gamma"] = [_filled(enumerate(accelerations(self.W, x)))]
+            b = filled((i, each.xreplace(still)) for i, each in enumerate(self.W))
+            found |= {"nonholonomic": [d.rows(self.W, x.v)]} | ({"nonholonomic_rate": [b]} if b else {})
+            found["nonholonomic_gamma"] = [filled(enumerate(accelerations(self.W, x)))]
         return found
 
     def _tangents(self) -> dict[str, list[Entries]]:
-        x, n = self.symbols, range(len(self.symbols.q))
-        found = {"force_by_q": [derivatives(self.Q, x.q)]}
-        by_v = derivatives(self.Q, x.v)
+        x, d, n = self.symbols, self.symbols.differentiation, range(len(self.symbols.q))
+        found = {"force_by_q": [d.rows(self.Q, x.q)]}
+        by_v = d.rows(self.Q, x.v)
         if by_v:
             found["force_by_v"] = [by_v]
         if self.C:
-            lam, rows = [Symbol(f"lam{k}") for k in range(len(self.C))], derivatives(self.C, x.q)
+            lam, rows = [Symbol(f"lam{k}") for k in range(len(self.C))], d.rows(self.C, x.q)
             reaction = [sympy.Add(*(lam[k] * rows.get((k, i), ZERO) for k in range(len(lam)))) for i in n]
-            found["reaction_by_q"] = [derivatives(reaction, x.q)]
+            found["reaction_by_q"] = [d.symmetric(reaction, x.q)]
         return found
 
 
@@ -91,21 +90,10 @@ def _bandwidth(arrays: dict[str, list[Entries]]) -> int:
     return max((abs(i - j) for kind in kinds for i, j in arrays.get(kind, [{}])[0]), default=0)
 
 
-def derivatives(expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Entries:
-    """The entries (i, j) of the Jacobian of expressions by symbols that are not zero."""
-    places = {symbol: j for j, symbol in enumerate(symbols)}
-    found = {}
-    for i, expression in enumerate(expressions):
-        for symbol in sorted(expression.free_symbols & set(places), key=places.__getitem__):
-            found[i, places[symbol]] = expression.diff(symbol)
-    return _filled(found.items())
-
-
 def along(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
     """The derivatives of expressions by time, less what the accelerations contribute."""
-    by_q = derivatives(expressions, x.q)
-    rates: list[list[Expr]] = [[each.diff(x.t)] for each in expressions]
-    for (i, j), entry in by_q.items():
+    rates: list[list[Expr]] = [[x.differentiation.by(each, x.t)] for each in expressions]
+    for (i, j), entry in x.differentiation.rows(expressions, x.q).items():
         rates[i].append(entry * x.v[j])
     return [sympy.Add(*terms) for terms in rates]
 
@@ -115,17 +103,15 @@ def accelerations(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
     return [-each for each in along(expressions, x)]
 
 
-def linear(argument: str, expressions: Sequence[Expr], symbols: Sequence[Symbol], names: str) -> Entries:
-    """The derivatives of expressions that are linear in symbols, or say that they are not."""
-    rows = derivatives(expressions, symbols)
+def linear(argument: str, expressions: Sequence[Expr], x: Reader) -> Entries:
+    """The derivatives by the velocities of expressions that are linear in them, or say that they are not."""
+    rows, velocities = x.differentiation.rows(expressions, x.v), set(x.v)
     for (i, j), entry in rows.items():
-        if entry.free_symbols & set(symbols):
-            entry = entry.expand()
-            if entry.free_symbols & set(symbols):
-                raise ValueError(f"{argument}[{i}] must be linear in the {names}; its derivative by {symbols[j]} is {entry}")
-            rows[i, j] = entry
-    return _filled(rows.items())
-
-
-def _filled(entries: Iterable[tuple[object, Expr]]) -> Entries:
-    return {place: entry for place, entry in entries if entry != 0}
+        if x.differentiation.symbols_of(entry) & velocities:
+            rows[i, j] = entry.expand()
+            if rows[i, j].free_symbols & velocities:
+                raise ValueError(
+                    f"{argument}[{i}] must be linear in the velocities; its derivative by that of {x.names[j]} depends "
+                    "on velocities"
+                )
+    return filled(rows.items())

@@ -6,7 +6,8 @@ from typing import Any
 import sympy
 from sympy import Expr
 
-from twoloop.symbolic.equations import ZERO, Equations, along, derivatives, linear
+from twoloop.symbolic.differentiation import ZERO
+from twoloop.symbolic.equations import Equations, along, linear
 from twoloop.symbolic.mechanism import SymbolicMechanism, made
 from twoloop.symbolic.reading import POSITIONS, VELOCITIES, Reader, column
 
@@ -68,19 +69,19 @@ def from_lagrangian(
     F = _forces(x, forces, coordinates)
     C, W = read_rows(x, constraints, nonholonomic)
 
+    d = x.differentiation
+    momenta = [d.by(kinetic, v) for v in x.v]
+    M = linear("dT/dv", momenta, x)
+
     def derive() -> Equations:
-        momenta = [kinetic.diff(v) for v in x.v]
-        M = mass_matrix("T", linear("T'", momenta, x.v, "velocities"), len(x.q))
-        rate = along(momenta, x)
-        Q = [
-            kinetic.diff(q) - rate[i] - potential.diff(q) - lost.diff(v) + F[i]
-            for i, (q, v) in enumerate(zip(x.q, x.v, strict=True))
-        ]
-        return Equations(x, M, Q, C, W, kinetic + potential)
+        rate, n = along(momenta, x), len(x.q)
+        Q = [d.by(kinetic - potential, x.q[i]) - rate[i] - d.by(lost, x.v[i]) + F[i] for i in range(n)]
+        mass = sympy.ImmutableMatrix(n, n, lambda i, j: M.get((i, j), ZERO))
+        return Equations(x, mass, Q, C, W, kinetic + potential)
 
     still = dict.fromkeys(x.v, ZERO)
     steady = not any(each.has(x.t) for each in (kinetic, potential, *C, *W))
-    homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *(kinetic.diff(v) for v in x.v), *W))
+    homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *momenta, *W))
     return made(
         x,
         ["Lagrange", kinetic, potential, lost, F, C, W],
@@ -103,13 +104,8 @@ def read_rows(x: Reader, constraints: Any, nonholonomic: Any) -> tuple[list[Expr
         for i, row in enumerate(rows):
             if not row.free_symbols & set(symbols):
                 raise ValueError(f"{argument}[{i}] must depend on the {names}; given {row}")
-    linear("nonholonomic", W, x.v, "velocities")
+    linear("nonholonomic", W, x)
     return C, W
-
-
-def mass_matrix(argument: str, entries: Mapping[Any, Expr], n: int) -> sympy.MatrixBase:
-    """M of its entries, none of whose rows may be empty without reason."""
-    return sympy.ImmutableMatrix(n, n, lambda i, j: entries.get((i, j), ZERO))
 
 
 def _forces(x: Reader, forces: Any, coordinates: Sequence[Any]) -> list[Expr]:

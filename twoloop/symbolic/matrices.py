@@ -7,7 +7,8 @@ import sympy
 from sympy import Expr, Float
 
 from twoloop.checks import check_flag
-from twoloop.symbolic.equations import ZERO, Equations, along, derivatives, linear
+from twoloop.symbolic.differentiation import ZERO
+from twoloop.symbolic.equations import Equations, along, linear
 from twoloop.symbolic.lagrange import read_rows
 from twoloop.symbolic.mechanism import SymbolicMechanism, made
 from twoloop.symbolic.reading import POSITIONS, VELOCITIES, Reader, column, sequence, square
@@ -82,7 +83,7 @@ def from_matrices(
     force = x.read_all("Q", column("Q", sequence("Q", Q), n, "row of M"), VELOCITIES)
     C, W = read_rows(x, constraints, nonholonomic)
     u = x.v if speeds is None else list(x.speeds.values())
-    K = linear("speeds", u, x.v, "velocities")
+    K = linear("speeds", u, x)
     V = x.read("potential", potential, POSITIONS)
 
     def derive() -> Equations:

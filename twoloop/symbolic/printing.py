@@ -7,6 +7,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from twoloop.callbacks import KINDS
+from twoloop.symbolic.differentiation import Entries
 
 # SymPy's functions that the equations may have, with their names in math and numpy
 FUNCTIONS = {
@@ -25,9 +26,6 @@ FUNCTIONS = {
     sympy.log: ("log", "log"),
 }
 MOST_FACTORS = 4  # integer powers up to this one are written as products
-
-Entries = dict[Any, Expr]  # place in an array to expression
-
 
 class _Printer:
     """Writes an expression with the functions of `math` or of `np`; all numbers are floats."""

@@ -10,6 +10,7 @@ from sympy.core.function import AppliedUndef
 from sympy.core.relational import Equality
 
 from twoloop.checks import check_number
+from twoloop.symbolic.differentiation import Differentiation
 from twoloop.symbolic.printing import FUNCTIONS
 
 SMOOTH = (sympy.Add, sympy.Mul, sympy.Pow, sympy.Number, sympy.NumberSymbol, *FUNCTIONS)
@@ -37,6 +38,8 @@ class Reader:
         Name to value of the parameters, in the order of `p`.
     t, q, v, p : symbols
         Of the generated code.
+    differentiation : Differentiation
+        Of expressions in these symbols.
     """
 
     def __init__(self, coordinates: Any, parameters: Any, speeds: Mapping[Any, Any] | None = None):
@@ -50,6 +53,7 @@ class Reader:
         self.q = [Symbol(f"q{i}") for i in range(n)]
         self.v = [Symbol(f"v{i}") for i in range(n)]
         self.p = [Symbol(f"p{i}") for i in range(len(symbols))]
+        self.differentiation = Differentiation()
         self._velocities = {Derivative(each, self.time): v for each, v in zip(functions, self.v, strict=True)}
         self._known = {self.time: self.t}
         self._known |= dict(zip(functions, self.q, strict=True)) | dict(zip(symbols, self.p, strict=True))
