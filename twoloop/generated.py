@@ -10,6 +10,7 @@ import math
 import sys
 import types
 import uuid
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -116,5 +117,6 @@ def _write(path: Path, text: str) -> None:
         unfinished.write_text(text, encoding="utf-8")
         unfinished.replace(path)
     except OSError:
-        unfinished.unlink(missing_ok=True)
         say_once(UNWRITABLE)
+        with suppress(OSError):
+            unfinished.unlink()

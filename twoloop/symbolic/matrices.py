@@ -52,7 +52,7 @@ def from_matrices(
     nonholonomic : list of expressions (n_a,)
         Each is zero; linear in the velocities, or speeds.
     potential : expression
-        V, J: the energy is 1/2 u^T M u + V. It does not change Q.
+        V, J: the energy is 1/2 q'^T K^T M K q' + V. It does not change Q.
     conserved : bool
         Whether that energy is an invariant, which is not looked into.
     parameters : mapping
@@ -87,12 +87,13 @@ def from_matrices(
     V = x.read("potential", potential, POSITIONS)
 
     def derive() -> Equations:
-        energy = sympy.Rational(1, 2) * sympy.Add(*(u[i] * mass[i, j] * u[j] for i in range(n) for j in range(n))) + V
+        speed = [sympy.Add(*(K.get((i, j), ZERO) * v for j, v in enumerate(x.v))) for i in range(n)]
+        energy = sympy.Rational(1, 2) * sympy.Add(*(speed[i] * mass[i, j] * speed[j] for i in range(n) for j in range(n)))
         if speeds is None:
-            return Equations(x, mass, force, C, W, energy)
+            return Equations(x, mass, force, C, W, energy + V)
         transform = sympy.ImmutableMatrix(n, len(x.q), lambda i, j: K.get((i, j), ZERO))
         rest = sympy.ImmutableMatrix(force) - mass * sympy.ImmutableMatrix(along(u, x))
-        return Equations(x, transform.T * mass * transform, list(transform.T * rest), C, W, energy)
+        return Equations(x, transform.T * mass * transform, list(transform.T * rest), C, W, energy + V)
 
     return made(
         x,
