@@ -165,7 +165,8 @@ class _Files:
 
 def sources_folder() -> Path:
     """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are."""
-    folder = numba.config.CACHE_DIR or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
+    chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
     return Path(folder) / "equations"
 
 

@@ -56,7 +56,9 @@ def symbolic_driven_crank() -> tuple[Problem, SymbolicMechanism]:
     problem = driven_crank()
     q = x1, y1, th1, x2, y2, th2 = dynamicsymbols("x1 y1 th1 x2 y2 th2")
     u1, v1, w1, u2, v2, w2 = rates(q)
-    p = L1, L2, m1, m2, g, start, rate, amplitude, frequency = sp.symbols("L1 L2 m1 m2 g start rate amplitude frequency")
+    p = L1, L2, m1, m2, g, start, rate, amplitude, frequency = sp.symbols(
+        "L1 L2 m1 m2 g start rate amplitude frequency"
+    )
     T = (m1 * (u1**2 + v1**2 + L1**2 / 12 * w1**2) + m2 * (u2**2 + v2**2 + L2**2 / 12 * w2**2)) / 2
     constraints = [
         x1 - L1 / 2 * sp.cos(th1),
@@ -73,7 +75,7 @@ def symbolic_driven_crank() -> tuple[Problem, SymbolicMechanism]:
 
 def symbolic_knife_edge() -> tuple[Problem, SymbolicMechanism]:
     problem = knife_edge()
-    q = x, y, angle = dynamicsymbols("x y angle")
+    q = x, _, angle = dynamicsymbols("x y angle")
     u, v, w = rates(q)
     m, J, pull = sp.symbols("m J pull")
     mechanism = from_lagrangian(
@@ -90,7 +92,8 @@ def symbolic_knife_edge() -> tuple[Problem, SymbolicMechanism]:
 
 def symbolic_rolling_disc() -> tuple[Problem, SymbolicMechanism]:
     problem = rolling_disc()
-    q = x, y, z, yaw, lean, spin = dynamicsymbols("x y z yaw lean spin")
+    q = dynamicsymbols("x y z yaw lean spin")
+    z, yaw, lean = q[2:5]
     u, v, w, yaw_rate, ahead, spin_rate = rates(q)
     m, R, g = sp.symbols("m R g")
     upright, turn = yaw_rate * sp.cos(lean), spin_rate - yaw_rate * sp.sin(lean)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from tests.symbolic.models import MODELS, symbolic_four_bar, symbolic_knife_edge
 
+from tests.symbolic.models import MODELS, symbolic_four_bar, symbolic_knife_edge
 from twoloop import solve_dae
+
 
 def in_python(mechanism, problem, kind, t, *state):
     """What generated code gives without numba."""
@@ -67,14 +68,14 @@ def test_tangents_are_the_derivatives(pair):
         return np.array([(function(x + step) - function(x - step)) / (2.0 * small) for step in steps]).T
 
     (K,) = in_python(mechanism, problem, "force_by_q", t, q, v)
-    assert K == pytest.approx(differences(lambda x: force(x, v), q), rel=1e-6, abs=1e-6 * max(1.0, np.abs(K).max()))
+    assert pytest.approx(differences(lambda x: force(x, v), q), rel=1e-6, abs=1e-6 * max(1.0, np.abs(K).max())) == K
     by_v = differences(lambda x: force(q, x), v)
     D = in_python(mechanism, problem, "force_by_v", t, q, v)[0] if "force_by_v" in mechanism.code.kinds else 0.0 * by_v
-    assert D == pytest.approx(by_v, rel=1e-6, abs=1e-6 * max(1.0, np.abs(K).max()))
+    assert pytest.approx(by_v, rel=1e-6, abs=1e-6 * max(1.0, np.abs(K).max())) == D
     if problem.system.n_c > 0:
         (R,) = in_python(mechanism, problem, "reaction_by_q", t, q, lam)
         reaction = differences(lambda x: lam @ in_python(mechanism, problem, "jacobian", t, x)[0], q)
-        assert R == pytest.approx(reaction, rel=1e-6, abs=1e-6)
+        assert pytest.approx(reaction, rel=1e-6, abs=1e-6) == R
 
 
 def test_the_energy_is_that_of_the_hand_written_mechanism(pair):

@@ -78,7 +78,9 @@ def from_matrices(
     x = Reader(coordinates, parameters, speeds)
     n = len(x.q) if speeds is None else len(speeds)
     mass = square("M", M, n)
-    mass = sympy.ImmutableMatrix(n, n, [x.read(f"M[{k // n}, {k % n}]", each, POSITIONS) for k, each in enumerate(mass)])
+    mass = sympy.ImmutableMatrix(
+        n, n, [x.read(f"M[{k // n}, {k % n}]", each, POSITIONS) for k, each in enumerate(mass)]
+    )
     _check_symmetric(mass)
     force = x.read_all("Q", column("Q", sequence("Q", Q), n, "row of M"), VELOCITIES)
     C, W = read_rows(x, constraints, nonholonomic)
@@ -88,7 +90,9 @@ def from_matrices(
 
     def derive() -> Equations:
         speed = [sympy.Add(*(K.get((i, j), ZERO) * v for j, v in enumerate(x.v))) for i in range(n)]
-        energy = sympy.Rational(1, 2) * sympy.Add(*(speed[i] * mass[i, j] * speed[j] for i in range(n) for j in range(n)))
+        energy = sympy.Rational(1, 2) * sympy.Add(
+            *(speed[i] * mass[i, j] * speed[j] for i in range(n) for j in range(n))
+        )
         if speeds is None:
             return Equations(x, mass, force, C, W, energy + V)
         transform = sympy.ImmutableMatrix(n, len(x.q), lambda i, j: K.get((i, j), ZERO))

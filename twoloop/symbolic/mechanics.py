@@ -56,13 +56,13 @@ def from_method(
         own = (), ()
     else:
         raise TypeError(f"method must be a LagrangesMethod, a KanesMethod or a System; given {method!r}")
-    n = len(method.q)
+    n, speeds = len(method.q), _speeds(method) if isinstance(method, KanesMethod) else None
     return from_matrices(
         method.mass_matrix[:, :n],
         method.forcing,
         [*own[0], *sequence("constraints", constraints)],
         list(method.q),
-        speeds=_speeds(method) if isinstance(method, KanesMethod) else None,
+        speeds=speeds,
         nonholonomic=[*own[1], *sequence("nonholonomic", nonholonomic)],
         potential=potential,
         conserved=conserved,

@@ -27,6 +27,7 @@ FUNCTIONS = {
 }
 MOST_FACTORS = 4  # integer powers up to this one are written as products
 
+
 class _Printer:
     """Writes an expression with the functions of `math` or of `np`; all numbers are floats."""
 

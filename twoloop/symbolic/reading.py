@@ -91,8 +91,8 @@ class Reader:
                 raise ValueError(self._unknown(argument, node))
             elif isinstance(node, NOT_SMOOTH):
                 raise ValueError(
-                    f"{argument} must be smooth; given {node}. Smooth it, such as sign(x) to tanh(x / small), or let an "
-                    "event end the run where it switches"
+                    f"{argument} must be smooth; given {node}. Smooth it, such as sign(x) to tanh(x / small), or let "
+                    "an event end the run where it switches"
                 )
             elif not isinstance(node, SMOOTH) or node.is_finite is False or node is sympy.S.NaN:
                 known = ", ".join(sorted(each.__name__ for each in FUNCTIONS))
