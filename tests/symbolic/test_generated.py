@@ -105,6 +105,10 @@ system = problem.system
 print(system.mass(0.0, problem.q0)[0, 0], system.gamma(0.0, problem.q0, [3.0, 4.0])[0])
 print(problem.energy(0.0, problem.q0, problem.v0))
 print([kind for kind, each in system.given.items() if not sum(each.stats.cache_hits.values())])
+try:
+    import twoloop.symbolic
+except ImportError as error:
+    print(error)
 """
 
 
@@ -115,10 +119,11 @@ def test_a_problem_goes_to_another_process_by_its_equations(folder):
     command = [sys.executable, "-c", UNPICKLED]
     done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    numbers, energy, compiled = done.stdout.splitlines()
+    numbers, energy, compiled, refusal = done.stdout.splitlines()
     assert [float(each) for each in numbers.split()] == [2.0, -25.0]
     assert float(energy) == pytest.approx(2.0 * 9.81 * -0.4)
     assert compiled == "[]"  # all machine code was read from the disk
+    assert "pip install 'twoloop[symbolic]'" in refusal
 
 
 def test_a_pickled_system_is_the_same_here():
