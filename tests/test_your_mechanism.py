@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from tests.test_pages import blocks
 
+from tests.test_pages import blocks
 from twoloop import solve_dae
 
 
