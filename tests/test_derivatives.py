@@ -118,3 +118,12 @@ def test_a_function_that_changes_its_arguments_is_refused_when_compiled():
 def test_arguments_in_another_order_are_refused():
     with pytest.raises(TypeError, match=r"force is called as force\(t, q, v\); the function given takes \(t, v, q\)"):
         pendulum(force=lambda t, v, q: np.zeros(2))
+
+
+def test_a_bandwidth_is_checked_without_constraints_too():
+    parts = {"n_q": 2, "n_c": 0, "mass": np.eye(2), "name": "free"}
+    coupled = ConstrainedSystem.from_python(**parts, force=lambda t, q, v: -q[::-1], bandwidth=0)
+    with pytest.raises(ValueError, match="bandwidth of 'free' must be at least 1"):
+        solve_dae(coupled, (0.0, 0.1), *START)
+    apart = ConstrainedSystem.from_python(**parts, force=lambda t, q, v: -q, bandwidth=0)
+    assert solve_dae(apart, (0.0, 0.1), *START).success

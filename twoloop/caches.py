@@ -25,6 +25,7 @@ from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import Type
+from numba.misc.appdirs import AppDirs
 
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
@@ -174,6 +175,13 @@ class _Files:
 
     def _path(self, key: Any) -> Path:
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+
+
+def sources_folder() -> Path:
+    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are."""
+    chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
+    return Path(folder) / "equations"
 
 
 @cache

@@ -376,7 +376,7 @@ def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arr
         level = ROUNDING * float(np.abs(force).max()) / shift
         look("the derivative of force by q", j, by_q / shift, level)
         look("the derivative of force by v", j, by_v / shift, level)
-        level = ROUNDING * float(np.abs(jacobian).max()) / shift
+        level = ROUNDING * float(np.abs(jacobian).max(initial=0.0)) / shift
         for k in range(system.n_c):
             look(f"the second derivative of constraint {k} by q", j, change[k] / shift, level)
     if where:

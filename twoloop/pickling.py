@@ -8,6 +8,8 @@ from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
+from twoloop.generated import GeneratedCode, code_of
+
 
 @dataclass(frozen=True)
 class ByName:
@@ -27,6 +29,18 @@ class ByName:
         return attrgetter(self.name)(importlib.import_module(self.module))  # type: ignore[no-any-return]
 
 
+@dataclass(frozen=True)
+class FromEquations:
+    """A callback of generated code, which travels as source."""
+
+    code: GeneratedCode
+    kind: str
+
+    def found(self) -> Dispatcher:
+        """The callback, compiled in this process or read from the disk."""
+        return self.code.callback(self.kind)
+
+
 def packed(system_name: str, kind: str, function: Any) -> Any:
     """What to pickle in the place of a function.
 
@@ -36,6 +50,8 @@ def packed(system_name: str, kind: str, function: Any) -> Any:
         If it is a plain function that pickle cannot find by its name.
     """
     if isinstance(function, Dispatcher):
+        if (code := code_of(function)) is not None:
+            return FromEquations(code, kind)
         named = ByName(function.py_func.__module__, function.py_func.__qualname__)
         try:
             return named if named.found() is function else function
@@ -56,4 +72,4 @@ def packed(system_name: str, kind: str, function: Any) -> Any:
 
 def unpacked(function: Any) -> Any:
     """The function that `packed` replaced."""
-    return function.found() if isinstance(function, ByName) else function
+    return function.found() if isinstance(function, (ByName, FromEquations)) else function

@@ -1,0 +1,44 @@
+"""The report on the size of symbolic mechanisms: its sentences follow from its rows."""
+
+import pandas as pd
+
+from studies import symbolic_size
+from studies.render import render
+
+
+def rows():
+    sizes = [
+        {"group": "size", "case": "angles", "n": 5, "tangents": tangents, "status": "REACHED_END", "lines": 100}
+        | {"derive_s": 1.0, "compile_s": 30.0 if tangents else 3.0, "second_s": 1.5, "evaluation_us": 1.0}
+        for tangents in (False, True)
+    ]
+    twin = {"group": "twin", "case": "four-bar", "status": "REACHED_END", "hand_us": 1.0, "twin_us": 1.1}
+    return pd.DataFrame([*sizes, twin | {"hand_evaluations": 100, "twin_evaluations": 100}])
+
+
+def text(rows):
+    found = symbolic_size.findings_of(rows)
+    return render("symbolic_size", found, {"sizes": "", "twins": ""}, stamp="stamp", quick=False)
+
+
+def test_sentences_turn_with_the_rows():
+    given = text(rows())
+    assert "All chains up to n = 5 were made" in given
+    assert "compiling takes 30 s with them and 3.0 s without" in given
+    assert "always less than 2.0 s" in given
+    assert "nowhere more than 1.2 times. Counts of evaluations are the same." in given
+    worse = rows()
+    worse.loc[0, "second_s"], worse.loc[1, "status"] = 2.5, "TIME_LIMIT"
+    worse.loc[2, ["twin_us", "twin_evaluations"]] = 2.0, 101.0
+    given = text(worse)
+    assert "Not all chains were made: angles, n = 5: TIME_LIMIT" in given
+    assert "more than 2.0 s: angles, n = 5" in given
+    assert "more than 1.2 times in four-bar" in given
+    assert "Counts of evaluations differ in four-bar." in given
+
+
+def test_a_chain_that_takes_too_long_is_a_row(monkeypatch):
+    monkeypatch.setattr(symbolic_size, "TIME_LIMIT", 0.01)
+    row = symbolic_size.made("positions", 2, False)
+    assert row["status"] == "TIME_LIMIT"
+    assert "first process" in row["message"]

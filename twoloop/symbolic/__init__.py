@@ -1,0 +1,15 @@
+"""Mechanisms from SymPy: energies or matrices in, a compiled `ConstrainedSystem` out. Needs the extra `symbolic`."""
+
+try:
+    import sympy
+except ImportError as error:
+    raise ImportError("twoloop.symbolic needs SymPy: pip install 'twoloop[symbolic]', or pip install sympy") from error
+
+from twoloop.symbolic.lagrange import from_lagrangian
+from twoloop.symbolic.matrices import from_matrices
+from twoloop.symbolic.mechanics import from_method
+from twoloop.symbolic.mechanism import SymbolicMechanism
+
+del sympy
+
+__all__ = ["SymbolicMechanism", "from_lagrangian", "from_matrices", "from_method"]

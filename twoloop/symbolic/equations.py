@@ -1,0 +1,117 @@
+"""Equations of motion in plain symbols, and every derivative that the callbacks need."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import sympy
+from sympy import Expr, Symbol
+
+from twoloop.symbolic.differentiation import ZERO, Entries, filled
+from twoloop.symbolic.printing import callback_source, energy_source
+from twoloop.symbolic.reading import Reader
+
+
+@dataclass(frozen=True)
+class Equations:
+    """M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0.
+
+    Attributes
+    ----------
+    symbols : Reader
+        What the expressions are made of.
+    M : matrix (n_q, n_q)
+        Symmetric, of which the upper triangle counts; free of velocities.
+    Q : sequence (n_q,)
+        The force.
+    C : sequence (n_c,)
+        The constraints on positions.
+    W : sequence (n_a,)
+        The non-holonomic ones, A v + b, linear in v.
+    energy : expression
+    """
+
+    symbols: Reader
+    M: sympy.MatrixBase
+    Q: Sequence[Expr]
+    C: Sequence[Expr]
+    W: Sequence[Expr]
+    energy: Expr
+
+    @property
+    def constant_mass(self) -> bool:
+        """Whether M depends neither on t nor on q."""
+        moving = {self.symbols.t, *self.symbols.q}
+        return not any(entry.free_symbols & moving for entry in self.M)
+
+    def source(self, tangents: bool) -> str:
+        """The generated code: a function for each callback, and the energy."""
+        tangents = tangents and not self.W  # Newton's method takes none beside non-holonomic rows
+        arrays = self._callbacks() | (self._tangents() if tangents else {})
+        constant = self.constant_mass
+        parts = [f"CONSTANT_MASS = {constant}\nBANDWIDTH = {_bandwidth(arrays) if constant and tangents else None}\n"]
+        parts += [callback_source(kind, each) for kind, each in arrays.items()]
+        return "\n\n".join([*parts, energy_source(self.energy)])
+
+    def _callbacks(self) -> dict[str, list[Entries]]:
+        x, d, n = self.symbols, self.symbols.differentiation, range(len(self.symbols.q))
+        found = {
+            "mass": [filled(((i, j), self.M[min(i, j), max(i, j)]) for i in n for j in n)],
+            "force": [filled(enumerate(self.Q))],
+        }
+        if self.C:
+            rows, rate = d.rows(self.C, x.q), [d.by(each, x.t) for each in self.C]
+            moving = [rate[i] + sum(rows.get((i, j), ZERO) * x.v[j] for j in n) for i in range(len(self.C))]
+            C, Ct, Qd = (filled(enumerate(each)) for each in (self.C, rate, accelerations(moving, x)))
+            found |= {"constraint": [C], "jacobian": [rows]} | ({"constraint_rate": [Ct]} if Ct else {})
+            found |= {"gamma": [Qd], "kinematics": [C, rows, Ct, Qd]}
+        if self.W:
+            still = dict.fromkeys(x.v, ZERO)
+            b = filled((i, each.xreplace(still)) for i, each in enumerate(self.W))
+            found |= {"nonholonomic": [d.rows(self.W, x.v)]} | ({"nonholonomic_rate": [b]} if b else {})
+            found["nonholonomic_gamma"] = [filled(enumerate(accelerations(self.W, x)))]
+        return found
+
+    def _tangents(self) -> dict[str, list[Entries]]:
+        x, d, n = self.symbols, self.symbols.differentiation, range(len(self.symbols.q))
+        found = {"force_by_q": [d.rows(self.Q, x.q)]}
+        by_v = d.rows(self.Q, x.v)
+        if by_v:
+            found["force_by_v"] = [by_v]
+        if self.C:
+            lam, rows = [Symbol(f"lam{k}") for k in range(len(self.C))], d.rows(self.C, x.q)
+            reaction = [sympy.Add(*(lam[k] * rows.get((k, i), ZERO) for k in range(len(lam)))) for i in n]
+            found["reaction_by_q"] = [d.symmetric(reaction, x.q)]
+        return found
+
+
+def _bandwidth(arrays: dict[str, list[Entries]]) -> int:
+    """How far from the diagonal M and the tangents have entries."""
+    kinds = ("mass", "force_by_q", "force_by_v", "reaction_by_q")
+    return max((abs(i - j) for kind in kinds for i, j in arrays.get(kind, [{}])[0]), default=0)
+
+
+def along(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
+    """The derivatives of expressions by time, less what the accelerations contribute."""
+    rates: list[list[Expr]] = [[x.differentiation.by(each, x.t)] for each in expressions]
+    for (i, j), entry in x.differentiation.rows(expressions, x.q).items():
+        rates[i].append(entry * x.v[j])
+    return [sympy.Add(*terms) for terms in rates]
+
+
+def accelerations(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
+    """The right-hand side of the equations for the accelerations that keep expressions in q and v constant."""
+    return [-each for each in along(expressions, x)]
+
+
+def linear(argument: str, expressions: Sequence[Expr], x: Reader) -> Entries:
+    """The derivatives by the velocities of expressions that are linear in them, or say that they are not."""
+    rows, velocities = x.differentiation.rows(expressions, x.v), set(x.v)
+    for (i, j), entry in rows.items():
+        if x.differentiation.symbols_of(entry) & velocities:
+            rows[i, j] = entry.expand()
+            if rows[i, j].free_symbols & velocities:
+                raise ValueError(
+                    f"{argument}[{i}] must be linear in the velocities; its derivative by that of {x.names[j]} depends "
+                    "on velocities"
+                )
+    return filled(rows.items())

@@ -1,0 +1,119 @@
+"""Equations of motion from the kinetic and the potential energy."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import sympy
+from sympy import Expr
+
+from twoloop.symbolic.differentiation import ZERO
+from twoloop.symbolic.equations import Equations, along, linear
+from twoloop.symbolic.mechanism import SymbolicMechanism, made
+from twoloop.symbolic.reading import POSITIONS, VELOCITIES, Reader, column
+
+
+def from_lagrangian(
+    T: Any,
+    V: Any,
+    constraints: Any,
+    coordinates: Any,
+    *,
+    forces: Any = None,
+    dissipation: Any = 0,
+    nonholonomic: Any = (),
+    parameters: Mapping[Any, Any] | None = None,
+    tangents: bool = True,
+    name: str = "mechanism",
+) -> SymbolicMechanism:
+    """Derive M and Q from energies, all derivatives of the constraints, and make a compiled system of them.
+
+    M = T_vv and Q = T_q - (T_v)_q v - (T_v)_t - V_q - D_v + F. M^-1 is never formed.
+
+    Parameters
+    ----------
+    T : expression
+        Kinetic energy, J, at most quadratic in the velocities `q.diff(t)`.
+    V : expression
+        Potential energy, J, of coordinates and time.
+    constraints : list of expressions (n_c,)
+        Each is zero; of coordinates and time. Empty for equations without constraints on positions.
+    coordinates : list (n_q,)
+        Functions of time, as `sympy.physics.mechanics.dynamicsymbols` makes them.
+    forces : mapping or list (n_q,), optional
+        Generalised forces F; a mapping goes from coordinates to expressions.
+    dissipation : expression
+        Rayleigh's function D, W: its derivatives by the velocities are subtracted from the forces.
+    nonholonomic : list of expressions (n_a,)
+        Each is zero; linear in the velocities.
+    parameters : mapping
+        From every other symbol to its value. The values can be changed later without compiling again.
+    tangents : bool
+        Whether to derive the tangents of the force and of the reactions for Newton's method.
+    name : str
+        Shown in messages.
+
+    Returns
+    -------
+    SymbolicMechanism
+        With `system`, `energy` and `problem(q0, v0, t_span)`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an expression has an unknown symbol or is not smooth, if a constraint depends on velocities or on no
+        coordinate, if T is not quadratic or `nonholonomic` not linear in the velocities, or if `forces` do not fit.
+    """
+    x = Reader(coordinates, parameters)
+    kinetic, potential = x.read("T", T, VELOCITIES), x.read("V", V, POSITIONS)
+    lost = x.read("dissipation", dissipation, VELOCITIES)
+    F = _forces(x, forces, coordinates)
+    C, W = read_rows(x, constraints, nonholonomic)
+
+    d = x.differentiation
+    momenta = [d.by(kinetic, v) for v in x.v]
+    M = linear("dT/dv", momenta, x)
+
+    def derive() -> Equations:
+        rate, n = along(momenta, x), len(x.q)
+        Q = [d.by(kinetic - potential, x.q[i]) - rate[i] - d.by(lost, x.v[i]) + F[i] for i in range(n)]
+        mass = sympy.ImmutableMatrix(n, n, lambda i, j: M.get((i, j), ZERO))
+        return Equations(x, mass, Q, C, W, kinetic + potential)
+
+    still = dict.fromkeys(x.v, ZERO)
+    steady = not any(each.has(x.t) for each in (kinetic, potential, *C, *W))
+    homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *momenta, *W))
+    return made(
+        x,
+        ["Lagrange", kinetic, potential, lost, F, C, W],
+        derive,
+        rows=(len(C), len(W)),
+        conserved=steady and homogeneous and lost == 0 and not any(F),
+        tangents=tangents,
+        name=name,
+    )
+
+
+def read_rows(x: Reader, constraints: Any, nonholonomic: Any) -> tuple[list[Expr], list[Expr]]:
+    """Both kinds of constraints, each of which must depend on something that moves."""
+    C = x.read_all("constraints", constraints, POSITIONS)
+    W = x.read_all("nonholonomic", nonholonomic, VELOCITIES)
+    for argument, rows, symbols, names in (
+        ("constraints", C, x.q, "coordinates"),
+        ("nonholonomic", W, x.v, "velocities"),
+    ):
+        for i, row in enumerate(rows):
+            if not row.free_symbols & set(symbols):
+                raise ValueError(f"{argument}[{i}] must depend on the {names}; given {row}")
+    linear("nonholonomic", W, x)
+    return C, W
+
+
+def _forces(x: Reader, forces: Any, coordinates: Sequence[Any]) -> list[Expr]:
+    n = len(x.q)
+    if isinstance(forces, Mapping):
+        unknown = [each for each in forces if each not in list(coordinates)]
+        if unknown:
+            raise ValueError(f"forces must be for coordinates, {', '.join(x.names)}; given one for {unknown[0]}")
+        return [x.read(f"forces[{each}]", forces.get(each, 0), VELOCITIES) for each in coordinates]
+    given = [0] * n if forces is None else column("forces", forces, n, "coordinate")
+    return x.read_all("forces", given, VELOCITIES)

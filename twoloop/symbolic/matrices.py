@@ -1,0 +1,129 @@
+"""Equations of motion from a mass matrix and a force, in velocities or in generalised speeds."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+from sympy import Expr, Float
+
+from twoloop.checks import check_flag
+from twoloop.symbolic.differentiation import ZERO
+from twoloop.symbolic.equations import Equations, along, linear
+from twoloop.symbolic.lagrange import read_rows
+from twoloop.symbolic.mechanism import SymbolicMechanism, made
+from twoloop.symbolic.reading import POSITIONS, VELOCITIES, Reader, column, sequence, square
+
+SAME = 1e-9  # relative: entries of M that count as equal
+PROBES = 3
+
+
+def from_matrices(
+    M: Any,
+    Q: Any,
+    constraints: Any,
+    coordinates: Any,
+    *,
+    speeds: Mapping[Any, Any] | None = None,
+    nonholonomic: Any = (),
+    potential: Any = 0,
+    conserved: bool = False,
+    parameters: Mapping[Any, Any] | None = None,
+    tangents: bool = True,
+    name: str = "mechanism",
+) -> SymbolicMechanism:
+    """Make a compiled system of M u' = Q, and derive all derivatives of the constraints.
+
+    With speeds u = K(t, q) q' + k(t, q) the equations become those of the coordinates: the mass is K^T M K, the force
+    K^T (Q - M (K' q' + k')).
+
+    Parameters
+    ----------
+    M : matrix (n_u, n_u)
+        Symmetric mass matrix, of coordinates and time; without rows or columns for constraints.
+    Q : list or matrix of one column (n_u,)
+        The force, with all that the inertia adds, as `forcing` of SymPy's methods.
+    constraints : list of expressions (n_c,)
+        Each is zero; of coordinates and time.
+    coordinates : list (n_q,)
+        Functions of time.
+    speeds : mapping, optional
+        From the generalised speeds, in the order of M, to expressions linear in `q.diff(t)`. None: the speeds are the
+        derivatives of the coordinates.
+    nonholonomic : list of expressions (n_a,)
+        Each is zero; linear in the velocities, or speeds.
+    potential : expression
+        V, J: the energy is 1/2 q'^T K^T M K q' + V. It does not change Q.
+    conserved : bool
+        Whether that energy is an invariant, which is not looked into.
+    parameters : mapping
+        From every other symbol to its value. The values can be changed later without compiling again.
+    tangents : bool
+        Whether to derive the tangents of the force and of the reactions for Newton's method.
+    name : str
+        Shown in messages.
+
+    Returns
+    -------
+    SymbolicMechanism
+        With `system`, `energy` and `problem(q0, v0, t_span)`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As for `from_lagrangian`; also if M is not square, not symmetric or depends on velocities, if Q has another
+        size, or if a speed is not linear in the velocities.
+    """
+    if speeds is not None and not isinstance(speeds, Mapping):
+        raise TypeError(f"speeds must map generalised speeds to expressions in the velocities; given {speeds!r}")
+    x = Reader(coordinates, parameters, speeds)
+    n = len(x.q) if speeds is None else len(speeds)
+    mass = square("M", M, n)
+    mass = sympy.ImmutableMatrix(
+        n, n, [x.read(f"M[{k // n}, {k % n}]", each, POSITIONS) for k, each in enumerate(mass)]
+    )
+    _check_symmetric(mass)
+    force = x.read_all("Q", column("Q", sequence("Q", Q), n, "row of M"), VELOCITIES)
+    C, W = read_rows(x, constraints, nonholonomic)
+    u = x.v if speeds is None else list(x.speeds.values())
+    K = linear("speeds", u, x)
+    V = x.read("potential", potential, POSITIONS)
+
+    def derive() -> Equations:
+        speed = [sympy.Add(*(K.get((i, j), ZERO) * v for j, v in enumerate(x.v))) for i in range(n)]
+        energy = sympy.Rational(1, 2) * sympy.Add(
+            *(speed[i] * mass[i, j] * speed[j] for i in range(n) for j in range(n))
+        )
+        if speeds is None:
+            return Equations(x, mass, force, C, W, energy + V)
+        transform = sympy.ImmutableMatrix(n, len(x.q), lambda i, j: K.get((i, j), ZERO))
+        rest = sympy.ImmutableMatrix(force) - mass * sympy.ImmutableMatrix(along(u, x))
+        return Equations(x, transform.T * mass * transform, list(transform.T * rest), C, W, energy + V)
+
+    return made(
+        x,
+        ["matrices", list(mass), force, u, C, W, V],
+        derive,
+        rows=(len(C), len(W)),
+        conserved=check_flag("conserved", conserved),
+        tangents=tangents,
+        name=name,
+    )
+
+
+def _check_symmetric(M: sympy.MatrixBase) -> None:
+    """Entries that are not written in the same way are compared at a few points."""
+    for i in range(M.rows):
+        for j in range(i):
+            a, b = M[i, j], M[j, i]
+            if a != b and not _agree(a, b):
+                raise ValueError(f"M must be symmetric; given {a} in row {i}, column {j}, and {b} across the diagonal")
+
+
+def _agree(a: Expr, b: Expr) -> bool:
+    symbols = sorted(a.free_symbols | b.free_symbols, key=str)
+    for probe in range(PROBES):
+        values = {symbol: Float(0.3 + (0.618034 * (k + 1) * (probe + 1)) % 1.0) for k, symbol in enumerate(symbols)}
+        one, other = sympy.N(a.xreplace(values)), sympy.N(b.xreplace(values))
+        if abs(one - other) > SAME * max(abs(one), abs(other)):
+            return False
+    return True

@@ -1,0 +1,108 @@
+"""Equations of motion from the objects of sympy.physics.mechanics."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
+
+from twoloop.symbolic.matrices import from_matrices
+from twoloop.symbolic.mechanism import SymbolicMechanism
+from twoloop.symbolic.reading import sequence
+
+
+def from_method(
+    method: LagrangesMethod | KanesMethod | System,
+    *,
+    constraints: Any = (),
+    nonholonomic: Any = (),
+    potential: Any = 0,
+    conserved: bool = False,
+    parameters: Mapping[Any, Any] | None = None,
+    tangents: bool = True,
+    name: str = "mechanism",
+) -> SymbolicMechanism:
+    """Make a compiled system of what sympy.physics.mechanics describes.
+
+    Constraints are those of the `LagrangesMethod` or the `System`, then those given here. A `KanesMethod` must be of
+    the tree without its loops, all coordinates and speeds independent; it may have been asked for its equations or not
+    if it knows its bodies. As many speeds as coordinates are wanted, linear in their derivatives.
+
+    Parameters
+    ----------
+    method : LagrangesMethod, KanesMethod or System
+    constraints, nonholonomic, potential, conserved, parameters, tangents, name
+        As for `from_matrices`.
+
+    Returns
+    -------
+    SymbolicMechanism
+
+    Raises
+    ------
+    TypeError, ValueError
+        As for `from_matrices`; also if the method has dependent or auxiliary speeds, or kinematic equations that do not
+        determine its speeds.
+    """
+    if isinstance(method, System):
+        own = method.holonomic_constraints, method.nonholonomic_constraints
+        method = _tree(method)
+    elif isinstance(method, LagrangesMethod):
+        if method.eom is None:
+            method.form_lagranges_equations()
+        n_c = len(method._hol_coneqs)
+        own = list(method._hol_coneqs), list(method.coneqs)[n_c:]
+    elif isinstance(method, KanesMethod):
+        own = (), ()
+    else:
+        raise TypeError(f"method must be a LagrangesMethod, a KanesMethod or a System; given {method!r}")
+    n, speeds = len(method.q), _speeds(method) if isinstance(method, KanesMethod) else None
+    return from_matrices(
+        method.mass_matrix[:, :n],
+        method.forcing,
+        [*own[0], *sequence("constraints", constraints)],
+        list(method.q),
+        speeds=speeds,
+        nonholonomic=[*own[1], *sequence("nonholonomic", nonholonomic)],
+        potential=potential,
+        conserved=conserved,
+        parameters=parameters,
+        tangents=tangents,
+        name=name,
+    )
+
+
+def _tree(system: System) -> KanesMethod:
+    """Kane's equations of a system without its constraints, which become rows of ours."""
+    loads = [*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads())]
+    if len(system.u_aux):
+        raise ValueError("method must have no auxiliary speeds: reactions come from the multipliers")
+    kane = KanesMethod(system.frame, list(system.q), list(system.u), kd_eqs=list(system.kdes))
+    kane.kanes_equations(system.bodies, loads or None)
+    return kane
+
+
+def _speeds(kane: KanesMethod) -> dict[Any, Any]:
+    """The generalised speeds as functions of the velocities, from the kinematic equations."""
+    if len(kane._udep) or len(kane._qdep):
+        raise ValueError(
+            "method must have independent coordinates and speeds only: leave u_dependent, q_dependent and the "
+            "constraints out of the KanesMethod, and give these as constraints= and nonholonomic="
+        )
+    if len(kane._uaux):
+        raise ValueError("method must have no auxiliary speeds: reactions come from the multipliers")
+    if kane._fr is None:
+        kane.kanes_equations()
+    q, u = kane.q, kane.u
+    if len(u) != len(q):
+        raise ValueError(
+            f"method must have as many speeds as coordinates; given {len(u)} and {len(q)}. Use from_matrices, whose "
+            "speeds= takes each as a formula of the velocities, such as those of Euler parameters"
+        )
+    by_u = kane.forcing_kin.jacobian(u)  # mass_matrix_kin q' = forcing_kin, linear in u
+    rest = kane.forcing_kin.xreplace(dict.fromkeys(u, sympy.S.Zero))
+    if by_u.free_symbols and by_u.has(*u):
+        raise ValueError("method must have kinematic equations that are linear in the speeds")
+    velocities = sympy.Matrix([each.diff(sympy.physics.mechanics.dynamicsymbols._t) for each in q])
+    solved = by_u.LUsolve(kane.mass_matrix_kin * velocities - rest)
+    return dict(zip(u, solved, strict=True))

@@ -1,0 +1,198 @@
+"""What the constructors return: generated code with the numbers that belong to it."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import ArrayLike, NDArray
+from sympy import Basic
+
+from twoloop.checks import check_flag, check_text
+from twoloop.generated import GeneratedCode, GeneratedEnergy
+from twoloop.mechanisms.problem import Problem
+from twoloop.projection import consistent_state
+from twoloop.symbolic.equations import Equations
+from twoloop.symbolic.reading import Reader, number
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SymbolicMechanism:
+    """A mechanism made from SymPy's expressions.
+
+    Holds no expressions any more, so that it can be pickled.
+
+    Attributes
+    ----------
+    name : str
+    coordinates : tuple of str (n_q,)
+        Names of the coordinates.
+    n_c, n_a : int
+        Number of constraints on positions, and of non-holonomic ones.
+    parameters : mapping
+        Name to value, in the order of `p`.
+    conserved : bool
+        Whether the energy is an invariant.
+    code : GeneratedCode
+        The callbacks and the energy; `code.source` is what was made of the equations.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    n_c: int
+    n_a: int
+    parameters: Mapping[str, float]
+    conserved: bool
+    code: GeneratedCode
+
+    @cached_property
+    def system(self) -> ConstrainedSystem:
+        """The compiled system. The first time that equations are met this takes seconds, see docs/your_mechanism.md."""
+        callbacks: dict[str, Any] = {kind: self.code.callback(kind) for kind in self.code.kinds}
+        return ConstrainedSystem(
+            n_q=len(self.coordinates),
+            n_c=self.n_c,
+            n_a=self.n_a,
+            parameters=self._vector,
+            constant_mass=self.code.value("CONSTANT_MASS"),
+            bandwidth=self.code.value("BANDWIDTH"),
+            name=self.name,
+            **callbacks,
+        )
+
+    @property
+    def energy(self) -> GeneratedEnergy:
+        """energy(t, q, v), J, of one state or of the columns of many."""
+        return GeneratedEnergy(self.code, self._vector)
+
+    @property
+    def _vector(self) -> tuple[float, ...]:
+        return tuple(self.parameters.values())
+
+    def with_parameters(self, parameters: Mapping[Any, Any]) -> "SymbolicMechanism":
+        """The same equations with other values of some parameters; nothing is derived or compiled again.
+
+        Parameters
+        ----------
+        parameters : mapping
+            From symbols, or their names, to numbers.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a parameter is unknown or its value no finite number.
+        """
+        values = {str(symbol): number(f"parameters[{symbol}]", value) for symbol, value in parameters.items()}
+        unknown = [name for name in values if name not in self.parameters]
+        if unknown:
+            raise ValueError(f"parameters must be of {', '.join(self.parameters) or 'none'}; given {unknown[0]}")
+        return replace(self, parameters={**self.parameters, **values})
+
+    def problem(
+        self,
+        q0: ArrayLike | Mapping[Any, float],
+        v0: ArrayLike | Mapping[Any, float],
+        t_span: tuple[float, float],
+        *,
+        keep: Sequence[Any] = (),
+        note: str = "",
+    ) -> Problem:
+        """The mechanism with a start, which is moved onto the constraints by `consistent_state`.
+
+        Parameters
+        ----------
+        q0, v0 : array_like (n_q,) or mapping
+            Positions and velocities at the start; a mapping goes from coordinates, or their names, to numbers, and
+            those not in it are guessed as 0.
+        t_span : (float, float)
+            Start and end, s.
+        keep : sequence
+            Coordinates, or their names, that must keep their values and velocities.
+        note : str
+            What is assumed.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a coordinate is unknown, or no consistent state is found.
+        """
+        places = [self._place("keep", each) for each in keep]
+        q, v = self._state("q0", q0), self._state("v0", v0)
+        q, v = consistent_state(self.system, t_span[0], q, v, keep=places or None)
+        return Problem(
+            name=self.name,
+            system=self.system,
+            q0=q,
+            v0=v,
+            t_span=t_span,
+            energy=self.energy,
+            parameters=dict(self.parameters),
+            note=note,
+            conserved=self.conserved,
+            coordinates=self.coordinates,
+        )
+
+    def _state(self, argument: str, given: Any) -> Any:
+        if not isinstance(given, Mapping):
+            return given
+        state = np.zeros(len(self.coordinates))
+        for coordinate, value in given.items():
+            state[self._place(argument, coordinate)] = number(f"{argument}[{coordinate}]", value)
+        return state
+
+    def _place(self, argument: str, coordinate: Any) -> int:
+        name = coordinate if isinstance(coordinate, str) else str(getattr(coordinate, "func", coordinate))
+        if name not in self.coordinates:
+            raise ValueError(f"{argument} must name coordinates, {', '.join(self.coordinates)}; given {coordinate}")
+        return self.coordinates.index(name)
+
+
+def made(
+    reader: Reader,
+    given: Sequence[Any],
+    derive: Callable[[], Equations],
+    *,
+    rows: tuple[int, int],
+    conserved: bool,
+    tangents: bool,
+    name: str,
+) -> SymbolicMechanism:
+    """The mechanism of equations, which are derived unless an earlier process did.
+
+    `given` is all that they follow from, in plain symbols; `rows` is (n_c, n_a).
+    """
+    check_text("name", name)
+    key = _digest([*given, check_flag("tangents", tangents), len(reader.q), len(reader.p)])
+    code = GeneratedCode.stored(key) or GeneratedCode(key, derive().source(tangents))
+    return SymbolicMechanism(name, reader.names, *rows, reader.values, conserved, code)
+
+
+def _digest(given: Any) -> str:
+    known: dict[Basic, bytes] = {}
+
+    def of(each: Any) -> bytes:
+        """Of an expression by way of its parts, each of which is looked at once."""
+        if isinstance(each, (list, tuple)):
+            return hashlib.sha256(b"list" + b"".join(map(of, each))).digest()
+        if not isinstance(each, Basic):
+            return hashlib.sha256(repr(each).encode()).digest()
+        if each not in known:
+            text = type(each).__name__ if each.args else sympy.srepr(each)
+            known[each] = hashlib.sha256(text.encode() + b"".join(map(of, each.args))).digest()
+        return known[each]
+
+    return hashlib.sha256(_version() + of(given)).hexdigest()[:32]
+
+
+@cache
+def _version() -> bytes:
+    """Digest of what makes code of expressions: this package and SymPy."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(sympy.__version__.encode() + b"".join(file.read_bytes() for file in files)).digest()

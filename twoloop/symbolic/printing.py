@@ -1,0 +1,138 @@
+"""Expressions as Python code: subexpressions that several entries of a callback share are evaluated once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+
+from twoloop.callbacks import KINDS
+from twoloop.symbolic.differentiation import Entries
+
+# SymPy's functions that the equations may have, with their names in math and numpy
+FUNCTIONS = {
+    sympy.sin: ("sin", "sin"),
+    sympy.cos: ("cos", "cos"),
+    sympy.tan: ("tan", "tan"),
+    sympy.asin: ("asin", "arcsin"),
+    sympy.acos: ("acos", "arccos"),
+    sympy.atan: ("atan", "arctan"),
+    sympy.atan2: ("atan2", "arctan2"),
+    sympy.sinh: ("sinh", "sinh"),
+    sympy.cosh: ("cosh", "cosh"),
+    sympy.tanh: ("tanh", "tanh"),
+    sympy.asinh: ("asinh", "arcsinh"),
+    sympy.exp: ("exp", "exp"),
+    sympy.log: ("log", "log"),
+}
+MOST_FACTORS = 4  # integer powers up to this one are written as products
+
+
+class _Printer:
+    """Writes an expression with the functions of `math` or of `np`; all numbers are floats."""
+
+    def __init__(self, module: str):
+        self.module = module
+        column = 0 if module == "math" else 1
+        self.functions = {function: f"{module}.{names[column]}" for function, names in FUNCTIONS.items()}
+
+    def sum(self, expression: Expr) -> str:
+        """An expression that stands alone, or as an argument."""
+        text = ""
+        for term in sympy.Add.make_args(expression):
+            negative = term.could_extract_minus_sign() and not term.is_Add
+            part = self.product(-term if negative else term)
+            text += (" - " if text else "-") + part if negative else (" + " if text else "") + part
+        return text
+
+    def product(self, expression: Expr) -> str:
+        """An expression as a term of a sum."""
+        above, below = [], []
+        for factor in sympy.Mul.make_args(expression):
+            if factor.is_Pow and factor.exp.is_Rational and factor.exp < 0:
+                below.append(self.power(factor.base, -factor.exp))
+            else:
+                above.append(self.factor(factor))
+        text = "*".join(above) or "1.0"
+        if not below:
+            return text
+        return f"{text}/{below[0]}" if len(below) == 1 else f"{text}/({'*'.join(below)})"
+
+    def factor(self, expression: Expr) -> str:
+        """An expression as a factor of a product."""
+        if expression.is_Symbol:
+            return str(expression.name)
+        if expression.is_Number or isinstance(expression, sympy.NumberSymbol):
+            return repr(float(expression)) if expression >= 0 else f"({float(expression)!r})"
+        if expression.is_Pow:
+            negative = expression.exp.is_Rational and expression.exp < 0
+            return f"({self.product(expression)})" if negative else self.power(expression.base, expression.exp)
+        if expression.func in self.functions:
+            return f"{self.functions[expression.func]}({', '.join(map(self.sum, expression.args))})"
+        return f"({self.sum(expression)})"
+
+    def power(self, base: Expr, exponent: Expr) -> str:
+        """A power, in parentheses where it needs them; small integer ones as products."""
+        if exponent == sympy.S.Half:
+            return f"{self.module}.sqrt({self.sum(base)})"
+        text = self.factor(base)
+        if not exponent.is_Integer:
+            return f"({text}**{self.factor(exponent)})"
+        if exponent == 1:
+            return text
+        if 1 < exponent <= MOST_FACTORS and base.is_Symbol:
+            return f"({'*'.join([text] * int(exponent))})"
+        return f"({text}**{int(exponent)})"
+
+
+def callback_source(kind: str, arrays: Sequence[Entries]) -> str:
+    """The source of a callback that fills the arrays of its kind, which arrive full of zeros."""
+    entry = KINDS[kind]
+    targets = [
+        (f"{name}[{', '.join(map(str, place)) if isinstance(place, tuple) else place}]", expression)
+        for (name, _), entries in zip(entry.outputs, arrays, strict=True)
+        for place, expression in entries.items()
+    ]
+    lines, values = _evaluated([expression for _, expression in targets], _Printer("math"))
+    stores: dict[str, list[str]] = {}
+    for (target, _), value in zip(targets, values, strict=True):
+        stores.setdefault(value, []).append(target)
+    lines += [f"{' = '.join(same)} = {value}" for value, same in stores.items()]
+    return _function(kind, entry.arguments, lines)
+
+
+def energy_source(energy: Expr) -> str:
+    """The source of energy(t, q, v, p), of one state or of the columns of many."""
+    lines, values = _evaluated([energy], _Printer("np"))
+    return _function("energy", ("t", "q", "v", "p"), [*lines, f"return {values[0]}"])
+
+
+def _function(name: str, arguments: Sequence[str], lines: Sequence[str]) -> str:
+    return "\n    ".join([f"def {name}({', '.join(arguments)}):", *(lines or ["pass"])]) + "\n"
+
+
+def _evaluated(expressions: list[Expr], printer: _Printer) -> tuple[list[str], list[str]]:
+    """Lines that evaluate what the expressions share, and the expressions after them."""
+    shared, reduced = sympy.cse(expressions, symbols=_numbered(), order="none", list=True)
+    used = set().union(*(each.free_symbols for each in [*reduced, *(value for _, value in shared)]), set())
+    loads = [
+        f"{symbol} = {symbol.name[: -len(number)]}[{number}]"
+        for symbol in sorted(used, key=_place)
+        if (number := _number(symbol)) and symbol.name[0] != "x"
+    ]
+    return loads + [f"{symbol} = {printer.sum(value)}" for symbol, value in shared], [
+        printer.sum(each) for each in reduced
+    ]
+
+
+def _numbered() -> Any:
+    return sympy.numbered_symbols("x", cls=Symbol)
+
+
+def _number(symbol: Symbol) -> str:
+    return symbol.name.lstrip("abcdefghijklmnopqrstuvwxyz")
+
+
+def _place(symbol: Symbol) -> tuple[str, int]:
+    number = _number(symbol)
+    return symbol.name[: len(symbol.name) - len(number)], int(number or 0)
