@@ -13,7 +13,7 @@ from studies.store import Output
 # claims reads the others' rows
 STUDIES = (
     *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam"),
-    *("validation", "honesty", "planted_errors", "claims"),
+    *("validation", "honesty", "robustness", "planted_errors", "claims"),
 )
 CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen
     ("smooth",): "smooth, rigid",
