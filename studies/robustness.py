@@ -186,6 +186,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["n_linkages"] = len(drawn.groupby(["what", "value"]))
     found["n_redrawn"] = int(drawn.drop_duplicates(["what", "value"])["n_redrawn"].sum())
     found["sensitivity"] = float(drawn["sensitivity"].max())
+    stopped = drawn[drawn["outcome"] == SAID]
+    found["n_stopped"], found["n_stopped_rank"] = len(stopped), int(stopped["message"].str.contains("rank").sum())
     found["linkages"] = [
         {"method": name, "kind": kind, **counts_of(own)}
         for (name, kind), own in drawn.groupby(["method", "what"], sort=False)
