@@ -7,7 +7,7 @@ import numpy as np
 
 from twoloop.adams import Adams
 from twoloop.bdf import BDF
-from twoloop.checks import check_choice, check_number, shown
+from twoloop.checks import check_choice, check_number, check_positive, shown
 from twoloop.dop853 import DOP853
 from twoloop.plan import INNER_TOL, LEAST_ERROR, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
@@ -306,6 +306,7 @@ def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float 
     beta : float
         Parameter of (12).
     """
+    check_positive("outer_tol", outer_tol)
     return Newmark(beta=beta, gamma=0.5, error_tol=outer_tol, inner_tol=inner_tol)
 
 
