@@ -160,7 +160,7 @@ class Trap:
     breaks: tuple[float, ...] = ()
     positions: Callable[[float], Array] | None = field(default=None, repr=False)
     tolerance: float = 1e-8
-    time_limit: float = 3.0
+    time_limit: float = 10.0
     steps: Mapping[str, float] = field(default_factory=dict)
     unnoticed: ConstrainedSystem | None = None
 
