@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,7 +15,7 @@ from studies import deceived, figures, study
 from studies.bench import Run, warm_up
 from studies.end_states import DECADES, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
 from studies.render import number, percent, power, render, table
-from studies.solvers import ADAMS, CATALOGUE, IDA_C, OWN_BDF, OWN_EXPLICIT
+from studies.solvers import ADAMS, CATALOGUE, EXUDYN, IDA_C, OWN_BDF, OWN_EXPLICIT
 from studies.store import Output
 from twoloop import mechanisms
 from twoloop.mechanisms import Problem
@@ -50,11 +51,19 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 QUICK_TOLERANCES = (1e-6, 1e-10)
 JUDGED_AT = (1e-6, 1e-10)  # tolerances of these
 DECEIVED_AT = (1e-4, 1e-6, 1e-8)  # tolerances of runs whose steps are looked at one by one
+MODELLED = "Exudyn's own model"  # group of runs with fixed steps, ...
+MODELS = (
+    *("redundant slider-crank", "A02, N = 1", "A02, N = 2", "A02, N = 2 (bodies)"),
+    *("heavy top", "spatial slider-crank", "A04 Bricard", "A05 governor"),
+)
+STEPS, QUICK_STEPS = (2000, 8000), (500, 2000)  # ... so many of them
+MODELLED_LIMIT = 30.0  # s of CPU of such a run
 TIGHT = 1e-10  # at which digits are compared
 COMPILING = 20.0  # of what compiles before the first run of a family of solvers on a problem
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = ("SunRadau5", OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
+APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 SHORT = {
     "RANK_LOST": "rank",
     "TIME_LIMIT": "time",
@@ -84,7 +93,16 @@ def runs(quick: bool) -> list[Run]:
             at = DECEIVED_AT[-1:] if quick else DECEIVED_AT
             group = deceived.DECEIVED
             found += [Run(case_of(problem), CATALOGUE[name], tol, group, repeats=1) for name in steps for tol in at]
-    return found
+    return found + list(modelled(made, quick))
+
+
+def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run]:
+    """Exudyn on the mechanisms of which it has a model of its own."""
+    for case in (replace(case_of(make()), time_limit=MODELLED_LIMIT) for make in made):
+        if case.name in MODELS:
+            for name in (f"Exudyn, {solver}" for solver in EXUDYN[: 1 if quick else None]):
+                for n in QUICK_STEPS if quick else STEPS:
+                    yield Run(case, CATALOGUE[name], case.t_end / n, MODELLED, repeats=1)
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -142,6 +160,21 @@ def of_steps(name: str, own: pd.DataFrame) -> dict[str, Any]:
     return found
 
 
+def of_model(case: str, own: pd.DataFrame) -> dict[str, Any]:
+    """What Exudyn's solvers make of a mechanism: errors at the shorter step, and the orders seen."""
+    found: dict[str, Any] = {"case": case, "solvers": {}}
+    for name, each in own.groupby("solver", sort=False):
+        coarse, fine = (each.sort_values("h", ascending=False).iloc[k] for k in (0, -1))
+        line: dict[str, Any] = {"error": None, "order": None, "status": str(fine["status"])}
+        if pd.notna(fine["error_q"]):
+            line["error"] = float(fine["error_q"])
+        if pd.notna(fine["error_q"]) and pd.notna(coarse["error_q"]):
+            ratio = float(coarse["error_q"]) / float(fine["error_q"])
+            line["order"] = float(np.log(ratio) / np.log(coarse["h"] / fine["h"]))
+        found["solvers"][str(name)] = line
+    return found
+
+
 def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
     """The best of ours and of others on one problem with TIGHT, in digits of q, and who is right."""
     tight = rows[rows["tol"] == TIGHT]
@@ -186,7 +219,8 @@ def _holds(name: str, level: str) -> float:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
-    rows = rows[~rows["group"].isin((JUDGED, deceived.DECEIVED))]
+    own_models = [of_model(case, own) for case, own in rows[rows["group"] == MODELLED].groupby("case", sort=False)]
+    rows = rows[~rows["group"].isin(APART)]
     solvers = [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]
     problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
     wrong = rows[rows["outcome"] == "wrong"]
@@ -197,6 +231,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "solvers": solvers,
         "problems": problems,
         "decades": DECADES,
+        "models": own_models,
+        "model_steps": list(STEPS),
         "steps": stepped,
         "steps_at": list(DECEIVED_AT),
         "first_deceived": [line["solver"] for line in stepped if line["first"]],
@@ -239,7 +275,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 def picture(rows: pd.DataFrame) -> Figure:
     """Problem x solver: digits of q with TIGHT."""
-    tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin((JUDGED, deceived.DECEIVED))]
+    tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin(APART)]
     cases, solvers = list(dict.fromkeys(tight["case"])), list(dict.fromkeys(tight["solver"]))
     shown, texts = np.full((len(cases), len(solvers)), np.nan), {}
     for _, row in tight.iterrows():
@@ -284,6 +320,13 @@ HEADER = (
 )
 
 
+def _of_exudyn(line: dict[str, Any] | None) -> str:
+    if line is None:
+        return "–"
+    order = "" if line["order"] is None else f" (order {number(line['order'])})"
+    return f"{number(line['error'])}{order}" if line["error"] is not None else SHORT.get(line["status"], "failed")
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings, figure and report."""
     found = findings_of(rows)
@@ -302,6 +345,13 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
         for line in found["steps"]
         if line["n"]
     ]
+    ready["models"] = table(
+        ("mechanism", *EXUDYN),
+        [
+            [line["case"], *(_of_exudyn(line["solvers"].get(f"Exudyn, {name}")) for name in EXUDYN)]
+            for line in found["models"]
+        ],
+    )
     header = ("solver", "steps", "deceived", "worst", "first steps deceived", "worst first")
     ready["steps"] = table(header, stepped)
     output.write("validation.md", render("validation", found, ready, stamp=line, quick=output.call.quick))
