@@ -62,9 +62,16 @@ def run(
     time_limit: float | None,
     radius: float = SPECTRAL_RADIUS,
     alpha: float = ALPHA,
+    dependent_rows: bool = False,
 ) -> Result:
-    """Solve an assembled system whose nodes have these sensors and reference coordinates, with n_c constraints."""
+    """Solve an assembled system whose nodes have these sensors and reference coordinates, with n_c constraints.
+
+    With dependent rows, which Exudyn's usual linear solver cannot treat, a dense one leaves out what is singular.
+    """
     settings = _settings(t_end, n_steps, store_every)
+    if dependent_rows:
+        settings.linearSolver.solverType = exu.LinearSolverType.EigenDense
+        settings.linearSolver.ignoreSingularJacobian = True
     settings.timeIntegration.generalizedAlpha.spectralRadius = radius
     limit = TimeLimit(time_limit)
     with _silence():

@@ -44,8 +44,8 @@ class MinimalFourBar:
         Initial angle of bar 3, from joint 2-3 to A, rad.
     branch : {-1, 1}
         1: joint 1-2 lies above the line from O to joint 2-3; -1: below.
-    density : float
-        Mass per length of the rods, kg/m.
+    density : float or (float, float, float)
+        Mass per length of the rods, or of each, kg/m.
     gravity : float
         m/s^2, along -y.
 
@@ -67,20 +67,21 @@ class MinimalFourBar:
         ground: float,
         theta3: float,
         branch: int,
-        density: float,
+        density: float | tuple[float, float, float],
         gravity: float,
     ):
         self._lengths = check_vector("lengths", lengths, 3)
         if not (self._lengths > 0.0).all():
             raise ValueError(f"lengths must be positive; given {lengths!r}")
         check_positive("ground", ground)
-        check_positive("density", density)
+        for value in density if isinstance(density, tuple) else (density,):
+            check_positive("density", value)
         for name, value in (("theta3", theta3), ("gravity", gravity)):
             if not math.isfinite(check_number(name, value)):
                 raise ValueError(f"{name} must be finite; given {value!r}")
         if branch not in (-1, 1):
             raise ValueError(f"branch must be 1 or -1; given {branch!r}")
-        self._masses = density * self._lengths
+        self._masses = np.array(density) * self._lengths
         self._gravity = gravity
         angles = _assemble(self._lengths, ground, theta3, branch)
         start = np.append(angles, 0.0)

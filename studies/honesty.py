@@ -28,6 +28,7 @@ from twoloop import ConstrainedSystem, Result, solve_dae
 Array = NDArray[np.float64]
 
 OWN = ("SunRadau5", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+IDA_C = "IDA from C"
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 QUICK_OWN, QUICK_SCIPY = ("SunRadau5", "DOP853", "BDF"), ("DOP853",)
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
@@ -37,17 +38,18 @@ TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right 
 TRUTH_LIMIT = 10.0  # s that one of them may take
 AGREE = 1e-7  # how far the two may differ
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
-ORDER = (HANG, SILENT, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
+UNASKED = "wrong, never asked"
+ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
+UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
 
 Call = Callable[[Trap], Result]
 
 
 def own(method: str, trap: Trap) -> Result:
     """One of ours, as a user calls it."""
-    step = {} if trap.step_size is None else {"step_size": trap.step_size}
     tolerances = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
     span = (0.0, trap.t_end)
-    return solve_dae(trap.system, span, trap.q0, trap.v0, method=method, **tolerances, **step)  # type: ignore[arg-type]
+    return solve_dae(trap.system, span, trap.q0, trap.v0, method=method, **tolerances, **trap.steps)  # type: ignore[arg-type]
 
 
 def scipy(method: str, trap: Trap) -> Result:
@@ -72,7 +74,7 @@ def _start(trap: Trap) -> tuple[Any, Any, Any, Any]:
 def solvers(quick: bool) -> dict[str, Call]:
     """Name to call; "two-loop" ones first."""
     made: dict[str, Call] = {f"{name} (two-loop)": partial(own, name) for name in (QUICK_OWN if quick else OWN)}
-    made |= {} if quick else {"IDA, stabilised": ida, "IDA from C": ida_c}
+    made |= {} if quick else {"IDA, stabilised": ida, IDA_C: ida_c}
     return made | {f"{name}, index 1": partial(scipy, name) for name in (QUICK_SCIPY if quick else SCIPY)}
 
 
@@ -84,8 +86,8 @@ def right_answer(trap: Trap) -> Array | None:
     StudyError
         If the two agree at no tolerance.
     """
-    if trap.motion is not None:
-        return trap.motion(trap.t_end)[0]
+    if trap.positions is not None:
+        return trap.positions(trap.t_end)
     if trap.sane is None:
         return None
     differ = np.inf
@@ -114,7 +116,7 @@ def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -
 
 def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
     """Make a run in a process of its own and send what came of it."""
-    made: Row = {"status": "", "message": "", "error": None, "warned": ""}
+    made: Row = {"status": "", "message": "", "error": None, "warned": "", "asked": True}
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
@@ -122,6 +124,9 @@ def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
             made |= {"status": result.status.name, "message": result.message}
             if result.success and truth is not None:
                 made["error"] = float(np.abs(result.q[:, -1] - truth).max())
+            if result.success and trap.unnoticed is not None:
+                without = call(replace(trap, system=trap.unnoticed))
+                made["asked"] = not np.array_equal(result.q, without.q)
         except Exception as error:
             made |= {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
     made["warned"] = " / ".join(str(each.message) for each in said)
@@ -135,7 +140,9 @@ def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
     limit = LOOSENESS * max(trap.tolerance, LEAST)
     if has_answer and row["error"] is not None and row["error"] <= limit:
         return RIGHT
-    return SAID if row["warned"] else SILENT
+    if row["warned"] or UNCONTROLLED in row["message"]:
+        return SAID
+    return SILENT if row["asked"] else UNASKED
 
 
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
@@ -164,7 +171,7 @@ def make(output: Output) -> pd.DataFrame:
     rows = []
     known = solvers(output.call.quick)
     with output.kept() as kept, unchecked():
-        compiled: set[tuple[str, int, int]] = set()
+        compiled: set[tuple[Any, ...]] = set()
         for trap in traps(output.call.quick):
             if all(f"{trap.name} | {trap.mechanism} | {name}" in kept for name in known):
                 truth = None
@@ -173,9 +180,9 @@ def make(output: Output) -> pd.DataFrame:
             for name, call in known.items():
                 key = f"{trap.name} | {trap.mechanism} | {name}"
                 if key not in kept:
-                    if not applies(name, trap):
+                    if why := why_not(name, trap):
                         row = {"trap": trap.name, "mechanism": trap.mechanism, "solver": name, "outcome": NOT_RUN}
-                        kept.add(key, row | {"status": "", "message": "its adapter has no fixed steps"})
+                        kept.add(key, row | {"status": "", "message": why})
                     else:
                         warm_up(name, call, trap, compiled)
                         kept.add(key, run(name, call, trap, truth))
@@ -183,15 +190,17 @@ def make(output: Output) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def applies(name: str, trap: Trap) -> bool:
-    """Fixed steps are asked for of ours alone."""
-    return trap.step_size is None or name.endswith("(two-loop)")
+def why_not(name: str, trap: Trap) -> str:
+    """Why a solver is not run on a trap; "" where it is."""
+    if trap.steps and not name.endswith("(two-loop)"):
+        return "its adapter takes no steps"
+    return "it takes compiled functions only" if name == IDA_C and trap.system.called_in_python else ""
 
 
-def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[str, int, int]]) -> None:
+def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
     """Compile in this process what the children call, on a harmless motion."""
     shared = call.func.__name__ if isinstance(call, partial) and not name.endswith("(two-loop)") else name
-    size = (shared, trap.system.n_q, trap.system.n_c)
+    size = (shared, trap.system.n_q, trap.system.n_c, trap.system.called_in_python)
     sane = trap.sane or trap.system
     if size in compiled:
         return
@@ -236,6 +245,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["counts"] = {
         name: {what: int((rows[rows["solver"] == name]["outcome"] == what).sum()) for what in ORDER} for name in names
     }
+    found["unasked"] = int((rows["outcome"] == UNASKED).sum())
     bad = rows[rows["outcome"].isin((SILENT, HANG))]
     for which in (True, False):
         some = bad[bad["solver"].str.endswith("(two-loop)") == which]
@@ -253,7 +263,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
         [
             each["trap"],
             *(
-                " / ".join(f"**{what.lower()}**" if what in (SILENT, HANG) else what for what in each[name])
+                " / ".join(f"**{what.lower()}**" if what in (SILENT, HANG, UNASKED) else what for what in each[name])
                 for name in found["solvers"]
             ),
         ]

@@ -1,18 +1,21 @@
-"""Traps: systems and starts on which a solver goes wrong unless it notices, each on two chains of point masses.
+"""Traps: systems and starts on which a solver goes wrong unless it notices, each on two mechanisms.
 
-One set of compiled callbacks serves all of them: what makes the trap stands in the vector of parameters.
+One set of compiled callbacks serves those on chains of point masses: what makes the trap stands in the parameters.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from studies.faults import python_copy
+from studies.random_linkages import end_of
 from twoloop import ConstrainedSystem
 from twoloop.callbacks import callback
-from twoloop.mechanisms import n_four_bar
+from twoloop.mechanisms import Problem, four_bar, n_four_bar
 
 Array = NDArray[np.float64]
 
@@ -110,6 +113,18 @@ def chain(n: int, parameters: Array, rows: int = 0) -> ConstrainedSystem:
     )
 
 
+def fails(Q: Array, t: float, *state: Array) -> Array:
+    """An error of Python after 1 s, in place of the force Q."""
+    if t > 1.0:
+        raise KeyError("the trap's callback raises")
+    return Q
+
+
+def misshapes(Q: Array, t: float, *state: Array) -> Array:
+    """One force too few after 1 s."""
+    return Q if t <= 1.0 else Q[:-1]
+
+
 @dataclass(frozen=True)
 class Trap:
     """What is wrong, on one mechanism.
@@ -126,11 +141,13 @@ class Trap:
         is wrong.
     breaks : tuple of float
         Times at which the right motion is computed in pieces.
-    motion : callable or None
-        motion(t) -> q, v, where it is known.
+    positions : callable or None
+        positions(t) -> q, where they are known.
     tolerance, time_limit : float
-    step_size : float or None
-        For methods that take fixed steps.
+    steps : mapping
+        `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
+    unnoticed : ConstrainedSystem or None
+        The system as it is for a solver that never evaluates it where the trap lies.
     """
 
     name: str
@@ -141,10 +158,11 @@ class Trap:
     t_end: float
     sane: ConstrainedSystem | None = None
     breaks: tuple[float, ...] = ()
-    motion: Callable[[float], tuple[Array, Array]] | None = field(default=None, repr=False)
+    positions: Callable[[float], Array] | None = field(default=None, repr=False)
     tolerance: float = 1e-8
-    time_limit: float = 3.0
-    step_size: float | None = None
+    time_limit: float = 10.0
+    steps: Mapping[str, float] = field(default_factory=dict)
+    unnoticed: ConstrainedSystem | None = None
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -156,23 +174,27 @@ def start(n: int) -> tuple[Array, Array]:
 
 
 def traps(quick: bool) -> list[Trap]:
-    """All traps, each on a chain of two and of three points; singular positions on two linkages."""
+    """All traps, each on a chain of two and of three points; those of positions on two linkages each."""
     made = [trap for n in ((2,) if quick else (2, 3)) for trap in of_chain(n)]
-    for n in () if quick else (1, 2):
+    return made + ([] if quick else list(of_linkages()))
+
+
+def of_linkages() -> Iterator[Trap]:
+    """Singular positions, dead points, and positions where the two assemblies of a linkage nearly meet."""
+    for n in (1, 2):
         problem = n_four_bar(n)
-        made.append(
-            Trap(
-                "singular position crossed",
-                problem.name,
-                problem.system,
-                problem.q0,
-                problem.v0,
-                5.0,
-                problem.system,
-                motion=problem.motion,
-            )
-        )
-    return made
+        yield of_motion("singular position crossed", problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
+    for ground in (2.0, 1.9):  # bars 1 and 2 come into line: the angle of bar 3 does not determine theirs
+        problem = four_bar((0.8, 1.2, 1.0), ground)
+        yield of_motion("dead point", problem, partial(end_of, problem))
+    for excess in (1e-4, -1e-7):  # longest and shortest less the other two: 0 at a change point
+        problem = four_bar((0.5, 1.5, 1.0), 2.0 + excess, theta3=1.0)
+        yield of_motion("assemblies nearly meet", problem, partial(end_of, problem))
+
+
+def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:
+    """A trap that lies in the motion, which is known."""
+    return Trap(name, problem.name, problem.system, problem.q0, problem.v0, 5.0, problem.system, positions=positions)
 
 
 def of_chain(n: int) -> list[Trap]:
@@ -200,14 +222,18 @@ def of_chain(n: int) -> list[Trap]:
         trap("inconsistent velocities", system(), None, v0=across),
         trap("NaN in the force after 1 s", system(NAN=1.0), None),
         trap("exception in a callback after 1 s", system(RAISES=1.0), None),
+        trap("exception in a Python callback after 1 s", python_copy(system(), force=fails), None),
+        trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=misshapes), None),
         trap("one wrong entry of C_q", system(WRONG=1e-3), system()),
         trap("force that jumps", push, push, breaks=(0.7,)),
-        trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001)),
+        trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001), unnoticed=system()),
+        trap("pulse of 1 ms, max_step half of it", pulse, pulse, breaks=(1.0, 1.001), steps={"max_step": 5e-4}),
         trap("redundant row", system(rows=1), system()),
         trap("pivot driven at 1000 rad/s", fast, fast, 1.0, v0=moving),
         trap("spring of 1e7 N/m", spring, spring, 1.0),
         trap("masses 1 to 1e10", heavy, heavy, 1.0),
         trap("tolerance of 1e-17", system(), system(), tolerance=1e-17),
         trap("time limit of 0.5 s", system(), None, 1e5, time_limit=0.5),
-        trap("fixed steps of 0.5 s", system(), system(), step_size=0.5),
+        trap("first step of 1 s", system(), system(), steps={"first_step": 1.0}),
+        trap("fixed steps of 0.5 s", system(), system(), steps={"step_size": 0.5}),
     ]

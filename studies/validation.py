@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies import figures, study
+from studies import deceived, figures, study
 from studies.bench import Run, warm_up
 from studies.end_states import DECADES, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
-from studies.render import number, power, render, table
-from studies.solvers import ADAMS, CATALOGUE, IDA_C, OWN_BDF, OWN_EXPLICIT
+from studies.render import number, percent, power, render, table
+from studies.solvers import ADAMS, CATALOGUE, EXUDYN, IDA_C, OWN_BDF, OWN_EXPLICIT
 from studies.store import Output
 from twoloop import mechanisms
 from twoloop.mechanisms import Problem
@@ -49,11 +50,20 @@ QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 QUICK_TOLERANCES = (1e-6, 1e-10)
 JUDGED_AT = (1e-6, 1e-10)  # tolerances of these
+DECEIVED_AT = (1e-4, 1e-6, 1e-8)  # tolerances of runs whose steps are looked at one by one
+MODELLED = "Exudyn's own model"  # group of runs with fixed steps, ...
+MODELS = (
+    *("redundant slider-crank", "A02, N = 1", "A02, N = 2", "A02, N = 2 (bodies)"),
+    *("heavy top", "spatial slider-crank", "A04 Bricard", "A05 governor"),
+)
+STEPS, QUICK_STEPS = (2000, 8000), (500, 2000)  # ... so many of them
+MODELLED_LIMIT = 30.0  # s of CPU of such a run
 TIGHT = 1e-10  # at which digits are compared
 COMPILING = 20.0  # of what compiles before the first run of a family of solvers on a problem
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = ("SunRadau5", OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
+APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 SHORT = {
     "RANK_LOST": "rank",
     "TIME_LIMIT": "time",
@@ -78,7 +88,21 @@ def runs(quick: bool) -> list[Run]:
         if problem.condition is not None and not quick:
             case = case_of(problem, judged=True)
             found += [Run(case, CATALOGUE[name], tol, JUDGED, repeats=1) for name in solvers for tol in JUDGED_AT]
-    return found
+        if problem.system.n_a == 0 and not {"singular", "redundant"} & set(problem.tags):
+            steps = [name for name in solvers if name != IDA_C]  # whose adapter keeps none
+            at = DECEIVED_AT[-1:] if quick else DECEIVED_AT
+            group = deceived.DECEIVED
+            found += [Run(case_of(problem), CATALOGUE[name], tol, group, repeats=1) for name in steps for tol in at]
+    return found + list(modelled(made, quick))
+
+
+def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run]:
+    """Exudyn on the mechanisms of which it has a model of its own."""
+    for case in (replace(case_of(make()), time_limit=MODELLED_LIMIT) for make in made):
+        if case.name in MODELS:
+            for name in (f"Exudyn, {solver}" for solver in EXUDYN[: 1 if quick else None]):
+                for n in QUICK_STEPS if quick else STEPS:
+                    yield Run(case, CATALOGUE[name], case.t_end / n, MODELLED, repeats=1)
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -93,7 +117,7 @@ def make(output: Output) -> pd.DataFrame:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore")
                         warm_up(run, 0, COMPILING)
-                kept.add(run.key(0), row_of(run))
+                kept.add(run.key(0), deceived.row_of(run) if run.group == deceived.DECEIVED else row_of(run))
         return pd.DataFrame([kept[run.key(0)] for run in todo])
 
 
@@ -121,6 +145,33 @@ def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
         sizes = tight[tight["error_q"].notna()][level].dropna().astype(float)
         found[level] = float(sizes.max()) if len(sizes) else None
     found["evaluations"] = float(tight["n_evaluations"].dropna().median()) if len(tight) else None
+    return found
+
+
+def of_steps(name: str, own: pd.DataFrame) -> dict[str, Any]:
+    """What the table says of the steps of a solver, over all problems whose steps could be judged."""
+    seen = own[own["n_sampled"] > 0]
+    found: dict[str, Any] = {"solver": name, "n": int(seen["n_sampled"].sum()), "problems": int(seen["case"].nunique())}
+    found |= {"deceived": None, "worst": None, "first": None, "first_worst": None}
+    if len(seen):
+        found |= {"deceived": float(seen["n_deceived"].sum() / found["n"]), "worst": float(seen["worst_step"].max())}
+        first = seen["first_step"].astype(float)
+        found |= {"first": float((first > 1.0).mean()), "first_worst": float(first.max())}
+    return found
+
+
+def of_model(case: str, own: pd.DataFrame) -> dict[str, Any]:
+    """What Exudyn's solvers make of a mechanism: errors at the shorter step, and the orders seen."""
+    found: dict[str, Any] = {"case": case, "solvers": {}}
+    for name, each in own.groupby("solver", sort=False):
+        coarse, fine = (each.sort_values("h", ascending=False).iloc[k] for k in (0, -1))
+        line: dict[str, Any] = {"error": None, "order": None, "status": str(fine["status"])}
+        if pd.notna(fine["error_q"]):
+            line["error"] = float(fine["error_q"])
+        if pd.notna(fine["error_q"]) and pd.notna(coarse["error_q"]):
+            ratio = float(coarse["error_q"]) / float(fine["error_q"])
+            line["order"] = float(np.log(ratio) / np.log(coarse["h"] / fine["h"]))
+        found["solvers"][str(name)] = line
     return found
 
 
@@ -167,16 +218,24 @@ def _holds(name: str, level: str) -> float:
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
-    judged, rows = rows[rows["group"] == JUDGED], rows[rows["group"] != JUDGED]
+    judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
+    own_models = [of_model(case, own) for case, own in rows[rows["group"] == MODELLED].groupby("case", sort=False)]
+    rows = rows[~rows["group"].isin(APART)]
     solvers = [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]
     problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
     wrong = rows[rows["outcome"] == "wrong"]
+    stepped = [of_steps(name, own) for name, own in steps.groupby("solver", sort=False)]
     found: dict[str, Any] = {
         "n": len(problems),
         "tight": TIGHT,
         "solvers": solvers,
         "problems": problems,
         "decades": DECADES,
+        "models": own_models,
+        "model_steps": list(STEPS),
+        "steps": stepped,
+        "steps_at": list(DECEIVED_AT),
+        "first_deceived": [line["solver"] for line in stepped if line["first"]],
     }
     found |= {"n_runs": len(rows), "ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
     found["wrong"] = [
@@ -216,7 +275,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 def picture(rows: pd.DataFrame) -> Figure:
     """Problem x solver: digits of q with TIGHT."""
-    tight = rows[(rows["tol"] == TIGHT) & (rows["group"] != JUDGED)]
+    tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin(APART)]
     cases, solvers = list(dict.fromkeys(tight["case"])), list(dict.fromkeys(tight["solver"]))
     shown, texts = np.full((len(cases), len(solvers)), np.nan), {}
     for _, row in tight.iterrows():
@@ -261,12 +320,40 @@ HEADER = (
 )
 
 
+def _of_exudyn(line: dict[str, Any] | None) -> str:
+    if line is None:
+        return "–"
+    order = "" if line["order"] is None else f" (order {number(line['order'])})"
+    return f"{number(line['error'])}{order}" if line["error"] is not None else SHORT.get(line["status"], "failed")
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings, figure and report."""
     found = findings_of(rows)
     output.save_findings(found)
     figures.save(picture(rows), output, "validation")
     ready = {"solvers": table(HEADER, lines(found["solvers"]))}
+    stepped = [
+        [
+            line["solver"],
+            line["n"],
+            percent(line["deceived"]),
+            line["worst"],
+            percent(line["first"]),
+            line["first_worst"],
+        ]
+        for line in found["steps"]
+        if line["n"]
+    ]
+    ready["models"] = table(
+        ("mechanism", *EXUDYN),
+        [
+            [line["case"], *(_of_exudyn(line["solvers"].get(f"Exudyn, {name}")) for name in EXUDYN)]
+            for line in found["models"]
+        ],
+    )
+    header = ("solver", "steps", "deceived", "worst", "first steps deceived", "worst first")
+    ready["steps"] = table(header, stepped)
     output.write("validation.md", render("validation", found, ready, stamp=line, quick=output.call.quick))
 
 

@@ -212,7 +212,7 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     """
     if callable(kind):
         raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {kind!r}")
 
     def decorate(function: Callable[..., None]) -> Dispatcher:

@@ -8,7 +8,7 @@ import numpy as np
 from twoloop.adams import Adams
 from twoloop.auto import Auto, switching
 from twoloop.bdf import BDF
-from twoloop.checks import check_choice, check_number, shown
+from twoloop.checks import check_choice, check_number, check_positive, shown
 from twoloop.dop853 import DOP853
 from twoloop.esdirk import ESDIRK
 from twoloop.plan import INNER_TOL, Method, Plan, check_tolerances, outer_tolerance
@@ -349,6 +349,7 @@ def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float 
     beta : float
         Parameter of (12).
     """
+    check_positive("outer_tol", outer_tol)
     return Newmark(beta=beta, gamma=0.5, error_tol=outer_tol, inner_tol=inner_tol)
 
 

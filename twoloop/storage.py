@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks import shown
 from twoloop.consistency import check_system
 from twoloop.dense import DenseSolution, Interpolator, Table
 from twoloop.result import Result, Statistics, Status
@@ -21,6 +22,13 @@ FORMAT = "twoloop result 1"
 ALWAYS = ("t", "q", "v", "a", "lam", "h")
 SOMETIMES = ("rejected_error", "rejected_convergence", "partitioned", "redundant")
 OF_EVENTS = ("t_events", "q_events", "v_events")
+
+
+def check_path(path: Any) -> Path:
+    """Return `path` as a Path, or say that it is none."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+        raise TypeError(f"path must be a file name or a path; given {shown(path)} of type {type(path).__name__}")
+    return Path(path)
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:
@@ -38,7 +46,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
         words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
         if interpolator.parts > 1:
             arrays["sol_interior_t"], arrays["sol_interior_states"] = interpolator.interiors(table)
-    with Path(path).open("wb") as file:
+    with check_path(path).open("wb") as file:
         np.savez(file, words=np.array(json.dumps(words)), allow_pickle=False, **arrays)
 
 
@@ -67,6 +75,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     """
     if system is not None:
         check_system(system)
+    path = check_path(path)
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

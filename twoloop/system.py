@@ -23,6 +23,7 @@ from twoloop.bounds import check_callback
 from twoloop.callbacks import KINDS, STATE, stand_in
 from twoloop.checks import check_number, check_real, check_size
 from twoloop.description import Description
+from twoloop.checks import check_flag, check_number, check_real, check_size
 from twoloop.jacobian import differenced_jacobian
 from twoloop.joints import Joint, check_joints
 from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
@@ -199,7 +200,7 @@ class ConstrainedSystem:
             "joints": joints,
             "name": name,
         }
-        if compile:
+        if check_flag("compile", compile):
             compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
             system = cls(**sizes, **options, **compiled)
             system._returning = functions

@@ -9,7 +9,7 @@ import pytest
 
 from studies import honesty
 from studies.render import render
-from studies.traps import traps
+from studies.traps import of_linkages, traps
 from twoloop import solve_dae
 
 TRAPS = {trap.name: trap for trap in traps(quick=True)}
@@ -37,7 +37,7 @@ def test_a_wrong_answer_with_success_is_silent():
 
 
 def test_a_warning_is_saying_so():
-    made = {"status": "REACHED_END", "error": 1.0, "warned": "beware"}
+    made = {"status": "REACHED_END", "error": 1.0, "warned": "beware", "asked": True, "message": ""}
     assert honesty.outcome(made, SOUND, True) == honesty.SAID
     assert honesty.outcome(made | {"warned": ""}, SOUND, True) == honesty.SILENT
     assert honesty.outcome(made | {"error": 1e-9, "warned": ""}, SOUND, True) == honesty.RIGHT
@@ -50,7 +50,47 @@ def test_a_call_that_does_not_come_back_hangs(monkeypatch):
     assert honesty.run("x", lambda trap: time.sleep(60.0), short, None)["outcome"] == honesty.HANG
 
 
-@pytest.mark.parametrize("name", ["inconsistent positions", "NaN in the force after 1 s", "one wrong entry of C_q"])
+def test_what_was_never_evaluated_is_told_from_what_was_missed():
+    pulse = TRAPS["pulse of 1 ms"]
+    assert row_of(pulse)["outcome"] == honesty.UNASKED
+    assert row_of(TRAPS["pulse of 1 ms, max_step half of it"])["outcome"] == honesty.RIGHT
+
+    def coarse(trap):  # ends before the pulse has: it has seen it
+        return solve_dae(trap.system, (0.0, 1.0005), trap.q0, trap.v0, method="DOP853", max_step=1e-3)
+
+    assert row_of(pulse, coarse)["outcome"] == honesty.SILENT
+
+
+def test_steps_without_error_control_may_say_so():
+    made = {"status": "REACHED_END", "error": 1.0, "warned": "", "asked": True, "message": ""}
+    assert honesty.outcome(made, SOUND, True) == honesty.SILENT
+    assert honesty.outcome(made | {"message": f"Done; {honesty.UNCONTROLLED}."}, SOUND, True) == honesty.SAID
+
+
+def test_traps_in_the_motion_have_a_known_end():
+    traps_of = {trap.name: trap for trap in of_linkages()}
+    for name in ("dead point", "assemblies nearly meet"):
+        row = row_of(traps_of[name])
+        assert row["outcome"] == honesty.RIGHT, row
+
+
+def test_a_solver_of_compiled_functions_is_not_asked_for_python():
+    trap = TRAPS["exception in a Python callback after 1 s"]
+    assert honesty.why_not(honesty.IDA_C, trap)
+    assert not honesty.why_not("BDF (two-loop)", trap)
+    assert honesty.why_not("LSODA, index 1", TRAPS["first step of 1 s"])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "inconsistent positions",
+        "NaN in the force after 1 s",
+        "one wrong entry of C_q",
+        "exception in a Python callback after 1 s",
+        "wrong shape from a Python callback after 1 s",
+    ],
+)
 @pytest.mark.parametrize("method", ["SunRadau5", "DOP853", "BDF"])
 def test_ours_say_so(name, method):
     assert row_of(TRAPS[name], partial(honesty.own, method))["outcome"] == honesty.SAID

@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import end_states, validation
+from studies import deceived, end_states, validation
 from studies.bench import Run
 from studies.render import number_of_words, render
 from studies.solvers import CATALOGUE
-from twoloop import mechanisms
+from twoloop import mechanisms, solve_dae
 
 
 def run_of(problem, solver="Gauss12", tolerance=1e-8, group=""):
@@ -113,3 +113,34 @@ def test_sentences_turn_with_the_rows():
     assert "Ours alone" not in text
     text, _ = text_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
     assert "Ours alone: double pendulum." in text
+
+
+def deceived_row(problem, solver, tolerance):
+    case = end_states.case_of(problem)
+    return deceived.row_of(Run(case, CATALOGUE[solver], tolerance, deceived.DECEIVED, repeats=1))
+
+
+def test_steps_that_keep_their_tolerance_and_steps_that_do_not():
+    problem = mechanisms.double_pendulum()
+    result = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
+    assert (deceived.local_errors(problem, result, 1e-6) < 1.0).all()
+    assert (deceived.local_errors(problem, result, 1e-12)[1:] > 1.0).sum() > 3
+    wrong = replace(result, v=result.v + 1e-4 * (np.arange(result.t.size) == 5))
+    errors = deceived.local_errors(problem, wrong, 1e-6, sampled=result.t.size)
+    assert np.flatnonzero(errors > 1.0).tolist() == [4, 5]
+
+
+def test_a_run_without_an_exact_motion_has_no_deceived_steps():
+    row = deceived_row(mechanisms.knife_edge(), "DOP853 (two-loop)", 1e-6)
+    assert row["n_sampled"] == 0
+    assert "no exact motion on index 1" in row["message"]
+
+
+def test_the_share_of_deceived_steps():
+    problem, solver = mechanisms.double_pendulum(), "DOP853 (two-loop)"
+    rows = pd.DataFrame([deceived_row(problem, solver, tolerance) for tolerance in (1e-6, 1e-8)])
+    sound = validation.of_steps(solver, rows)
+    assert (sound["n"], sound["deceived"], sound["first"]) == (50, 0.0, 0.0)
+    rows["n_deceived"], rows["first_step"] = [10, 0], [2.0, 0.5]
+    bad = validation.of_steps(solver, rows)
+    assert (bad["deceived"], bad["first"], bad["first_worst"]) == (0.2, 0.5, 2.0)

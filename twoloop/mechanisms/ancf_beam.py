@@ -50,6 +50,7 @@ __all__ = [
 
 GRAVITY = 9.81  # m/s^2
 N_DRAWN = 8  # pieces of the line that an element is drawn as
+LARGEST = 1e50  # of a parameter in SI units: products of a few of them must be numbers, too
 STARTS = {"node": "only the base node moving (start='node')", "beam": "all of it moving (start='beam')"}
 
 # p: the parameters of the elements, then those of the base's motion
@@ -144,7 +145,7 @@ def ancf_beam(
         If an argument is out of range.
     """
     n_elements = check_size("n_elements", n_elements, 1)
-    if start not in tuple(STARTS):
+    if not isinstance(start, str) or start not in STARTS:
         raise ValueError(
             f"start must be 'node' (the base node moves, the others rest) or 'beam' (all of it moves with the base); "
             f"given {start!r}. The base moves at t = 0: nothing else is consistent with it"
@@ -166,6 +167,8 @@ def ancf_beam(
                 raise ValueError(f"{name} must be finite; given {value!r}")
         else:
             check_positive(name, value)
+        if abs(value) > LARGEST:
+            raise ValueError(f"{name} must be at most {LARGEST:g}; given {value!r}")
     if gravity < 0.0:
         raise ValueError(f"gravity must be at least 0, it acts along -y; given {gravity!r}")
     if not -1.0 < poisson_ratio < 0.5:

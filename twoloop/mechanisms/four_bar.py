@@ -7,6 +7,7 @@ axis along the chain. (35) of the paper is printed with a cosine of th3 where a 
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -174,7 +175,7 @@ def four_bar(
     ground, theta3 = check_finite("ground", ground), check_finite("theta3", theta3)
     if not ground > 0.0:
         raise ValueError(f"ground must be positive; given {ground!r}")
-    if isinstance(branch, bool) or branch not in (-1, 1):
+    if isinstance(branch, bool) or not isinstance(branch, Real) or branch not in (-1, 1):
         raise ValueError(
             f"branch must be 1 (joint 1-2 above the line from O to joint 2-3) or -1 (below); given {branch!r}"
         )

@@ -69,7 +69,7 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
         If n is not a positive integer, or `coordinates` is unknown.
     """
     n = check_size("n", n, 1)
-    if coordinates not in SETS:
+    if not isinstance(coordinates, str) or coordinates not in SETS:
         raise ValueError(f"coordinates must be one of {', '.join(SETS)}; given {coordinates!r}")
     name = f"A02, N = {n}{' (bodies)' if coordinates == 'bodies' else ''}"
     rows = _of_tips(n) if coordinates == "tips" else _of_bodies(n)
