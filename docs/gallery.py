@@ -10,8 +10,8 @@ from twoloop.mechanisms import Problem
 BEGINNING = """# Ready mechanisms
 
 `from twoloop.mechanisms import four_bar`, and so on: each is a function that returns a
-[`Problem`](../reference.md#ready-mechanisms) with compiled callbacks, a consistent start, a usual time span, the energy,
-and a reference of which it is known how many digits hold. This page is written from the mechanisms whenever the
+[`Problem`](../reference.md#ready-mechanisms) with compiled callbacks, a consistent start, a usual time span, the energy
+and a reference, of which it is known how many digits hold. This page is written from the mechanisms whenever the
 documentation is built.
 """
 
