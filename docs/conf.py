@@ -16,7 +16,8 @@ copyright = author
 version = release = twoloop.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "generated/extra"]
+html_extra_path = ["generated/extra"]  # the animations of the gallery, copied as they are
 default_role = "py:obj"  # a name in single backticks, as numpydoc has them, is a link where there is such an object
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3  # as on GitHub: a link to page.md#heading works in both
@@ -41,6 +42,6 @@ def escape_bars(app, what, name, obj, options, lines):
 
 
 def setup(app):
-    """Write the generated pages before Sphinx lists the files."""
-    app.connect("builder-inited", lambda app: generate.write(HERE / "generated"))
+    """Write the generated pages before Sphinx looks for files."""
+    app.connect("config-inited", lambda app, config: generate.write(HERE / "generated"))
     app.connect("autodoc-process-docstring", escape_bars)

@@ -1,11 +1,14 @@
-"""The gallery of the ready mechanisms, from what they say of themselves."""
+"""The gallery of the ready mechanisms, from what they say of themselves, each in its motion where it can be drawn."""
 
 import inspect
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from twoloop import mechanisms
+from twoloop import ConstraintWarning, Result, mechanisms, solve_dae
 from twoloop.mechanisms import Problem
+
+LONGEST = 10.0  # s of a motion that is shown
 
 BEGINNING = """# Ready mechanisms
 
@@ -16,11 +19,17 @@ documentation is built.
 """
 
 
-def write(folder: Path) -> None:
-    """Write gallery.md into the folder."""
+def write(page: Path, animations: Path) -> None:
+    """Write the page, and an animation of each mechanism into the folder that the page finds as ../animations."""
+    animations.mkdir(parents=True, exist_ok=True)
     parts = [BEGINNING]
-    parts += [entry(*each) for each in problems()]
-    (folder / "gallery.md").write_text("\n".join(parts), encoding="utf-8")
+    for name, summary, problem in problems():
+        parts.append(entry(name, summary, problem))
+        if hasattr(Result, "animate"):
+            motion(problem).animate(animations / f"{name}.html")
+            frame = f'<iframe src="../animations/{name}.html" title="{name} in its motion" width="100%" height="560"'
+            parts.append(f'```{{raw}} html\n{frame} loading="lazy" style="border: 0"></iframe>\n```\n')
+    page.write_text("\n".join(parts), encoding="utf-8")
 
 
 def problems() -> Iterator[tuple[str, str, Problem]]:
@@ -31,6 +40,17 @@ def problems() -> Iterator[tuple[str, str, Problem]]:
             each.default is not each.empty for each in inspect.signature(maker).parameters.values()
         ):  # a beam of one's own asks for numbers
             yield name, (inspect.getdoc(maker) or "").splitlines()[0], maker()
+
+
+def motion(problem: Problem) -> Result:
+    """The run that is shown; that rows are redundant is said in the text."""
+    end = min(problem.t_span[1], LONGEST)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConstraintWarning)
+        result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, rtol=1e-6, atol=1e-6, dense_output=True)
+    if not result.success:
+        raise RuntimeError(f"{problem.name}: {result.message}")
+    return result
 
 
 def entry(name: str, summary: str, problem: Problem) -> str:

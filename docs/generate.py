@@ -20,4 +20,4 @@ def write(folder: Path) -> None:
         if file.suffix in SHOWN:
             shutil.copy(file, reports)
     (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")
-    gallery.write(folder)
+    gallery.write(folder / "gallery.md", folder / "extra" / "animations")
