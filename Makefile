@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers compile table3 reports test test-oldest lint lock clean
+.PHONY: help install peers compile table3 reports test test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -34,7 +34,12 @@ help: ## say what there is
 
 install: $(STAMP) ## make .venv; runs by itself when it must
 
+# `venv --clear` would empty the environment behind a link, which others may be using
 $(STAMP): requirements.lock pyproject.toml
+	@if [ -L .venv ]; then \
+		echo ".venv is a link to $$(readlink .venv): not cleared. Set that environment up in its own folder, or remove the link." >&2; \
+		exit 1; \
+	fi
 	@$(FIND_PYTHON); \
 	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for one."; \
 	"$$python" -m venv --clear .venv
@@ -81,6 +86,10 @@ lint: install ## ruff and mypy
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
 
+docs: install ## the documentation, into docs/_build/html; a warning is an error
+	$(RUN) -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
 lock: ## renew both lock files from pyproject.toml; PYTHON=python3.11, the oldest supported
 	@$(FIND_PYTHON); "$$python" -m venv --clear .venv
 	@$(RUN) $(PIP) install ".[references,symbolic,sweeps,docs,studies,dev]" hatchling
@@ -92,4 +101,4 @@ lock: ## renew both lock files from pyproject.toml; PYTHON=python3.11, the oldes
 
 clean: ## remove caches (numba's too) and builds; .venv and .venv-oldest stay
 	find . -name '.venv*' -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
-	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache build dist
+	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache build dist docs/_build docs/generated

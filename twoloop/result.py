@@ -57,6 +57,11 @@ MEANINGS: dict[Status, str] = {
 }
 
 
+def explained(status: Status) -> str:
+    """Where the documentation explains a failure, for the end of its message; nothing for a run that succeeded."""
+    return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
+
+
 @dataclass(frozen=True)
 class Statistics:
     """Counts and CPU time of a run; None where a foreign solver does not tell.
@@ -112,7 +117,7 @@ class Result:
     status : Status
         0: reached the end; 1: an event; negative: failed.
     message : str
-        What happened and, after a failure, what to try.
+        What happened and, after a failure, what to try, and where the documentation explains it.
     stats : Statistics
         Counts and CPU time. After a terminal event `n_accepted` counts the steps up to it, the rest the few behind it,
         too. What is evaluated between steps is in `cpu_time` alone, and not at all where `sol` does it.

@@ -14,7 +14,7 @@ from twoloop.derivatives import wrong_derivative
 from twoloop.kernels import common, intervals
 from twoloop.plan import Plan, least_tolerance
 from twoloop.recorder import Recorder, Wanted
-from twoloop.result import Result, Statistics, Status
+from twoloop.result import Result, Statistics, Status, explained
 from twoloop.system import ConstrainedSystem
 from twoloop.workspace import kit_of, workspace
 
@@ -154,7 +154,7 @@ class Run:
             warnings.warn(
                 f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
                 f"{in_words(rows, self.redundant.tolist())}. They are left out of the solution and checked at every "
-                "step; multipliers are those of least norm",
+                "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows",
                 ConstraintWarning,
                 stacklevel=4,
             )
@@ -278,7 +278,7 @@ class Run:
             lam=table[:, 3 * n :].T,
             h=steps[1:, a.H],
             status=status,
-            message=message,
+            message=message + explained(status),
             stats=statistics,
             rank=self.rank,
             redundant=self.redundant,

@@ -1,0 +1,47 @@
+"""Configuration of the documentation: make docs."""
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE)]  # the packages, and the generators beside this file
+
+import generate  # noqa: E402
+
+import twoloop  # noqa: E402
+
+project = "twoloop"
+author = "The twoloop contributors"
+copyright = author
+version = release = twoloop.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "generated/extra"]
+html_extra_path = ["generated/extra"]  # the animations of the gallery, copied as they are
+default_role = "py:obj"  # a name in single backticks, as numpydoc has them, is a link where there is such an object
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3  # as on GitHub: a link to page.md#heading works in both
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+autodoc_typehints = "none"  # the docstrings have types and shapes
+autodoc_member_order = "bysource"
+python_maximum_signature_line_length = 100
+
+html_theme = "alabaster"
+html_theme_options = {"description": release, "page_width": "1100px", "fixed_sidebar": True}
+html_show_sourcelink = False
+html_copy_source = False
+
+
+def escape_bars(app, what, name, obj, options, lines):
+    """Let |x| in a docstring be the magnitude that it means, not a substitution of reStructuredText."""
+    for k, line in enumerate(lines):
+        parts = line.split("`")
+        parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
+        lines[k] = "`".join(parts)
+
+
+def setup(app):
+    """Write the generated pages before Sphinx looks for files."""
+    app.connect("config-inited", lambda app, config: generate.write(HERE / "generated"))
+    app.connect("autodoc-process-docstring", escape_bars)

@@ -1,0 +1,53 @@
+"""The page "Which method?": its table and sentences follow the findings."""
+
+import json
+
+import pytest
+
+from studies.which_method import page
+
+SOLVER = {"family": "two-loop", "right": 9, "wrong": 0, "said so": 1, "ratio": 0.1}
+VALIDATION = {"n": 4, "tight": 1e-10, "decades": 2}
+COUNTS = {"WRONG AND SILENT": 2, "HANG": 1}
+
+
+@pytest.fixture
+def text_of(tmp_path):
+    """The page made from findings of validation, and of honesty where they are given."""
+
+    def make(solvers, counts=None):
+        (tmp_path / "validation.json").write_text(json.dumps(VALIDATION | {"solvers": solvers}))
+        if counts is not None:
+            (tmp_path / "honesty.json").write_text(json.dumps({"n_traps": 5, "counts": counts}))
+        return page(tmp_path)
+
+    return make
+
+
+def test_nothing_has_been_run(tmp_path):
+    text = page(tmp_path)
+    assert text.count("not run yet") == 2 and "python -m studies.validation" in text
+
+
+def test_a_line_for_each_method_of_ours_best_first(text_of):
+    bad = SOLVER | {"solver": "BDF", "wrong": 3}
+    good = SOLVER | {"solver": "DOP853 (two-loop)"}
+    text = text_of([bad, good, SOLVER | {"solver": "IDA", "family": "SUNDIALS"}], {"DOP853 (two-loop)": COUNTS})
+    lines = [line for line in text.splitlines() if line.startswith("| `")][:2]
+    assert lines == ["| `DOP853` | 9 | 1 | 0 | 0.10 | 3 |", "| `BDF` | 9 | 1 | 3 | 0.10 | – |"]
+    assert "`IDA`" not in text
+
+
+@pytest.mark.parametrize(
+    ("changed", "said", "unsaid"),
+    [
+        ({}, "Never wrong at the end of a run: `Gauss12`.", "None of the methods"),
+        ({"wrong": 1}, "None of the methods is right on every run", "Never wrong"),
+        ({"ratio": 0.5}, "The median error stays below the tolerance", "ask it"),
+        ({"ratio": 5.0}, "The error exceeds the tolerance in the median of `Gauss12`: ask it", "stays below"),
+    ],
+)
+def test_sentences_follow_the_findings(text_of, changed, said, unsaid):
+    text = text_of([SOLVER | {"solver": "Gauss12"} | changed])
+    assert said in text and unsaid not in text
+    assert "traps" not in text

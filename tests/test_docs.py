@@ -1,0 +1,131 @@
+"""The documentation: its code as printed, its links, what it says of every status, and the generated pages."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from tests.test_pages import blocks
+from twoloop import Result, Status, mechanisms
+from twoloop.result import explained
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted(page.stem for page in DOCS.glob("*.md"))
+ELSEWHERE = {"between_steps": "test_pages.py", "compare": "studies/test_compare.py"}  # whose code other tests run
+WITHOUT_CODE = {"errors", "index", "method", "reference"}
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory):
+    """What the code of a page defines, run once, in a folder of its own."""
+    mpl.use("Agg")
+    made = {}
+
+    def run(page):
+        if page not in made:
+            made[page] = {"__name__": page}
+            with pytest.MonkeyPatch.context() as patch:
+                patch.chdir(tmp_path_factory.mktemp(page))
+                for block in blocks(f"docs/{page}.md"):
+                    exec(block, made[page])
+        return made[page]
+
+    return run
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in ELSEWHERE])
+def test_the_code_of_a_page_runs(page, names, recwarn):
+    assert (len(blocks(f"docs/{page}.md")) == 0) == (page in WITHOUT_CODE)
+    names(page)
+
+
+def test_code_that_is_run_elsewhere_is(names):
+    for page, test in ELSEWHERE.items():
+        assert f"docs/{page}.md" in (DOCS.parent / "tests" / test).read_text(encoding="utf-8")
+
+
+# --- what the pages promise
+
+
+def test_start_here_has_the_right_motion(names):
+    page = names("start")
+    assert page["result"].success and page["other"].success
+    assert page["error"] < 1e-7 and page["violation"] < 1e-13
+    assert np.ptp(page["energies"]) < 1e-6
+    assert page["problem"].q0 == pytest.approx([0.04, -1.0, 1.54, 0.32], abs=0.005)  # as drawn in four_bar.svg
+
+
+def test_every_kind_of_constraint_does_what_its_section_says(names):
+    page = names("constraints")
+    assert "not consistent" in str(page["error_text"])
+    assert "docs/constraints.md#redundant-rows" in str(page["caught"][0].message)
+    assert np.abs(page["bars"] - page["bars"][:, :1]).max() < 1e-9
+    assert np.linalg.matrix_rank(page["system"].mass(0.0, page["q0"])) == 6
+    slope = page["slide"].q[:, -1]
+    scale = 9.81 * np.sin(0.4) / (2.0 * 1.7**2)
+    assert slope == pytest.approx([scale * np.sin(17.0) ** 2, scale * (17.0 - 0.5 * np.sin(34.0)), 17.0], abs=1e-7)
+
+
+def test_the_adapter_of_the_page_has_the_order_of_its_method(names):
+    page = names("benchmark")
+    errors = page["rows"].query("solver == 'RATTLE'")["error_q"].to_numpy()
+    assert errors[0] / errors[1] == pytest.approx(100.0, rel=0.1)
+    assert (page["rows"]["status"] == "REACHED_END").all()
+
+
+# --- statuses
+
+
+@pytest.mark.parametrize("status", [status for status in Status if status < 0], ids=lambda status: status.name)
+def test_every_failure_leads_to_a_section_with_cause_and_remedy(status):
+    assert explained(status) == f" See docs/when_it_fails.md#{status.name.lower()}."
+    text = (DOCS / "when_it_fails.md").read_text(encoding="utf-8")
+    section = re.search(rf"### {status.name}\n(.*?)(?=\n##)", text, re.DOTALL)
+    assert section is not None and {"**Cause.**", "**Remedy.**"} <= set(section[1].split())
+
+
+def test_the_message_of_a_failed_run_ends_with_it(names):
+    result = names("when_it_fails")["result"]
+    assert result.status is Status.NOT_FINITE
+    assert result.message.endswith(explained(Status.NOT_FINITE))
+
+
+def test_success_is_not_explained():
+    assert explained(Status.REACHED_END) == explained(Status.EVENT) == ""
+
+
+# --- links, and what is generated
+
+
+def test_links_lead_to_files_that_are_there():
+    """Also on GitHub, but for the pages that only the build makes; headings are checked by the build."""
+    for page in PAGES:
+        text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+        for link in re.findall(r"\]\(([^)#]+)", text):
+            if not link.startswith(("http", "generated/")):
+                assert (DOCS / link).is_file(), f"{page}.md: {link}"
+
+
+def generator(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_gallery_shows_every_ready_mechanism(tmp_path, monkeypatch):
+    gallery = generator("gallery")
+    monkeypatch.setattr(gallery, "LONGEST", 0.01)  # s: whole motions are for the build
+    gallery.write(tmp_path / "gallery.md", tmp_path / "animations")
+    text = (tmp_path / "gallery.md").read_text(encoding="utf-8")
+    makers = {name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam"}
+    assert {line[3:] for line in text.splitlines() if line.startswith("## ")} == makers
+    assert text.count("- *Tests*: ") == len(makers)
+    if hasattr(Result, "animate"):
+        assert {file.stem for file in (tmp_path / "animations").iterdir()} == makers
+        assert all(f"../animations/{name}.html" in text for name in makers)
