@@ -12,10 +12,8 @@ from studies.store import Output
 
 # claims and compare_page read the others' rows
 STUDIES = (
-    *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam"),
-    *("validation", "honesty", "planted_errors", "sweep_linkages", "claims", "compare_page"),
-    *("validation", "honesty", "planted_errors", "symbolic_size", "claims"),
-    *("validation", "honesty", "robustness", "planted_errors", "claims"),
+    *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam", "validation"),
+    *("honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "claims", "compare_page"),
 )
 CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen
     ("smooth",): "smooth, rigid",

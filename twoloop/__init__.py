@@ -5,8 +5,8 @@ from twoloop.callbacks import callback
 from twoloop.citations import citation
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
-from twoloop.esdirk import ESDIRK
 from twoloop.drawing import Drawing
+from twoloop.esdirk import ESDIRK
 from twoloop.joints import Joint
 from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.projection import ConsistentState, consistent_state

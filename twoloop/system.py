@@ -21,9 +21,8 @@ from twoloop.adapters import (
 )
 from twoloop.bounds import check_callback
 from twoloop.callbacks import KINDS, STATE, stand_in
-from twoloop.checks import check_number, check_real, check_size
-from twoloop.description import Description
 from twoloop.checks import check_flag, check_number, check_real, check_size
+from twoloop.description import Description
 from twoloop.jacobian import differenced_jacobian
 from twoloop.joints import Joint, check_joints
 from twoloop.kernels.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
