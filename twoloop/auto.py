@@ -18,7 +18,10 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
     from twoloop.kernels import switching as kernels
 
     plans = (first, second)
-    each = [[plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse] for plan in plans]
+    each = [
+        [plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse, plan.predictive * plan.least_error]
+        for plan in plans
+    ]
     return replace(
         first,
         step=kernels.switching_step,

@@ -12,6 +12,7 @@ from twoloop.plan import INNER_TOL, Plan, check_tolerances, least_tolerance
 Array = NDArray[np.float64]
 
 OUTER_SHARE = 3.0  # of the tolerance: the correction that is this small is still made, and convergence is quadratic
+LOOSEST_OUTER = 3e-3  # relative: with larger corrections stiff problems are solved so badly that steps become short
 OUTER_TOL_FIXED = 1e-12  # relative; stiff forces magnify rounding
 SAFETY = 0.8  # with 0.9 one attempt in seven is refused where the motion is not smooth, as of the stiff beam
 
@@ -61,7 +62,7 @@ class ESDIRK:
         None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when the correction just made changes no independent position by more than this, relative
-        to max(|value|, 1). None: 3 min(rtol, atol); with fixed steps 1e-12.
+        to max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3; with fixed steps 1e-12.
 
     tested : {"all", "positions"}
         What the error estimate is taken over: positions and velocities, or positions only. Stiff vibrations that do not
@@ -102,7 +103,7 @@ class ESDIRK:
         A, embedded = make()
         outer_tol = self.outer_tol
         if outer_tol is None:
-            outer_tol = OUTER_TOL_FIXED if fixed else OUTER_SHARE * least_tolerance(rtol, atol)
+            outer_tol = OUTER_TOL_FIXED if fixed else min(OUTER_SHARE * least_tolerance(rtol, atol), LOOSEST_OUTER)
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
             kernels.diagonal_step,

@@ -114,7 +114,7 @@ def _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, esti
     return e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
 
-@kernel(STEP)
+@kernel(STEP, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt; one that the estimate refuses ends without the accelerations at its end."""
     s, A, b, c, fine, coarse = _tableau(options)

@@ -29,6 +29,8 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.linalg import copy
 
+KEPT = 1.2  # see advance.py
+JUST_REFUSED = 1.0 + 1e-9
 SAFETY_OF_ALL = 0.8  # of advance(); no method of a pair has less
 EARLY = 100.0  # evaluations before the first look at the rate
 INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
@@ -52,7 +54,7 @@ EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 # places in `options`: of the pair, then SAFETY ... REUSE_OF of the first and of the second method; then their options
 # LIMIT: h rho from which on the implicit method is tried
 LIMIT, MATRIX_COST, SIZE_1, N_PAIR = range(4)
-SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, N_OF_EACH = range(6)
+SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, LEAST_ERROR, N_OF_EACH = range(7)  # LEAST_ERROR 0: no trend
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
 # places in `memory`: advance() sets LAST_ACCEPTED; behind the scalars two directions (n_q), then the two memories
@@ -69,15 +71,19 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     RATE,  # the last one found, 1 / s
     FIRST_MEMORY,
     H_MEAN,
+    H_BEFORE,  # size and error of the last accepted step of this phase
+    ERROR_BEFORE,
+    H_TRIED,
+    ERROR_TRIED,
     N_TRIALS,
     N_SCALARS,
-) = range(14)
+) = range(18)
 
 
 def switching_options(
     limit: float, matrix_cost: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """`options`: of the pair, the cost of a Newton matrix in evaluations, then five numbers of each, then their own."""
+    """`options`: of the pair, the cost of a Newton matrix in evaluations, then six numbers of each, then their own."""
     first = np.asarray(first, dtype=np.float64)
     scalars = [limit, matrix_cost, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
@@ -157,6 +163,7 @@ def _enter(w, options, memory, n, phase, t):
     """Begin another phase; its method knows nothing of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
+    memory[ERROR_BEFORE] = 0.0
     memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
 
@@ -205,6 +212,19 @@ def _restart(memory):
         memory[i] = 0.0
 
 
+@compiled
+def _factor(memory, each, h, error):
+    """The step factor as advance() would choose it for the method alone, from the error and its trend."""
+    if error == 0.0:
+        return each[FACTOR_MAX]
+    factor = each[SAFETY] * error ** -each[EXPONENT]
+    if error <= 1.0 and each[LEAST_ERROR] > 0.0 and memory[ERROR_BEFORE] > 0.0:
+        trend = h / memory[H_BEFORE] * (memory[ERROR_BEFORE] / error) ** each[EXPONENT]
+        factor = min(factor, factor * trend)
+    factor = min(each[FACTOR_MAX], max(each[FACTOR_MIN], factor))
+    return 1.0 if each[LEAST_ERROR] > 0.0 and error <= 1.0 and 1.0 <= factor <= KEPT else factor
+
+
 @kernel(STEP)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by one of the two; the error is returned such that advance() takes the step which that method wants.
@@ -214,6 +234,8 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     first, second = _memories(memory, n)
     memory[STEPS] += memory[LAST_ACCEPTED]
+    if memory[LAST_ACCEPTED] == 1.0:
+        memory[H_BEFORE], memory[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
     if memory[LAST_ACCEPTED] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
@@ -245,9 +267,8 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return code, error
     if memory[PHASE] == ON_TRIAL:
         error *= STRICT
-    factor = each[FACTOR_MAX]
-    if error > 0.0:
-        factor = min(factor, max(each[FACTOR_MIN], each[SAFETY] * error ** -each[EXPONENT]))
+    memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
+    factor = _factor(memory, each, h, error)
     if error > 1.0:
-        return code, max(1.0 + 1e-9, SAFETY_OF_ALL / factor)
+        return code, max(JUST_REFUSED, SAFETY_OF_ALL / factor)
     return code, min(1.0, SAFETY_OF_ALL / factor)
