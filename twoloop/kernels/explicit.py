@@ -16,8 +16,8 @@ from twoloop.kernels.predictor import departure, keep_predicted
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
-# vectors (n_q) in `memory` after memory[0], which is advance()'s; then V and A of the stages (s, n_q each)
-Q_STAGE, ESTIMATED, N_VECTORS = range(3)
+# vectors (2 n_q) in `memory` after memory[0], which is advance()'s; then the slopes of the stages, (s, 2 n_q)
+STAGE, ESTIMATED, N_VECTORS = range(3)
 
 
 def options_array(
@@ -43,7 +43,7 @@ def options_array(
 
 def memory_size(s: int, n_q: int) -> int:
     """Length of `memory` for s stages and n_q coordinates."""
-    return 1 + (N_VECTORS + 2 * s) * n_q
+    return 1 + (N_VECTORS + s) * 2 * n_q
 
 
 @inlined
@@ -58,14 +58,14 @@ def _tableau(options):
 
 @inlined
 def _vector(memory, n, which):
-    return memory[1 + which * n : 1 + (which + 1) * n]
+    return memory[1 + which * 2 * n : 1 + (which + 1) * 2 * n]
 
 
 @inlined
-def _stages(memory, s, n):
-    """Velocities and accelerations of the stages."""
-    o = 1 + N_VECTORS * n
-    return memory[o : o + s * n].reshape((s, n)), memory[o + s * n : o + 2 * s * n].reshape((s, n))
+def _slopes(memory, s, n):
+    """Velocities and accelerations of the stages, side by side."""
+    o = 1 + N_VECTORS * 2 * n
+    return memory[o:].reshape((s, 2 * n))
 
 
 @compiled
@@ -92,25 +92,24 @@ def _move(y, h, weights, slopes, y1):
 def _largest(tolerances, h, weights, y, y1, slopes, estimate):
     """Largest component of h times the weighted sum of the slopes over atol + rtol |y|."""
     _weighted(weights, slopes, estimate)
+    n = estimate.size // 2
     largest = 0.0
-    for m in range(y.size):
-        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
-        largest = max(largest, abs(h * estimate[m]) / scale)
+    for m in range(n):
+        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
+        largest = max(largest, abs(h * estimate[m]) / (atol + rtol * max(abs(y[m]), abs(y1[m]))))
+        k = n + m
+        largest = max(largest, abs(h * estimate[k]) / (atol + rtol * max(abs(y[k]), abs(y1[k]))))
     return largest
 
 
 @compiled
-def _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, estimate):
+def _error(tolerances, h, fine, coarse, y, y1, slopes, estimate):
     """e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
 
     Taken component by component it would be e, of low order, where d passes through zero: up to 30 % more evaluations.
     """
-    n = estimate.size
-    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
-    e = _largest(tolerances, h, fine, q, q1, V_stage, estimate)
-    e = max(e, _largest(tolerances, h, fine, v, v1, A_stage, estimate))
-    d = _largest(tolerances, h, coarse, q, q1, V_stage, estimate)
-    d = max(d, _largest(tolerances, h, coarse, v, v1, A_stage, estimate))
+    e = _largest(tolerances, h, fine, y, y1, slopes, estimate)
+    d = _largest(tolerances, h, coarse, y, y1, slopes, estimate)
     return e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
 
@@ -119,28 +118,26 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt; one that the estimate refuses ends without the accelerations at its end."""
     s, A, b, c, fine, coarse = _tableau(options)
     n = w.Q.size
-    q, v = state[:n], state[n : 2 * n]
+    q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    q_stage, estimate = _vector(memory, n, Q_STAGE), _vector(memory, n, ESTIMATED)
-    V_stage, A_stage = _stages(memory, s, n)
+    stage, estimate = _vector(memory, n, STAGE), _vector(memory, n, ESTIMATED)
+    slopes = _slopes(memory, s, n)
     w.counters[N_OUTER] += 1
-    copy(v, V_stage[0])
-    copy(state[2 * n : 3 * n], A_stage[0])
+    copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        # dependents too: where Newton starts
-        _move(q, h, A[j, :j], V_stage, q_stage)
-        _move(v, h, A[j, :j], A_stage, V_stage[j])
+        _move(y, h, A[j, :j], slopes, stage)  # dependents too: where Newton starts
+        v_stage, a_stage = slopes[j, :n], slopes[j, n:]
+        copy(stage[n:], v_stage)
         if options[FREE] == 1.0:
-            code = evaluate_there(f, w, t + c[j] * h, q_stage, V_stage[j], A_stage[j])
+            code = evaluate_there(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
         else:
-            code = evaluate(f, w, t + c[j] * h, q_stage, V_stage[j], options[INNER_TOL], A_stage[j])
+            code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:
             return code, np.inf
-    _move(q, h, b, V_stage, q1)
-    _move(v, h, b, A_stage, v1)
+    _move(y, h, b, slopes, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, state, new_state, V_stage, A_stage, estimate)
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, estimate)
         if not error <= 1.0:
             return DONE, error
     keep_predicted(w, q1)
