@@ -27,6 +27,7 @@ from twoloop.kernels.common import (
     N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
+    NEARLY_SINGULAR,
     NOT_FINITE,
     ORIENTATION,
     ORIENTATION_NEW,
@@ -57,6 +58,7 @@ from twoloop.kernels.partition import CHANGED, partition_is_poor
 ) = range(8)
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
+COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
 FADING = 0.98  # of the longest step, with each accepted one
 KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
@@ -295,6 +297,14 @@ def advance(
             if partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
                 return RANK_LOST
             clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+            if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+                w.notes[NEARLY_SINGULAR] = 1.0
+            if size < COLLAPSED * clock[H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[BRIDGE] == 1.0:
+                # a motion may go straight towards a singular position, and its partition show nothing of it
+                if renew_partition(f, w, clock[T], state[:n]) != DONE:
+                    return RANK_LOST
+                if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+                    w.notes[NEARLY_SINGULAR] = 1.0
             short = size < SHORT * clock[H_LONG] and not fixed and not lands
             if short and _near_singular(w, control, clock):
                 return NEAR_SINGULAR

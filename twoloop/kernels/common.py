@@ -141,9 +141,10 @@ def _type_of_work(value: Any, context: Any) -> Any:
     RANK_V,
     CONTRADICTION,  # row that was taken for redundant and is violated
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     N_NOTES,
-) = range(19)
+) = range(20)
 
 # what a kernel returns: DONE, or why it could not
 (

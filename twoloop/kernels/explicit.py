@@ -10,7 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.calls import evaluate, evaluate_state, evaluate_there, project
-from twoloop.kernels.common import ATOL, DEPARTURE, DONE, ESTIMATE, N_OUTER, RTOL, STEP, compiled, inlined, kernel
+from twoloop.kernels.common import (
+    ATOL,
+    DEPARTURE,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    NEARLY_SINGULAR,
+    RTOL,
+    STEP,
+    compiled,
+    inlined,
+    kernel,
+)
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure, keep_predicted
 
@@ -122,13 +134,15 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     stage, estimate = _vector(memory, n, STAGE), _vector(memory, n, ESTIMATED)
     slopes = _slopes(memory, s, n)
+    # near a singular position it matters on which side of it a stage is, and how well velocities keep to the rows
+    free = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] == 0.0
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
         _move(y, h, A[j, :j], slopes, stage)  # dependents too: where Newton starts
         v_stage, a_stage = slopes[j, :n], slopes[j, n:]
         copy(stage[n:], v_stage)
-        if options[FREE] == 1.0:
+        if free:
             code = evaluate_there(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
         else:
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
@@ -141,7 +155,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= 1.0:
             return DONE, error
     keep_predicted(w, q1)
-    if options[FREE] == 1.0:
+    if free:
         code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     else:
         code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)

@@ -31,6 +31,7 @@ from twoloop.kernels.stages import (
     INNER_TOL,
     OUTER_TEST,
     OUTER_TOL,
+    STAGES,
     end_error,
     interpolate,
     tableau_of,
@@ -231,6 +232,8 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
     """The error of the two half steps and, with EXTRAPOLATION, their extrapolation with the whole step."""
     share = options[EXTRAPOLATION]
+    if share == EMBEDDED:
+        share = 1.0 / (2.0 ** (options[STAGES] + options[DECAY] * (options[STAGES] - 1.0)) - 1.0)
     error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
     if not (share > 0.0 and error <= 1.0):
         return DONE, error
@@ -276,7 +279,9 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code != DONE:
         return code, np.inf
     error = 0.0
-    if tolerances[ESTIMATE] == 1.0 and options[EXTRAPOLATION] != EMBEDDED:
+    # where velocities follow from rows of A, positions do not have the order that end_error goes by
+    embedded = options[EXTRAPOLATION] == EMBEDDED and w.Rate.size == w.C.size
+    if tolerances[ESTIMATE] == 1.0 and not embedded:
         copy(q1, q_full)
         copy(v1, v_full)
         for j in range(s):
@@ -299,7 +304,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         seen = end_error(tolerances, options[DECAY], c, h, state, new_state, trial, weights, q_mid)
-        error = max(error, (SHARE_OF_ENDS if options[EXTRAPOLATION] == EMBEDDED else SHARE_BESIDE) * seen)
+        error = max(error, (SHARE_OF_ENDS if embedded else SHARE_BESIDE) * seen)
     return code, max(error, w.notes[DEPARTURE])
 
 
