@@ -107,7 +107,6 @@ def sweep(
     TypeError, ValueError
         If an argument is wrong, functions cannot be sent to other processes, or `out` holds another sweep.
     """
-    pandas = needed("pandas", "pandas", "sweep")
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)
     n_workers = (os.cpu_count() or 1) if workers is None else check_size("workers", workers, 1)
@@ -116,6 +115,7 @@ def sweep(
     work: Work = (problem_of, measure, options)
     if client is not None or parallel == "processes":
         _check_pickles(work)
+    pandas = needed("pandas", "pandas", "sweep")
     path = None if out is None else Path(out)
     settings = saved_sweep.settings(work)
     rows: dict[int, Row] = {} if path is None else saved_sweep.read(pandas, path, given, settings)
