@@ -10,12 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.problems import swing
 from twoloop import solve_dae
 from twoloop.animation import projected
 from twoloop.mechanisms import pendulum, spatial_slider_crank
+
+Image = pytest.importorskip("PIL.Image")  # not among the oldest versions
 
 # a document with what the page asks of it; counts what is drawn, and lets time pass frame by frame
 DOCUMENT = """

@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import twoloop
@@ -13,6 +12,9 @@ from twoloop import kernels
 from twoloop.__main__ import main
 from twoloop.caches import folder_of
 from twoloop.mechanisms import four_bar
+
+pd = pytest.importorskip("pandas")  # not among the oldest versions
+pytest.importorskip("matplotlib")
 
 ROOT = Path(__file__).parents[1]
 FILE = """

@@ -1,13 +1,14 @@
 """Many runs at once: the same numbers as one by one, failures as rows, and going on after an interruption."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import twoloop
 from tests.problems import pendulum as bare_pendulum
 from twoloop import saved_sweep, solve_dae, sweep, sweeps
 from twoloop.mechanisms import Problem, four_bar, pendulum
+
+pd = pytest.importorskip("pandas")  # not among the oldest versions
 
 ANGLES = [{"theta3": angle} for angle in (0.0, 0.1, 2.0, -0.2, 0.3, 0.05)]  # 2.0 cannot be assembled
 MADE = []  # by `counted`, of threads

@@ -16,6 +16,9 @@ from twoloop import solve_dae
 from twoloop.mechanisms import knife_edge, rolling_disc
 from twoloop.plotting import violation
 
+pytest.importorskip("pandas")  # not among the oldest versions
+pytest.importorskip("matplotlib")
+
 
 @pytest.fixture(scope="module")
 def result(default_four_bar):

@@ -1,5 +1,7 @@
 """What is drawn of the ready mechanisms: bars keep their lengths, pins stay, and lines meet where joints are."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,15 @@ def test_many_states_at_once_are_those_one_by_one(name):
     assert both.shape[1] == (2 if "planar" in problem.tags else 3)
     for k in range(2):
         np.testing.assert_allclose(both[..., k], problem.drawing.at(q[:, k]), rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_problems_can_be_sent_to_other_processes(name):
+    problem = MADE[name]
+    other = pickle.loads(pickle.dumps(problem))
+    np.testing.assert_array_equal(other.drawing.at(problem.q0), problem.drawing.at(problem.q0))
+    assert other.energy(0.0, other.q0, other.v0) == problem.energy(0.0, problem.q0, problem.v0)
+    assert other.system.description.coordinates == problem.coordinates == other.coordinates
 
 
 def test_four_bar_from_pin_to_pin():
