@@ -12,7 +12,7 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 from sympy import Basic
 
-from twoloop.checks import check_flag, check_text
+from twoloop.checks import check_flag, check_text, check_vector
 from twoloop.generated import GeneratedCode, GeneratedEnergy
 from twoloop.mechanisms.problem import Problem
 from twoloop.projection import consistent_state
@@ -123,15 +123,16 @@ class SymbolicMechanism:
         TypeError, ValueError
             If a coordinate is unknown, or no consistent state is found.
         """
+        start, end = check_vector("t_span", t_span, 2).tolist()
         places = [self._place("keep", each) for each in keep]
         q, v = self._state("q0", q0), self._state("v0", v0)
-        q, v = consistent_state(self.system, t_span[0], q, v, keep=places or None)
+        q, v = consistent_state(self.system, start, q, v, keep=places or None)
         return Problem(
             name=self.name,
             system=self.system,
             q0=q,
             v0=v,
-            t_span=t_span,
+            t_span=(start, end),
             energy=self.energy,
             parameters=dict(self.parameters),
             note=note,
