@@ -22,7 +22,7 @@ def from_lagrangian(
     dissipation: Any = 0,
     nonholonomic: Any = (),
     parameters: Mapping[Any, Any] | None = None,
-    tangents: bool = True,
+    tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
     """Derive M and Q from energies, all derivatives of the constraints, and make a compiled system of them.
@@ -48,7 +48,8 @@ def from_lagrangian(
     parameters : mapping
         From every other symbol to its value. The values can be changed later without compiling again.
     tangents : bool
-        Whether to derive the tangents of the force and of the reactions for Newton's method.
+        Whether to derive the tangents of the force and of the reactions for Newton's method. For stiff forces: they
+        save differences, and double or triple the code; fixed steps in which bodies turn far converge better without.
     name : str
         Shown in messages.
 

@@ -28,7 +28,7 @@ def from_matrices(
     potential: Any = 0,
     conserved: bool = False,
     parameters: Mapping[Any, Any] | None = None,
-    tangents: bool = True,
+    tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
     """Make a compiled system of M u' = Q, and derive all derivatives of the constraints.
@@ -58,7 +58,8 @@ def from_matrices(
     parameters : mapping
         From every other symbol to its value. The values can be changed later without compiling again.
     tangents : bool
-        Whether to derive the tangents of the force and of the reactions for Newton's method.
+        Whether to derive the tangents of the force and of the reactions for Newton's method. For stiff forces: they
+        save differences, and double or triple the code; fixed steps in which bodies turn far converge better without.
     name : str
         Shown in messages.
 

@@ -19,7 +19,7 @@ def from_method(
     potential: Any = 0,
     conserved: bool = False,
     parameters: Mapping[Any, Any] | None = None,
-    tangents: bool = True,
+    tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
     """Make a compiled system of what sympy.physics.mechanics describes.
