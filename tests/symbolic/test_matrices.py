@@ -81,12 +81,15 @@ def test_kanes_method_with_linear_kinematics(of_rate):
     frame, q, u, kinematic, bodies, loads = particles(of_rate)
     kane = me.KanesMethod(frame, q, u, kd_eqs=kinematic)
     kane.kanes_equations(bodies, loads)
-    made = from_method(kane, constraints=constraints, potential=V, parameters=VALUES, conserved=True)
+    made = from_method(kane, constraints=constraints, potential=V, parameters=VALUES)
     same(made, from_lagrangian(T, V, constraints, coordinates, parameters=VALUES))
     q, v = np.array([0.3, 0.8]), np.array([1.0, -2.0])
     known = from_lagrangian(T, V, [], coordinates, parameters=VALUES)
     assert made.energy(0.0, q, v) == pytest.approx(known.energy(0.0, q, v), rel=1e-13)
-    assert made.conserved
+    assert not made.conserved  # the rail moves
+    free = from_method(kane, potential=V, parameters=VALUES)
+    assert free.conserved
+    assert not from_method(kane, parameters=VALUES).conserved  # without the potential
 
 
 def test_a_system_brings_its_constraints():
@@ -131,3 +134,4 @@ def test_euler_parameters_with_angular_velocities_as_speeds():
         tangent @ evaluated(known, "force", 0.0, q, v), rel=1e-12, abs=1e-12
     )
     assert made.energy(0.0, q, v) == pytest.approx(known.energy(0.0, q, v), rel=1e-13)
+    assert made.conserved

@@ -28,6 +28,8 @@ class Equations:
     W : sequence (n_a,)
         The non-holonomic ones, A v + b, linear in v.
     energy : expression
+    conserved : bool
+        Whether it is an invariant.
     """
 
     symbols: Reader
@@ -36,6 +38,7 @@ class Equations:
     C: Sequence[Expr]
     W: Sequence[Expr]
     energy: Expr
+    conserved: bool
 
     @property
     def constant_mass(self) -> bool:
@@ -48,7 +51,12 @@ class Equations:
         tangents = tangents and not self.W  # Newton's method takes none beside non-holonomic rows
         arrays = self._callbacks() | (self._tangents() if tangents else {})
         constant = self.constant_mass
-        parts = [f"CONSTANT_MASS = {constant}\nBANDWIDTH = {self._bandwidth() if constant else None}\n"]
+        known = {
+            "CONSTANT_MASS": constant,
+            "BANDWIDTH": self._bandwidth() if constant else None,
+            "CONSERVED": self.conserved,
+        }
+        parts = ["".join(f"{name} = {value}\n" for name, value in known.items())]
         parts += [callback_source(kind, each) for kind, each in arrays.items()]
         return "\n\n".join([*parts, energy_source(self.energy)])
 

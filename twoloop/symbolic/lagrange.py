@@ -78,17 +78,17 @@ def from_lagrangian(
         rate, n = along(momenta, x), len(x.q)
         Q = [d.by(kinetic - potential, x.q[i]) - rate[i] - d.by(lost, x.v[i]) + F[i] for i in range(n)]
         mass = sympy.ImmutableMatrix(n, n, lambda i, j: M.get((i, j), ZERO))
-        return Equations(x, mass, Q, C, W, kinetic + potential)
+        still = dict.fromkeys(x.v, ZERO)
+        steady = not any(each.has(x.t) for each in (kinetic, potential, *C, *W))
+        homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *momenta, *W))
+        conserved = steady and homogeneous and lost == 0 and not any(F)
+        return Equations(x, mass, Q, C, W, kinetic + potential, conserved)
 
-    still = dict.fromkeys(x.v, ZERO)
-    steady = not any(each.has(x.t) for each in (kinetic, potential, *C, *W))
-    homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *momenta, *W))
     return made(
         x,
         ["Lagrange", kinetic, potential, lost, F, C, W],
         derive,
         rows=(len(C), len(W)),
-        conserved=steady and homogeneous and lost == 0 and not any(F),
         tangents=tangents,
         name=name,
     )
