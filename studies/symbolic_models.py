@@ -40,7 +40,7 @@ def rates(coordinates: Sequence[Any]) -> list[Any]:
     return [each.diff(t) for each in coordinates]
 
 
-def symbolic_four_bar() -> tuple[Problem, SymbolicMechanism]:
+def symbolic_four_bar(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
     problem = four_bar()
     q = dynamicsymbols("x1 y1 th1 x2 y2 th2 x3 y3 th3")
     lengths, ground, g = sp.symbols("L1:4"), sp.Symbol("L"), sp.Symbol("g")
@@ -54,10 +54,12 @@ def symbolic_four_bar() -> tuple[Problem, SymbolicMechanism]:
         constraints += [px - x - dx, py - y - dy]
         x, y = x + 2 * dx, y + 2 * dy
     values = dict(zip([*lengths, ground, g], [1.0, 2.0, 1.5, 3.0, 9.81], strict=True))
-    return problem, from_lagrangian(T, V, [*constraints, y, x - ground], q, parameters=values, name="four-bar")
+    return problem, from_lagrangian(
+        T, V, [*constraints, y, x - ground], q, parameters=values, tangents=tangents, name="four-bar"
+    )
 
 
-def symbolic_slider_crank() -> tuple[Problem, SymbolicMechanism]:
+def symbolic_slider_crank(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
     """With a spring, a damper and a constant force: forces, dissipation and potential each have their part."""
     problem = sundials_slider_crank()
     q = crank, slider, rod = dynamicsymbols("crank slider rod")
@@ -73,12 +75,13 @@ def symbolic_slider_crank() -> tuple[Problem, SymbolicMechanism]:
         q,
         dissipation=c * length.diff(t) ** 2 / 2,
         parameters={symbol: problem.parameters[symbol.name] for symbol in p},
+        tangents=tangents,
         name="slider-crank",
     )
     return problem, mechanism
 
 
-def symbolic_driven_crank() -> tuple[Problem, SymbolicMechanism]:
+def symbolic_driven_crank(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
     problem = driven_crank()
     q = x1, y1, th1, x2, y2, th2 = dynamicsymbols("x1 y1 th1 x2 y2 th2")
     u1, v1, w1, u2, v2, w2 = rates(q)
@@ -96,10 +99,12 @@ def symbolic_driven_crank() -> tuple[Problem, SymbolicMechanism]:
     known = problem.parameters
     numbers = [known["crank"], known["rod"], *known["masses"], known["gravity"], *known["drive"].values()]
     values = dict(zip(p, numbers, strict=True))
-    return problem, from_lagrangian(T, g * (m1 * y1 + m2 * y2), constraints, q, parameters=values, name="driven crank")
+    return problem, from_lagrangian(
+        T, g * (m1 * y1 + m2 * y2), constraints, q, parameters=values, tangents=tangents, name="driven crank"
+    )
 
 
-def symbolic_knife_edge() -> tuple[Problem, SymbolicMechanism]:
+def symbolic_knife_edge(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
     problem = knife_edge()
     q = x, _, angle = dynamicsymbols("x y angle")
     u, v, w = rates(q)
@@ -111,12 +116,13 @@ def symbolic_knife_edge() -> tuple[Problem, SymbolicMechanism]:
         q,
         nonholonomic=[u * sp.sin(angle) - v * sp.cos(angle)],
         parameters=dict(zip((m, J, pull), problem.system.parameters.tolist(), strict=True)),
+        tangents=tangents,
         name="knife edge",
     )
     return problem, mechanism
 
 
-def symbolic_rolling_disc() -> tuple[Problem, SymbolicMechanism]:
+def symbolic_rolling_disc(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
     problem = rolling_disc()
     q = dynamicsymbols("x y z yaw lean spin")
     z, yaw, lean = q[2:5]
@@ -131,7 +137,7 @@ def symbolic_rolling_disc() -> tuple[Problem, SymbolicMechanism]:
     values = dict(zip((m, R, g), (known["mass"], known["radius"], known["gravity"]), strict=True))
     holonomic = [z - R * sp.cos(lean)]
     return problem, from_lagrangian(
-        T, m * g * z, holonomic, q, nonholonomic=slip, parameters=values, name="rolling disc"
+        T, m * g * z, holonomic, q, nonholonomic=slip, parameters=values, tangents=tangents, name="rolling disc"
     )
 
 
@@ -149,7 +155,7 @@ def rotation(e: Sequence[Any]) -> sp.Matrix:
     return (e0**2 - f.dot(f)) * sp.eye(3) + 2 * f * f.T + 2 * e0 * cross
 
 
-def symbolic_heavy_top() -> tuple[Problem, SymbolicMechanism]:
+def symbolic_heavy_top(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
     problem = heavy_top()
     x, e = dynamicsymbols("x y z"), dynamicsymbols("e0:4")
     m, length, g, *J = sp.symbols("m length g J1:4")
@@ -159,10 +165,12 @@ def symbolic_heavy_top() -> tuple[Problem, SymbolicMechanism]:
     known = problem.parameters
     values = dict(zip((m, length, g, *J), (known["mass"], known["length"], 9.81, *known["inertia"]), strict=True))
     constraints = [(sum(each**2 for each in e) - 1) / 2, *pivot]
-    return problem, from_lagrangian(T, m * g * x[2], constraints, [*x, *e], parameters=values, name="heavy top")
+    return problem, from_lagrangian(
+        T, m * g * x[2], constraints, [*x, *e], parameters=values, tangents=tangents, name="heavy top"
+    )
 
 
-MODELS: dict[str, Callable[[], tuple[Problem, SymbolicMechanism]]] = {
+MODELS: dict[str, Callable[..., tuple[Problem, SymbolicMechanism]]] = {
     "four-bar": symbolic_four_bar,
     "slider-crank with spring and damper": symbolic_slider_crank,
     "driven crank": symbolic_driven_crank,
@@ -172,7 +180,7 @@ MODELS: dict[str, Callable[[], tuple[Problem, SymbolicMechanism]]] = {
 }
 
 
-def chain_of_positions(n: int, tangents: bool = True) -> SymbolicMechanism:
+def chain_of_positions(n: int, tangents: bool = False) -> SymbolicMechanism:
     """`closed_chain(n)`: point masses on massless links, in Cartesian coordinates."""
     names = " ".join(f"x{i} y{i}" for i in range(n))
     q = dynamicsymbols(names)
@@ -185,7 +193,7 @@ def chain_of_positions(n: int, tangents: bool = True) -> SymbolicMechanism:
     return from_lagrangian(T, V, links, q, parameters=values, tangents=tangents, name=f"closed chain of {n}")
 
 
-def chain_of_angles(n: int, tangents: bool = True) -> SymbolicMechanism:
+def chain_of_angles(n: int, tangents: bool = False) -> SymbolicMechanism:
     """n + 1 uniform links whose ends are pinned, in the angles of the links: a full mass matrix, two constraints."""
     q = dynamicsymbols(f"a0:{n + 1}")
     m, length, g, span = sp.symbols("m length g span")

@@ -94,6 +94,8 @@ SYMBOLIC = [
         REAL,
         constraints=[sp.gamma(x)],
     ),
+    case("V=oo", "V must be made of real numbers, powers and", REAL, V=sp.oo),
+    case("V=nan", "V must be made of real numbers, powers and", REAL, V=sp.nan),
     case("forces={x: -sign(x')}", r"forces\[x\(t\)\] must be smooth; given sign", SMOOTH, forces={x: -sp.sign(xd)}),
     case("forces=[0]", "forces must have 2 entries, one for each coordinate; given 1", "give one each", forces=[0]),
     case(
@@ -121,7 +123,7 @@ SYMBOLIC = [
         TypeError,
         coordinates=sp.symbols("x y"),
     ),
-    case("coordinates=[x, x]", "coordinates must differ", "name each once", coordinates=[x, x]),
+    case("coordinates=[x, x]", "coordinates must differ in their names", "name each once", coordinates=[x, x]),
     case("coordinates=[]", "coordinates must name at least one", "name them", coordinates=[]),
     case(
         "parameters={'m': 1.0}",
@@ -200,6 +202,14 @@ SYMBOLIC += [
         ValueError,
         "parameters must be of m, g, L; given mass",
         "use the symbols, or their names",
+    ),
+    Case(
+        "symbolic.SymbolicMechanism",
+        "`problem(..., t_span=2.0)`",
+        lambda: lagrangian().problem([1.0, 0.0], [0.0, 0.0], 2.0),
+        ValueError,
+        r"t_span must have shape \(2,\)",
+        "give (start, end)",
     ),
     Case(
         "symbolic.SymbolicMechanism",

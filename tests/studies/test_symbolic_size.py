@@ -24,7 +24,7 @@ def text(rows):
 def test_sentences_turn_with_the_rows():
     given = text(rows())
     assert "All chains up to n = 5 were made" in given
-    assert "compiling takes 30 s with them and 3.0 s without" in given
+    assert "compiling takes 30 s with them (`tangents=True`) and 3.0 s without" in given
     assert "always less than 2.0 s" in given
     assert "nowhere more than 1.2 times. Counts of evaluations are the same." in given
     worse = rows()

@@ -51,8 +51,9 @@ def test_kinematics_is_what_the_separate_callbacks_give(pair):
             assert given == pytest.approx(expected, rel=1e-13, abs=1e-13 * max(1.0, np.abs(expected).max()))
 
 
-def test_tangents_are_the_derivatives(pair):
-    problem, mechanism = pair
+@pytest.mark.parametrize("name", list(MODELS))
+def test_tangents_are_the_derivatives(name):
+    problem, mechanism = MODELS[name](tangents=True)
     n, small = problem.system.n_q, 1e-6
     if problem.system.n_a > 0:
         assert "force_by_q" not in mechanism.code.kinds  # Newton's method would not ask for it

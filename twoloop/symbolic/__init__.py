@@ -3,7 +3,9 @@
 try:
     import sympy
 except ImportError as error:
-    raise ImportError("twoloop.symbolic needs SymPy: pip install 'twoloop[symbolic]', or pip install sympy") from error
+    raise ImportError(
+        "twoloop.symbolic needs SymPy: pip install sympy, or this project with its extra: pip install '.[symbolic]'"
+    ) from error
 
 from twoloop.symbolic.lagrange import from_lagrangian
 from twoloop.symbolic.matrices import from_matrices

@@ -28,6 +28,8 @@ class Equations:
     W : sequence (n_a,)
         The non-holonomic ones, A v + b, linear in v.
     energy : expression
+    conserved : bool
+        Whether it is an invariant.
     """
 
     symbols: Reader
@@ -36,6 +38,7 @@ class Equations:
     C: Sequence[Expr]
     W: Sequence[Expr]
     energy: Expr
+    conserved: bool
 
     @property
     def constant_mass(self) -> bool:
@@ -48,9 +51,23 @@ class Equations:
         tangents = tangents and not self.W  # Newton's method takes none beside non-holonomic rows
         arrays = self._callbacks() | (self._tangents() if tangents else {})
         constant = self.constant_mass
-        parts = [f"CONSTANT_MASS = {constant}\nBANDWIDTH = {_bandwidth(arrays) if constant and tangents else None}\n"]
+        known = {
+            "CONSTANT_MASS": constant,
+            "BANDWIDTH": self._bandwidth() if constant else None,
+            "CONSERVED": self.conserved,
+        }
+        parts = ["".join(f"{name} = {value}\n" for name, value in known.items())]
         parts += [callback_source(kind, each) for kind, each in arrays.items()]
         return "\n\n".join([*parts, energy_source(self.energy)])
+
+    def _bandwidth(self) -> int:
+        """How far apart coordinates are numbered of which M, the force or one constraint has both."""
+        x, d = self.symbols, self.symbols.differentiation
+        places = {symbol: j for symbols in (x.q, x.v) for j, symbol in enumerate(symbols)}
+        entries = [*enumerate(self.Q), *((j, entry) for (_, j), entry in d.rows(self.C, x.q).items())]
+        pairs = [(i, places[symbol]) for i, entry in entries for symbol in d.symbols_of(entry) & set(places)]
+        pairs += [divmod(place, self.M.cols) for place, entry in enumerate(self.M) if entry != 0]
+        return max((abs(i - j) for i, j in pairs), default=0)
 
     def _callbacks(self) -> dict[str, list[Entries]]:
         x, d, n = self.symbols, self.symbols.differentiation, range(len(self.symbols.q))
@@ -82,12 +99,6 @@ class Equations:
             reaction = [sympy.Add(*(lam[k] * rows.get((k, i), ZERO) for k in range(len(lam)))) for i in n]
             found["reaction_by_q"] = [d.symmetric(reaction, x.q)]
         return found
-
-
-def _bandwidth(arrays: dict[str, list[Entries]]) -> int:
-    """How far from the diagonal M and the tangents have entries."""
-    kinds = ("mass", "force_by_q", "force_by_v", "reaction_by_q")
-    return max((abs(i - j) for kind in kinds for i, j in arrays.get(kind, [{}])[0]), default=0)
 
 
 def along(expressions: Sequence[Expr], x: Reader) -> list[Expr]:

@@ -22,7 +22,7 @@ def from_lagrangian(
     dissipation: Any = 0,
     nonholonomic: Any = (),
     parameters: Mapping[Any, Any] | None = None,
-    tangents: bool = True,
+    tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
     """Derive M and Q from energies, all derivatives of the constraints, and make a compiled system of them.
@@ -48,7 +48,8 @@ def from_lagrangian(
     parameters : mapping
         From every other symbol to its value. The values can be changed later without compiling again.
     tangents : bool
-        Whether to derive the tangents of the force and of the reactions for Newton's method.
+        Whether to derive the tangents of the force and of the reactions for Newton's method. For stiff forces: they
+        save differences, and double or triple the code; fixed steps in which bodies turn far converge better without.
     name : str
         Shown in messages.
 
@@ -77,17 +78,17 @@ def from_lagrangian(
         rate, n = along(momenta, x), len(x.q)
         Q = [d.by(kinetic - potential, x.q[i]) - rate[i] - d.by(lost, x.v[i]) + F[i] for i in range(n)]
         mass = sympy.ImmutableMatrix(n, n, lambda i, j: M.get((i, j), ZERO))
-        return Equations(x, mass, Q, C, W, kinetic + potential)
+        still = dict.fromkeys(x.v, ZERO)
+        steady = not any(each.has(x.t) for each in (kinetic, potential, *C, *W))
+        homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *momenta, *W))
+        conserved = steady and homogeneous and lost == 0 and not any(F)
+        return Equations(x, mass, Q, C, W, kinetic + potential, conserved)
 
-    still = dict.fromkeys(x.v, ZERO)
-    steady = not any(each.has(x.t) for each in (kinetic, potential, *C, *W))
-    homogeneous = all(each.xreplace(still) == 0 for each in (kinetic, *momenta, *W))
     return made(
         x,
         ["Lagrange", kinetic, potential, lost, F, C, W],
         derive,
         rows=(len(C), len(W)),
-        conserved=steady and homogeneous and lost == 0 and not any(F),
         tangents=tangents,
         name=name,
     )

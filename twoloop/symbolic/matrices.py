@@ -1,19 +1,18 @@
 """Equations of motion from a mass matrix and a force, in velocities or in generalised speeds."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sympy
 from sympy import Expr, Float
 
-from twoloop.checks import check_flag
 from twoloop.symbolic.differentiation import ZERO
 from twoloop.symbolic.equations import Equations, along, linear
 from twoloop.symbolic.lagrange import read_rows
 from twoloop.symbolic.mechanism import SymbolicMechanism, made
 from twoloop.symbolic.reading import POSITIONS, VELOCITIES, Reader, column, sequence, square
 
-SAME = 1e-9  # relative: entries of M that count as equal
+SAME = 1e-9  # relative: what counts as equal
 PROBES = 3
 
 
@@ -26,9 +25,8 @@ def from_matrices(
     speeds: Mapping[Any, Any] | None = None,
     nonholonomic: Any = (),
     potential: Any = 0,
-    conserved: bool = False,
     parameters: Mapping[Any, Any] | None = None,
-    tangents: bool = True,
+    tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
     """Make a compiled system of M u' = Q, and derive all derivatives of the constraints.
@@ -52,13 +50,12 @@ def from_matrices(
     nonholonomic : list of expressions (n_a,)
         Each is zero; linear in the velocities, or speeds.
     potential : expression
-        V, J: the energy is 1/2 q'^T K^T M K q' + V. It does not change Q.
-    conserved : bool
-        Whether that energy is an invariant, which is not looked into.
+        V, J: the energy is 1/2 q'^T K^T M K q' + V. It does not change Q; whether Q conserves the energy is found out.
     parameters : mapping
         From every other symbol to its value. The values can be changed later without compiling again.
     tangents : bool
-        Whether to derive the tangents of the force and of the reactions for Newton's method.
+        Whether to derive the tangents of the force and of the reactions for Newton's method. For stiff forces: they
+        save differences, and double or triple the code; fixed steps in which bodies turn far converge better without.
     name : str
         Shown in messages.
 
@@ -89,41 +86,48 @@ def from_matrices(
     V = x.read("potential", potential, POSITIONS)
 
     def derive() -> Equations:
-        speed = [sympy.Add(*(K.get((i, j), ZERO) * v for j, v in enumerate(x.v))) for i in range(n)]
-        energy = sympy.Rational(1, 2) * sympy.Add(
-            *(speed[i] * mass[i, j] * speed[j] for i in range(n) for j in range(n))
-        )
-        if speeds is None:
-            return Equations(x, mass, force, C, W, energy + V)
         transform = sympy.ImmutableMatrix(n, len(x.q), lambda i, j: K.get((i, j), ZERO))
-        rest = sympy.ImmutableMatrix(force) - mass * sympy.ImmutableMatrix(along(u, x))
-        return Equations(x, transform.T * mass * transform, list(transform.T * rest), C, W, energy + V)
+        speed = transform * sympy.ImmutableMatrix(x.v)
+        terms = (speed[i] * mass[i, j] * speed[j] for i in range(n) for j in range(n))
+        energy = sympy.Rational(1, 2) * sympy.Add(*terms) + V
+        if speeds is None:
+            turned, Q_of_q = mass, force
+        else:
+            turned = transform.T * mass * transform
+            Q_of_q = list(transform.T * (sympy.ImmutableMatrix(force) - mass * sympy.ImmutableMatrix(along(u, x))))
+        return Equations(x, turned, Q_of_q, C, W, energy, _conserved(x, Q_of_q, [*C, *W], energy))
 
     return made(
         x,
         ["matrices", list(mass), force, u, C, W, V],
         derive,
         rows=(len(C), len(W)),
-        conserved=check_flag("conserved", conserved),
         tangents=tangents,
         name=name,
     )
 
 
+def _conserved(x: Reader, Q: Sequence[Expr], rows: Sequence[Expr], energy: Expr) -> bool:
+    """Whether the force gives as much power as the energy loses, and constraints, none of which may move, give none."""
+    still = dict.fromkeys(x.v, ZERO)
+    moving = any(row.has(x.t) or (row.xreplace(still) != 0 and row.free_symbols & set(x.v)) for row in rows)
+    return not moving and _cancel([*(v * q for v, q in zip(x.v, Q, strict=True)), *along([energy], x)])
+
+
 def _check_symmetric(M: sympy.MatrixBase) -> None:
-    """Entries that are not written in the same way are compared at a few points."""
     for i in range(M.rows):
         for j in range(i):
             a, b = M[i, j], M[j, i]
-            if a != b and not _agree(a, b):
+            if a != b and not _cancel([a, -b]):
                 raise ValueError(f"M must be symmetric; given {a} in row {i}, column {j}, and {b} across the diagonal")
 
 
-def _agree(a: Expr, b: Expr) -> bool:
-    symbols = sorted(a.free_symbols | b.free_symbols, key=str)
+def _cancel(terms: Sequence[Expr]) -> bool:
+    """Whether terms add up to nothing, at a few points: what is equal need not be written in the same way."""
+    symbols = sorted(set().union(*(term.free_symbols for term in terms)), key=str)
     for probe in range(PROBES):
         values = {symbol: Float(0.3 + (0.618034 * (k + 1) * (probe + 1)) % 1.0) for k, symbol in enumerate(symbols)}
-        one, other = sympy.N(a.xreplace(values)), sympy.N(b.xreplace(values))
-        if abs(one - other) > SAME * max(abs(one), abs(other)):
+        found = [complex(term.xreplace(values)) for term in terms]
+        if not abs(sum(found)) <= SAME * sum(map(abs, found)):
             return False
     return True

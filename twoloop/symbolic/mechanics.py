@@ -17,9 +17,8 @@ def from_method(
     constraints: Any = (),
     nonholonomic: Any = (),
     potential: Any = 0,
-    conserved: bool = False,
     parameters: Mapping[Any, Any] | None = None,
-    tangents: bool = True,
+    tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
     """Make a compiled system of what sympy.physics.mechanics describes.
@@ -31,7 +30,7 @@ def from_method(
     Parameters
     ----------
     method : LagrangesMethod, KanesMethod or System
-    constraints, nonholonomic, potential, conserved, parameters, tangents, name
+    constraints, nonholonomic, potential, parameters, tangents, name
         As for `from_matrices`.
 
     Returns
@@ -65,7 +64,6 @@ def from_method(
         speeds=speeds,
         nonholonomic=[*own[1], *sequence("nonholonomic", nonholonomic)],
         potential=potential,
-        conserved=conserved,
         parameters=parameters,
         tangents=tangents,
         name=name,

@@ -12,7 +12,7 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 from sympy import Basic
 
-from twoloop.checks import check_flag, check_text
+from twoloop.checks import check_flag, check_text, check_vector
 from twoloop.generated import GeneratedCode, GeneratedEnergy
 from twoloop.mechanisms.problem import Problem
 from twoloop.projection import consistent_state
@@ -38,8 +38,6 @@ class SymbolicMechanism:
         Number of constraints on positions, and of non-holonomic ones.
     parameters : mapping
         Name to value, in the order of `p`.
-    conserved : bool
-        Whether the energy is an invariant.
     code : GeneratedCode
         The callbacks and the energy; `code.source` is what was made of the equations.
     """
@@ -49,7 +47,6 @@ class SymbolicMechanism:
     n_c: int
     n_a: int
     parameters: Mapping[str, float]
-    conserved: bool
     code: GeneratedCode
 
     @cached_property
@@ -71,6 +68,11 @@ class SymbolicMechanism:
     def energy(self) -> GeneratedEnergy:
         """energy(t, q, v), J, of one state or of the columns of many."""
         return GeneratedEnergy(self.code, self._vector)
+
+    @property
+    def conserved(self) -> bool:
+        """Whether the energy is an invariant."""
+        return bool(self.code.value("CONSERVED"))
 
     @property
     def _vector(self) -> tuple[float, ...]:
@@ -123,15 +125,16 @@ class SymbolicMechanism:
         TypeError, ValueError
             If a coordinate is unknown, or no consistent state is found.
         """
+        start, end = check_vector("t_span", t_span, 2).tolist()
         places = [self._place("keep", each) for each in keep]
         q, v = self._state("q0", q0), self._state("v0", v0)
-        q, v = consistent_state(self.system, t_span[0], q, v, keep=places or None)
+        q, v = consistent_state(self.system, start, q, v, keep=places or None)
         return Problem(
             name=self.name,
             system=self.system,
             q0=q,
             v0=v,
-            t_span=t_span,
+            t_span=(start, end),
             energy=self.energy,
             parameters=dict(self.parameters),
             note=note,
@@ -160,7 +163,6 @@ def made(
     derive: Callable[[], Equations],
     *,
     rows: tuple[int, int],
-    conserved: bool,
     tangents: bool,
     name: str,
 ) -> SymbolicMechanism:
@@ -171,7 +173,7 @@ def made(
     check_text("name", name)
     key = _digest([*given, check_flag("tangents", tangents), len(reader.q), len(reader.p)])
     code = GeneratedCode.stored(key) or GeneratedCode(key, derive().source(tangents))
-    return SymbolicMechanism(name, reader.names, *rows, reader.values, conserved, code)
+    return SymbolicMechanism(name, reader.names, *rows, reader.values, code)
 
 
 def _digest(given: Any) -> str:

@@ -94,7 +94,7 @@ class Reader:
                     f"{argument} must be smooth; given {node}. Smooth it, such as sign(x) to tanh(x / small), or let "
                     "an event end the run where it switches"
                 )
-            elif not isinstance(node, SMOOTH) or node.is_finite is False or node is sympy.S.NaN:
+            elif not isinstance(node, SMOOTH) or (node.is_Number and not node.is_finite):
                 known = ", ".join(sorted(each.__name__ for each in FUNCTIONS))
                 raise ValueError(f"{argument} must be made of real numbers, powers and {known}; given {node}")
             else:
@@ -132,7 +132,9 @@ def sequence(argument: str, given: Any) -> list[Any]:
     """The entries of a list, a tuple or a matrix of one column."""
     if given is None:
         return []
-    if isinstance(given, (str, Mapping, Expr)) or not isinstance(given, (Iterable, sympy.MatrixBase)):
+    if isinstance(given, sympy.MatrixBase):
+        return list(given)
+    if isinstance(given, (str, Mapping, Expr)) or not isinstance(given, Iterable):
         raise TypeError(f"{argument} must be a list of SymPy expressions; given {given!r}")
     return list(given)
 
@@ -168,8 +170,8 @@ def _time_of(coordinates: Sequence[Any]) -> Symbol:
     times = {each.args[0] for each in coordinates}
     if len(times) > 1:
         raise ValueError(f"coordinates must be functions of one time; given {', '.join(sorted(map(repr, times)))}")
-    if len(set(coordinates)) < len(coordinates):
-        raise ValueError(f"coordinates must differ; given {', '.join(map(str, coordinates))}")
+    if len({str(each) for each in coordinates}) < len(coordinates):
+        raise ValueError(f"coordinates must differ in their names; given {', '.join(map(str, coordinates))}")
     return times.pop()
 
 
