@@ -32,6 +32,8 @@ FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs"
 SEED, N_EACH, QUICK_EACH = 2016, 10, 1
 TIME_LIMIT = 900.0  # s of the tests of a mutant, longer than they take on a busy machine; none has to end
 NONE = "none"
+# mutants that no test can see, and why: kernel, line, what was there, what is there
+ARGUED: dict[tuple[str, ...], str] = {}
 SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
 COMPARED = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
 SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"} | {
@@ -188,8 +190,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         str(kernel): {"n": len(own), "seen": int((own["seen_by"] != NONE).sum())}
         for kernel, own in rows.groupby("kernel", sort=False)
     }
+    keys = ("kernel", "text", "old", "new")
     places = [
-        {key: str(row[key]) for key in ("kernel", "line", "text", "old", "new")} for _, row in survivors.iterrows()
+        {key: str(row[key]) for key in ("line", *keys)} | {"why": ARGUED.get(tuple(str(row[key]) for key in keys), "")}
+        for _, row in survivors.iterrows()
     ]
     return {"n": len(rows), "seen": len(rows) - len(survivors), "kernels": kernels, "survivors": places}
 
