@@ -84,7 +84,7 @@ class Model:
         markers = []
         for body in (i, j):
             number, local, R = self._local(body, point)
-            place = exu.HT(rotation=R.T @ frame, translation=local)  # type: ignore[call-arg]
+            place = exu.HT(rotation=R.T @ frame, translation=local)  # type: ignore[call-arg]  # its stub lags behind
             markers.append(self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=number, localHT=place)))
         self.mbs.AddObject(GenericJoint(markerNumbers=markers, constrainedAxes=locked))
 

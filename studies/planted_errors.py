@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import multiprocessing
 import os
 import time
@@ -174,6 +175,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings and report."""
     found = findings_of(rows)
+    mutants = output.path / "mutants.json"
+    found["mutants"] = json.loads(mutants.read_text()) if mutants.is_file() else None
     output.save_findings(found)
     cells = [
         [str(place), "; ".join(own["fault"]), str(by).removeprefix("tests/")]

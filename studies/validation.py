@@ -219,7 +219,7 @@ def _holds(name: str, level: str) -> float:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
-    own_models = [of_model(case, own) for case, own in rows[rows["group"] == MODELLED].groupby("case", sort=False)]
+    models = rows[rows["group"] == MODELLED]
     rows = rows[~rows["group"].isin(APART)]
     solvers = [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]
     problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
@@ -231,8 +231,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "solvers": solvers,
         "problems": problems,
         "decades": DECADES,
-        "models": own_models,
-        "model_steps": list(STEPS),
+        "models": [of_model(case, own) for case, own in models.groupby("case", sort=False)],
+        "model_steps": sorted({round(row["t_end"] / row["h"]) for _, row in models.iterrows()}),
         "steps": stepped,
         "steps_at": list(DECEIVED_AT),
         "first_deceived": [line["solver"] for line in stepped if line["first"]],

@@ -1,5 +1,7 @@
 """Small runs behind the claims that no other study makes: single steps and runs of a second."""
 
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -7,8 +9,9 @@ from numpy.typing import NDArray
 
 from references.four_bar_minimal import MinimalFourBar
 from references.paper_step import Step, advance, true_states
-from twoloop import ConstrainedSystem, paper_irk, solve_dae
-from twoloop.mechanisms import Problem, four_bar
+from studies import end_states, validation
+from twoloop import ConstrainedSystem, ConstraintWarning, Result, paper_irk, solve_dae
+from twoloop.mechanisms import Problem, four_bar, knife_edge, rolling_disc
 from twoloop.tableaux import sun_radau_iib
 
 Array = NDArray[np.float64]
@@ -16,6 +19,8 @@ Array = NDArray[np.float64]
 TOL = 1e-5  # Atol = Rtol of the paper
 LOOPS = 1e-9  # err_in = err_out of the paper
 SUN = sun_radau_iib(3)
+NEAR = 1e-3  # of the state known: 100 times the tolerance
+TIME_LIMIT = 60.0  # s of a published mechanism
 STEP = 0.06  # s, about the median step of the paper's procedure
 
 
@@ -23,7 +28,8 @@ def make(quick: bool) -> dict[str, float]:
     """All of them."""
     linkage = four_bar()
     states = true_states(linkage, 8 if quick else 40)
-    return local_error(linkage, states) | predictor(linkage, states) | values_alone(linkage)
+    found = local_error(linkage, states) | predictor(linkage, states) | values_alone(linkage)
+    return found | generality(validation.MAKE[:: 7 if quick else 1]) | nonholonomic()
 
 
 def local_error(problem: Problem, states: list[tuple[float, Array, Array]]) -> dict[str, float]:
@@ -77,3 +83,32 @@ def values_alone(problem: Problem) -> dict[str, float]:
     other, without = run(ConstrainedSystem.from_python(**functions))
     difference = float(np.abs(np.array([one, other]) - compiled).max())
     return {"difference": difference, "calls given": with_gamma, "calls differenced": without}
+
+
+def ended(problem: Problem) -> tuple[Result, float]:
+    """The paper's procedure to the end of a problem's reference, and the error in q of its last state."""
+    known = problem.reference
+    assert known is not None
+    options: dict[str, Any] = {"method": paper_irk(), "rtol": TOL, "atol": TOL, "time_limit": TIME_LIMIT}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConstraintWarning)
+        result = solve_dae(problem.system, (0.0, known.t), problem.q0, problem.v0, **options)
+    error = end_states.error(result.q[:, -1], known.q)
+    assert error is not None
+    return result, error
+
+
+def generality(make: Sequence[Callable[[], Problem]]) -> dict[str, float]:
+    """How many of these mechanisms the paper's procedure brings to the state known."""
+    right = [result.success and error < NEAR for result, error in (ended(one()) for one in make)]
+    return {"mechanisms": float(len(right)), "mechanisms right": float(sum(right))}
+
+
+def nonholonomic() -> dict[str, float]:
+    """Largest error and largest residual of the velocity constraints on two non-holonomic systems."""
+    errors, residuals = [], []
+    for problem in (knife_edge(), rolling_disc()):
+        result, error = ended(problem)
+        errors.append(error)
+        residuals.append(end_states.violations(problem.system, result)["violation_v"])
+    return {"non-holonomic error": max(errors), "non-holonomic violation": max(residuals)}

@@ -283,7 +283,7 @@ def _paper_on(rows: Rows, case: str) -> pd.Series:
 def step_order(rows: Rows, case: str, order: float) -> Judgement:
     run = _paper_on(rows, case)
     met = order / HALF_A_DECADE <= run["h_median"] <= order * HALF_A_DECADE
-    return decide([met], median=float(run["h_median"]), largest=float(run["h_max"]))
+    return decide([met], median=float(run["h_median"]))
 
 
 def beams_work(rows: Rows) -> Judgement:
@@ -314,3 +314,13 @@ def any_method(rows: Rows) -> Judgement:
     others = rows.pick("energy", variables="velocities", partition="lasting")[["solver", "status"]]
     reached = pd.concat([line_up, others]).groupby("solver")["status"].agg(lambda each: "REACHED_END" in set(each))
     return decide(reached, reached=int(reached.sum()), methods=len(reached))
+
+
+def general(rows: Rows) -> Judgement:
+    right, mechanisms = (int(rows.number(key)) for key in ("mechanisms right", "mechanisms"))
+    return decide([right == mechanisms], right > mechanisms / 2, right=right, mechanisms=mechanisms)
+
+
+def nonholonomic(rows: Rows) -> Judgement:
+    error, violation = rows.number("non-holonomic error"), rows.number("non-holonomic violation")
+    return decide([error < FOLLOWS, violation < SATISFIED], error=error, violation=violation)

@@ -46,7 +46,8 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame([{"fault": f"fault {k}", "place": "tableau", "caught_by": "a test"} for k in range(3)])
 
     def text(rows):
-        return render("planted_errors", planted_errors.findings_of(rows), {"faults": ""}, stamp="stamp", quick=False)
+        found = planted_errors.findings_of(rows) | {"mutants": None}
+        return render("planted_errors", found, {"faults": ""}, stamp="stamp", quick=False)
 
     assert "All are caught" in text(rows)
     rows.loc[1, "caught_by"] = planted_errors.NONE

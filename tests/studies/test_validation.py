@@ -88,7 +88,8 @@ def made_up(**changed):
 
 def text_of(rows):
     found = validation.findings_of(rows)
-    return render("validation", found, {"solvers": ""}, stamp="stamp", quick=False), found
+    empty = dict.fromkeys(("solvers", "steps", "models"), "")
+    return render("validation", found, empty, stamp="stamp", quick=False), found
 
 
 def test_sentences_turn_with_the_rows():
@@ -144,3 +145,18 @@ def test_the_share_of_deceived_steps():
     rows["n_deceived"], rows["first_step"] = [10, 0], [2.0, 0.5]
     bad = validation.of_steps(solver, rows)
     assert (bad["deceived"], bad["first"], bad["first_worst"]) == (0.2, 0.5, 2.0)
+
+
+def test_sentences_of_steps_and_of_models_follow_their_rows():
+    first = {"group": deceived.DECEIVED, "case": "double pendulum", "solver": "BDF", "tol": 1e-8, "n_sampled": 25}
+    first |= {"n_deceived": 0, "worst_step": 0.3, "first_step": 8.0}
+    exudyn = {"group": validation.MODELLED, "case": "heavy top", "solver": "Exudyn, HHT", "t_end": 1.0, "status": "x"}
+    runs = [exudyn | {"h": 1.0 / n, "error_q": 100.0 / n**2} for n in (100, 400)]
+    text, found = text_of(pd.concat([made_up(), pd.DataFrame([first, *runs])]))
+    assert "`BDF` accepts first steps with too large an error" in text
+    assert "with 400 steps, and the order seen between 100 and 400 steps" in text
+    assert found["models"][0]["solvers"]["Exudyn, HHT"]["order"] == pytest.approx(2.0)
+    text, _ = text_of(pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))
+    assert "first steps with too large an error" not in text
+    assert "Exudyn" not in text
+    assert number_of_words(text) < 1000

@@ -1,0 +1,97 @@
+"""Mutants of kernels: what is changed, that a test which sees one is named, and what the report says."""
+
+import ast
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from studies import mutants
+from studies.cli import ROOT
+from studies.mutants import Mutant, mutants_of
+from studies.render import render
+
+SOURCE = """
+NUMBER = 3
+
+
+def plain(a):
+    return a + 1
+
+
+@kernel
+def compiled(a, b):
+    if a < b and a != 2.0:
+        return a * (b - 1)
+    return 0.0
+"""
+
+
+def changes(source=SOURCE):
+    return [(mutant.line, mutant.old, mutant.new) for mutant in mutants_of("x", source)]
+
+
+def test_operators_comparisons_words_and_numbers_of_compiled_functions_are_changed():
+    assert sorted(changes()) == sorted(
+        [
+            *[(11, "<", "<="), (11, "and", "or"), (11, "!=", "=="), (11, "2.0", "4.0")],
+            *[(12, "*", "/"), (12, "-", "+"), (12, "1", "2"), (13, "0.0", "1.0")],
+        ]
+    )
+
+
+def test_a_mutant_is_one_change_of_one_line():
+    for mutant in mutants_of("x", SOURCE):
+        made = mutant.applied(SOURCE)
+        differ = [(a, b) for a, b in zip(SOURCE.splitlines(), made.splitlines(), strict=True) if a != b]
+        assert len(differ) == 1
+        assert ast.dump(ast.parse(made)) != ast.dump(ast.parse(SOURCE))
+
+
+def test_the_sample_is_the_same_every_time_and_of_all_kernels():
+    chosen = mutants.sample(False)
+    assert chosen == mutants.sample(False)
+    assert len({mutant.name for mutant in chosen}) == len(chosen) == mutants.N_EACH * len(mutants.TESTS)
+    for kernel, tests in mutants.TESTS.items():
+        source = (ROOT / "twoloop" / "kernels" / f"{kernel}.py").read_text()
+        for mutant in (each for each in chosen if each.kernel == kernel):
+            assert source.splitlines()[mutant.line - 1][mutant.begin : mutant.end] == mutant.old
+            ast.parse(mutant.applied(source))
+        assert all((ROOT / test).is_file() for test in tests)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "twoloop" / "kernels").mkdir(parents=True)
+    (tmp_path / "twoloop" / "kernels" / "x.py").write_text("def f():\n    return 1\n")
+    (tmp_path / "test_x.py").write_text(
+        "from pathlib import Path\n\n\ndef test_it():\n"
+        "    assert 'return 1' in (Path(__file__).parent / 'twoloop' / 'kernels' / 'x.py').read_text()\n"
+    )
+    return tmp_path
+
+
+def row(folder, new, monkeypatch):
+    monkeypatch.setitem(mutants.TESTS, "x", ("test_x.py",))
+    return mutants.row_of(Mutant("x", 2, 11, 12, "1", new, "return 1"), folder)
+
+
+def test_a_mutant_that_is_seen_and_one_that_is_not(folder: Path, monkeypatch):
+    assert row(folder, "2", monkeypatch)["seen_by"] == "test_x.py::test_it"
+    assert row(folder, "1 ", monkeypatch)["seen_by"] == mutants.NONE
+    assert (folder / "twoloop" / "kernels" / "x.py").read_text() == "def f():\n    return 1\n"
+
+
+def text_of(seen_by, why=""):
+    line = {"kernel": "bdf", "line": 3, "text": "a | b", "old": "1", "new": "2", "seen_by": seen_by}
+    found = mutants.findings_of(pd.DataFrame([line]))
+    for survivor in found["survivors"]:
+        survivor["why"] = why
+    whole = {"n": 1, "missed": [], "places": {}, "tolerance": 1e-10, "mutants": found}
+    return render("planted_errors", whole, {"faults": ""}, stamp="stamp", quick=False)
+
+
+def test_sentences_turn_with_the_rows():
+    assert "Not seen" not in text_of("test_x.py::test_it")
+    assert "| bdf.py:3 `a \\| b` | 1 → 2 | **no test sees it** |" in text_of(mutants.NONE)
+    assert "because" in text_of(mutants.NONE, "because")
