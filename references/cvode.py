@@ -59,8 +59,8 @@ def solve_cvode(
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_evaluations, all calls of the
-        right-hand side, and cpu_time. A failure gives `Status.SOLVER_FAILED` and scikit-sundae's text.
+        `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_evaluations, all calls of
+        the right-hand side, and cpu_time. A failure gives `Status.SOLVER_FAILED` and scikit-sundae's text.
 
     Raises
     ------

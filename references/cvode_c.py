@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 METHODS = {"Adams": 1, "BDF": 2}  # CV_ADAMS and CV_BDF
 SMALLEST_STEP = 1e-12  # of the length of t_span
-STEPS_A_CALL = 500  # between two looks at the clock
+STEPS_A_CALL = 100  # between two looks at the clock
 CV_NORMAL, CV_TSTOP_RETURN, CV_TOO_MUCH_WORK = 1, 1, -1
 
 

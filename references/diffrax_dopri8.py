@@ -76,7 +76,9 @@ def solve_diffrax(
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     if system.n_q > LARGEST:
-        raise NotSymbolic(f"system must have at most {LARGEST} coordinates for diffrax; {system.name!r} has {system.n_q}")
+        raise NotSymbolic(
+            f"system must have at most {LARGEST} coordinates for diffrax; {system.name!r} has {system.n_q}"
+        )
     check_start(system, t0, q0, v0, derivatives=False)
     solve = _compiled(system, t0, q0.tobytes(), v0.tobytes())
     start = np.concatenate([q0, v0])

@@ -46,7 +46,7 @@ class Expressions:
     Raises
     ------
     NotSymbolic
-        If the callbacks are Python functions, Q_d is not given, or no order of elimination is safe.
+        If the callbacks are Python functions, Q_d is not given, or the mass stays singular with rows of C_q added.
     """
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, v0: Array):
@@ -89,7 +89,13 @@ class Expressions:
         ):
             out = np.full(shape, 0.0, dtype=object)
             if shape[0]:
-                _traced(getattr(f, name), functions, {})(t, *state, p, out)
+                try:
+                    _traced(getattr(f, name), functions, {})(t, *state, p, out)
+                except Exception as error:  # each package has its own for what it cannot do
+                    raise NotSymbolic(
+                        f"{name} of {self.system.name!r} does not run on symbols; it must not branch on t, q or v, nor "
+                        f"call but sin, cos, sqrt and hypot on them: {error}"
+                    ) from error
             setattr(made, name, out)
         return made
 

@@ -23,7 +23,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LARGEST_UNROLLED = 9  # coordinates; with more, compiled unrolled, an integrator takes minutes to build
-STEPS_A_CALL = 500  # between two looks at the clock
+STEPS_A_CALL = 100  # between two looks at the clock
 
 
 def solve_heyoka(
@@ -93,10 +93,10 @@ def solve_heyoka(
         failure = limit.message("heyoka", reached, "take looser tolerances")
     elif outcome != outcomes.time_limit:  # which is what heyoka calls the end
         failure = f"heyoka failed after t = {reached:.10g} with {outcome.name}. {ADVICE}"
-    # heyoka lands on the first time by steps of its own, and there may be none to make
     kept = times[times <= (reached if failure else t1)]
     integrator.time, integrator.state[:] = t0, start
-    states = integrator.propagate_grid(kept)[-1].T if kept.size else np.empty((start.size, 0))
+    grid = kept if kept.size and kept[0] == t0 else np.append(t0, kept)  # it must begin where the state is
+    states = integrator.propagate_grid(grid)[-1].T[:, grid.size - kept.size :]
     end = f"heyoka, order {integrator.order}, reached the end, t = {t1:g}."
     return ode_result(system, kept, states, failure, end, Statistics(n_accepted=steps, cpu_time=cpu))
 
