@@ -132,7 +132,8 @@ def _run(
 ) -> tuple[Array, int, float, Statistics]:
     """Rows y at the times before a failure, CVODE's last flag, the time that it reached, its counters."""
     sundials, state, n = library(), start.copy(), start.size
-    reached, flag, rows = REAL(t0), 0, []
+    reached, flag = REAL(t0), 0
+    rows: list[Array] = []
     with ExitStack() as stack:
         own = context(stack)
         y = made(stack, "N_VMake_Serial", sundials.N_VDestroy, n, state.ctypes.data, own)

@@ -21,7 +21,7 @@ from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-LARGEST = 15  # coordinates; the compilation of more takes minutes
+LARGEST = 9  # coordinates; the compilation of more takes too long
 MOST_STEPS = 100_000
 
 

@@ -77,15 +77,15 @@ class Expressions:
     def equations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> SimpleNamespace:
         """M, Q, C, C_q, C_t and Q_d as arrays of expressions; what is zero is the number 0.0."""
         f, n, m = self.system.functions, self.system.n_q, self.system.n_c
-        p, q, v = [float(value) for value in f.p], _objects(q), _objects(v)
+        p, positions, velocities = [float(value) for value in f.p], _objects(q), _objects(v)
         made = SimpleNamespace()
         for name, shape, state in (
-            ("mass", (n, n), (q,)),
-            ("force", (n,), (q, v)),
-            ("constraint", (m,), (q,)),
-            ("jacobian", (m, n), (q,)),
-            ("constraint_rate", (m,), (q,)),
-            ("gamma", (m,), (q, v)),
+            ("mass", (n, n), (positions,)),
+            ("force", (n,), (positions, velocities)),
+            ("constraint", (m,), (positions,)),
+            ("jacobian", (m, n), (positions,)),
+            ("constraint_rate", (m,), (positions,)),
+            ("gamma", (m,), (positions, velocities)),
         ):
             out = np.full(shape, 0.0, dtype=object)
             if shape[0]:

@@ -1,4 +1,4 @@
-"""Solvers of other projects that take expressions or compiled right-hand sides: right on the four-bar, clear failures."""
+"""Solvers of other projects that take expressions or a right-hand side: right on the four-bar, clear failures."""
 
 import numpy as np
 import pytest
