@@ -65,7 +65,9 @@ def _end_of_second(problem: Problem) -> Reference:
     q, v = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))
     differ = max(float(np.abs(result.q[:, -1] - q[:, 0]).max()), 1e-15)
     digits = {"q": float(-np.log10(differ))}
-    return Reference(t_end, result.q[:, -1], result.v[:, -1], "Gauss16 at 1e-15", digits=digits, verified="one coordinate")
+    return Reference(
+        t_end, result.q[:, -1], result.v[:, -1], "Gauss16 at 1e-15", digits=digits, verified="one coordinate"
+    )
 
 
 def runs(quick: bool) -> list[Run]:
@@ -116,7 +118,9 @@ def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     both = tables.of_both(tables.ranking(rows, error))
     found: dict[str, Any] = {"error": error, "ratio": None}
     for which, best in both.items():
-        found[which] = None if best is None else {key: best[key] for key in ("solver", "cpu_s", "n_evaluations", "keeps")}
+        found[which] = (
+            None if best is None else {key: best[key] for key in ("solver", "cpu_s", "n_evaluations", "keeps")}
+        )
     if found["ours"] and found["others"]:
         found["ratio"] = found["others"]["cpu_s"] / found["ours"]["cpu_s"]
     return found
@@ -148,7 +152,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["behind"] = dict(pd.Series([at["others"]["solver"] for at in behind], dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
     found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None
-    found["clear"] = [each["case"] for each in made if all(at["ratio"] is None or at["ratio"] >= 1 / TIED for at in each["at"])]
+    found["clear"] = [
+        each["case"] for each in made if all(at["ratio"] is None or at["ratio"] >= 1 / TIED for at in each["at"])
+    ]
     found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
     return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
 
@@ -200,7 +206,9 @@ def headline(rows: pd.DataFrame, most: int = 9) -> Figure:
         line = line[line["error_q"] > line["floor"]]
         if len(line):
             width = {"linewidth": 2.2} if line["family"].iloc[0] == "two-loop" else {}
-            axes.plot(line["error_q"].astype(float), 1e3 * line["cpu_s"].astype(float), **figures.look(line.iloc[0]), **width)
+            axes.plot(
+                line["error_q"].astype(float), 1e3 * line["cpu_s"].astype(float), **figures.look(line.iloc[0]), **width
+            )
     axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time (ms)")
     axes.invert_xaxis()
     figures.legend(figure, [axes], "thick: twoloop; filled:\nkeeps the constraints")
