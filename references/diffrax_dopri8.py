@@ -140,6 +140,6 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Cal
         found = jax.block_until_ready(run(t0, t1, y0, rtol, atol, times))
         good = bool(found.result == diffrax.RESULTS.successful)
         counts = (int(found.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
-        return np.asarray(found.ys), "" if good else str(found.result), *counts
+        return np.array(found.ys), "" if good else str(found.result), *counts
 
     return solve

@@ -6,7 +6,7 @@ Errors are those at the end of the reference, which is known there to more digit
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
 from studies import figures, tables
-from studies.bench import NOTHING_RUN, Case, Run, attempt, build
+from studies.bench import NOTHING_RUN, Run, attempt, build
 from studies.cases.four_bar import SECOND
 from studies.end_states import case_of, row_of
 from studies.render import number, power
@@ -32,7 +32,10 @@ DECADES = tuple(10.0**-k for k in range(3, 14))
 SHOWN = DECADES[::2]  # in the table
 TIED = 1.2  # times that differ by less are equal
 HEADLINE = "four-bar"
-GEOMETRIES = {HEADLINE: mechanisms.four_bar, "four-bar, second": partial(mechanisms.four_bar, **SECOND)}  # type: ignore[arg-type]
+GEOMETRIES: dict[str, Callable[[], Problem]] = {
+    HEADLINE: mechanisms.four_bar,
+    "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
+}
 QUICK = ("four-bar", "double pendulum", "knife edge")
 QUICK_SOLVERS = ("Adams", "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams", "LSODA, index 1")
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-14)
@@ -62,8 +65,8 @@ def _end_of_second(problem: Problem) -> Reference:
     """Its state after 10 s: one coordinate, and Gauss16 on nine, whose difference tells the digits."""
     t_end = 10.0
     result = solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, method="Gauss16", rtol=TIGHT, atol=TIGHT)
-    q, v = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))
-    differ = max(float(np.abs(result.q[:, -1] - q[:, 0]).max()), 1e-15)
+    known = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))[0]
+    differ = max(float(np.abs(result.q[:, -1] - known[:, 0]).max()), 1e-15)
     digits = {"q": float(-np.log10(differ))}
     return Reference(
         t_end, result.q[:, -1], result.v[:, -1], "Gauss16 at 1e-15", digits=digits, verified="one coordinate"
@@ -144,7 +147,9 @@ def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Ratios of the fastest rival to the fastest of ours by mechanism and decade, and what of the goals holds."""
     by_case = {str(name): own for name, own in rows.groupby("case", sort=False)}
-    made = [{"case": name, "at": [at_decade(own, error) for error in DECADES]} for name, own in by_case.items()]
+    made: list[dict[str, Any]] = [
+        {"case": name, "at": [at_decade(own, error) for error in DECADES]} for name, own in by_case.items()
+    ]
     every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
     behind = [at for at in every if at["ratio"] < 1.0 / TIED]
     found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind), "tied": TIED}
@@ -205,10 +210,8 @@ def headline(rows: pd.DataFrame, most: int = 9) -> Figure:
         line = rows[rows["solver"] == solver].sort_values("error_q")
         line = line[line["error_q"] > line["floor"]]
         if len(line):
-            width = {"linewidth": 2.2} if line["family"].iloc[0] == "two-loop" else {}
-            axes.plot(
-                line["error_q"].astype(float), 1e3 * line["cpu_s"].astype(float), **figures.look(line.iloc[0]), **width
-            )
+            look = figures.look(line.iloc[0]) | ({"linewidth": 2.2} if line["family"].iloc[0] == "two-loop" else {})
+            axes.plot(line["error_q"].astype(float), 1e3 * line["cpu_s"].astype(float), **look)
     axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time (ms)")
     axes.invert_xaxis()
     figures.legend(figure, [axes], "thick: twoloop; filled:\nkeeps the constraints")
@@ -233,6 +236,3 @@ def heat_map(found: dict[str, Any]) -> Figure:
     axes.set_title("Time of the fastest rival over that of the fastest of ours (blue: ours ahead)")
     figure.colorbar(image, ax=axes)
     return figure
-
-
-__all__ = ["GROUP", "Case", "collect", "findings_of", "headline", "heat_map", "lines", "runs"]
