@@ -17,8 +17,9 @@ from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
 from studies import figures, tables
-from studies.bench import NOTHING_RUN, Run, attempt, build
+from studies.bench import MOST_CALLS, NOTHING_RUN, Run, attempt, build
 from studies.cases.four_bar import SECOND
+from studies.cli import StudyError
 from studies.end_states import case_of, row_of
 from studies.render import number, power
 from studies.solvers import CATALOGUE, HEYOKA, OWN, RIVALS
@@ -36,19 +37,19 @@ GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
     "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
 }
-QUICK = ("four-bar", "double pendulum", "knife edge")
-QUICK_SOLVERS = ("Adams", "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams", "LSODA, index 1")
+QUICK = ("four-bar", "knife edge")
+QUICK_SOLVERS = ("Adams", "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-14)
 BUILT = (1e-3, 1e-6, 1e-9, 1e-12, 1e-15)  # of solvers that are built for each tolerance
 STEPS = (100, 300, 1000)  # of those of fixed steps
-QUICK_TOLERANCES = (1e-4, 1e-8)
+QUICK_TOLERANCES = (1e-3, 1e-5)
 REPEATS = 3
 ONCE = 0.1  # s of CPU; a run that takes longer is not repeated
-TIMED = 0.02  # s; a shorter run is called until it has used so much ...
-MOST_CALLS = 30  # ... or so often
+TIMED = 0.02  # s; a shorter run is called until it has used so much
 TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 60.0  # s of what is built before
-TIGHT = 1e-15  # tolerance of the reference of the second geometry
+TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
+FAR = 1e-11  # ... to so much
 
 
 @cache
@@ -62,15 +63,25 @@ def problems(quick: bool) -> dict[str, Problem]:
 
 
 def _end_of_second(problem: Problem) -> Reference:
-    """Its state after 10 s: one coordinate, and Gauss16 on nine, whose difference tells the digits."""
-    t_end = 10.0
-    result = solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, method="Gauss16", rtol=TIGHT, atol=TIGHT)
+    """Its state after 10 s by Gauss16, from which DOP853 differs in the last of its digits.
+
+    Raises
+    ------
+    StudyError
+        If the equation in one coordinate, which shares nothing with them, does not agree to FAR.
+    """
+    t_end, ends = 10.0, []
+    for method in ("Gauss16", "DOP853"):
+        span = (0.0, t_end)
+        result = solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=TIGHT, atol=TIGHT)
+        ends.append((result.q[:, -1], result.v[:, -1]))
     known = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))[0]
-    differ = max(float(np.abs(result.q[:, -1] - known[:, 0]).max()), 1e-15)
-    digits = {"q": float(-np.log10(differ))}
-    return Reference(
-        t_end, result.q[:, -1], result.v[:, -1], "Gauss16 at 1e-15", digits=digits, verified="one coordinate"
-    )
+    apart = float(np.abs(ends[0][0] - known[:, 0]).max())
+    if apart > FAR:
+        raise StudyError(f"the end of {problem.name} is {apart:.1e} from that of the equation in one coordinate")
+    differ = max(float(np.abs(ends[0][0] - ends[1][0]).max()), 1e-15)
+    said = f"DOP853, which differs by {differ:.1e}; the equation in one coordinate, by {apart:.1e}"
+    return Reference(t_end, *ends[0], "Gauss16 at 1e-14", digits={"q": float(-np.log10(differ))}, verified=said)
 
 
 def runs(quick: bool) -> list[Run]:

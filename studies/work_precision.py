@@ -29,6 +29,9 @@ QUICK = (*COMPARED[:6], "DOP853, projected")  # others take seconds to compile o
 DEFAULT = "SunRadau5"  # of solve_dae
 SETTINGS = ("tol", "h", "err_out")
 PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP)  # groups of rows that are not of the four cases
+IN_TABLE = 3  # solvers of a case in the report; the figure has more, the rows have all
+SLOW = 0.2  # s to build: quicker ones are not listed
+STEEP = 2.0  # exponent of a cost that grows faster than with the square of the size
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
@@ -162,14 +165,18 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     known, medians = cases.load(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
     findings = findings_of(medians, known) | {"rivals": rivals.findings_of(everywhere)}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    findings |= {"limit": limit.findings_of(part(rows, limit.GROUP)), "shown": list(rivals.SHOWN)}
+    steep = [line for line in findings["scaling"] if (line.get("step_exponent") or 0.0) > STEEP]
+    findings |= {"steep": [f"{line['method']}, {line['family']}" for line in steep], "fitted": scaling.FITTED}
+    findings |= {"machine": limit.findings_of(part(rows, limit.GROUP)), "slow": SLOW}
     output.save_findings(findings)
     ready = {}
     for case, found in zip(known, findings["cases"], strict=True):
         own = medians[medians["case"] == case.name]
         lines = figures.cheapest_lines(own, ERRORS)
         header = ["solver", "called from", *(power(error) for error in ERRORS)]
-        ready[case.name] = table(header, tables.work_precision(own, ERRORS, lines))
+        ready[case.name] = table(
+            header, tables.work_precision(own, ERRORS, figures.cheapest_lines(own, ERRORS, IN_TABLE))
+        )
         plot = figures.work_precision(own, lines, f"{case.name}, {number(case.t_end)} s")
         figures.save(plot, output, found["figure"].removesuffix(".png"))
     ratios = ["mechanism", *(power(error) for error in rivals.SHOWN)]
@@ -189,8 +196,8 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 def built(solvers: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
     """Of the table of solvers: what it takes to compile or to build each, and how far it leaves the constraints."""
     for line in solvers:
-        seconds = line["build_s"] or (None, None)
-        yield [line["solver"], line["called_from"], *seconds, line["violation"]]
+        if line["build_s"] and line["build_s"][1] > SLOW:
+            yield [line["solver"], line["called_from"], *line["build_s"], line["violation"]]
 
 
 def main(words: Sequence[str] | None = None) -> None:
