@@ -46,6 +46,7 @@ QUICK_TOLERANCES = (1e-3, 1e-5)
 REPEATS = 3
 ONCE = 0.1  # s of CPU; a run that takes longer is not repeated
 TIMED = 0.02  # s; a shorter run is called until it has used so much
+SLOW = 0.2  # s of CPU; after a run that takes longer its solver is not asked for more accuracy on that mechanism
 TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 60.0  # s of what is built before
 TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
@@ -99,22 +100,33 @@ def runs(quick: bool) -> list[Run]:
 
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
-    """Rows of all runs, the repetitions interleaved; of what a solver cannot run at all, the first alone."""
+    """Rows of all runs, the repetitions interleaved, each solver's from its loosest setting on.
+
+    Of what a solver cannot run at all there is the first row alone, and none after one of more than SLOW seconds: such
+    a solver is far from the fastest, and would take most of the study's time.
+    """
     built: set[tuple[int, str, float]] = set()
-    refused: set[tuple[str, str]] = set()
+    ended: set[tuple[str, str]] = set()
     for repeat in range(REPEATS):
         for run in todo:
             who = run.case.name, run.solver.name
-            first = kept[run.key(0)] if repeat > 0 and run.key(0) in kept else {}
-            enough = repeat >= run.repeats or first.get("status", "") == "TIME_LIMIT"
-            if enough or who in refused or (first.get("cpu_s") or 0.0) > ONCE:
+            if not _again(run, repeat, kept) if repeat > 0 else who in ended:
                 continue
             if run.key(repeat) not in kept:
                 kept.add(run.key(repeat), _row(run, repeat, built))
-            if kept[run.key(repeat)]["status"] in (*NOTHING_RUN, "RAISED"):
-                refused.add(who)
+            row = kept[run.key(repeat)]
+            if row["status"] in (*NOTHING_RUN, "RAISED", "TIME_LIMIT") or (row["cpu_s"] or 0.0) > SLOW:
+                ended.add(who)
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
+
+
+def _again(run: Run, repeat: int, kept: KeptRows) -> bool:
+    """Whether a run is repeated: one that was made, ended and was short."""
+    if repeat >= run.repeats or run.key(0) not in kept:
+        return False
+    first = kept[run.key(0)]
+    return first["error_q"] is not None and (first["cpu_s"] or 0.0) <= ONCE
 
 
 def _row(run: Run, repeat: int, built: set[tuple[int, str, float]]) -> Row:
