@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import time
 from contextlib import chdir
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -121,7 +121,7 @@ def solve_collocation(
     t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
     check_start(system, t0, q0, v0, derivatives=False)
     ends = t0 + (t1 - t0) * np.unique(np.linspace(0, n_steps, min(OUTPUTS, n_steps) + 1).astype(int)) / n_steps
-    options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps, "rootfinder_options": ROOT}
+    options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps}
     return _solved(system, "collocation", t0, ends[1:], ends, q0, v0, options, time_limit)
 
 
@@ -138,13 +138,14 @@ def _solved(
 ) -> Result:
     """The Result at `times`, with the clock of a run that stores at `timed`."""
     check_choice("plugin", plugin, ("idas", "collocation"))
-    equations, start = _equations(system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
+    made = partial(_integrator, plugin, system, t0, q0.tobytes(), v0.tobytes(), tuple(options.items()))
+    start = np.concatenate([q0, v0])
     t1, name = float(timed[-1]), {"idas": "IDAS of CasADi", "collocation": "CasADi's collocation"}[plugin]
     limit, failure, cpu, states = TimeLimit(time_limit), "", 0.0, np.empty((start.size, 0))
     counts: dict[str, Any] = {}
     after = times[times > t0]
     try:
-        integrator = _integrator(plugin, equations, t0, timed, options)
+        integrator = made(timed.tobytes())
         limit, began = TimeLimit(time_limit), time.process_time()
         states = np.array(integrator(x0=start)["xf"])
         cpu = time.process_time() - began
@@ -152,7 +153,7 @@ def _solved(
         if limit.passed():
             failure = limit.message(name, t1, "take looser tolerances, or fewer steps")
         if after.size != timed.size:
-            states = np.array(_integrator(plugin, equations, t0, after, options)(x0=start)["xf"])
+            states = np.array(made(after.tobytes())(x0=start)["xf"])
     except RuntimeError as error:  # the only sign of a failure; the run may have ended anywhere
         said = [line for line in str(error).splitlines() if line.strip()]
         failure = f"{name} failed: {said[-1]}. {ADVICE}"
@@ -186,12 +187,18 @@ def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> di
     return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions, t, q, v))}
 
 
-def _integrator(plugin: str, equations: dict[str, Any], t0: float, times: Array, options: dict[str, Any]) -> Any:
+@lru_cache(maxsize=32)
+def _integrator(
+    plugin: str, system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, options: tuple[Any, ...], times: bytes
+) -> Any:
+    """What integrates to these times; compiled, where there is a compiler and that helps."""
     casadi, compiler = _casadi(), shutil.which("cc")
+    arguments = ("motion", plugin, _equations(system, t0, q0, v0), t0, np.frombuffer(times).tolist())
+    given = dict(options) | ({"rootfinder_options": ROOT} if plugin == "collocation" else {})
     if plugin != "idas" or compiler is None:
-        return casadi.integrator("motion", plugin, equations, t0, times.tolist(), options)
+        return casadi.integrator(*arguments, given)
     # CasADi writes for the compiler into the working folder, whatever it is told; it has loaded all when it returns
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
-        jit = {"flags": ["-O3"], "cleanup": False}
-        compiled = {"jit": True, "compiler": "shell", "jit_cleanup": False, "jit_options": jit}
-        return casadi.integrator("motion", plugin, equations, t0, times.tolist(), options | compiled)
+        jit: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_cleanup": False}
+        jit["jit_options"] = {"flags": ["-O3"], "cleanup": False}
+        return casadi.integrator(*arguments, given | jit)

@@ -108,6 +108,7 @@ def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol:
         import heyoka
     except ImportError as error:
         raise RuntimeError("heyoka is not installed: make peers, or pip install 'twoloop[peers]'") from error
+    heyoka.llvm_state.set_diskcache_enabled(False)  # or what a building takes would depend on what ran before
     n, state = system.n_q, np.concatenate([np.frombuffer(q0), np.frombuffer(v0)])
     symbols = heyoka.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
     functions = {"sin": heyoka.sin, "cos": heyoka.cos, "sqrt": heyoka.sqrt}

@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
@@ -311,14 +310,14 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, fl
 
 
 def build(run: Run, repeat: int, built: set[tuple[int, str, float]], limit: float = COMPILING) -> float | None:
-    """Let a run compile what it calls, unless `built` has it: the CPU time of that, s, of all threads."""
+    """Let a run compile what it calls, unless `built` has it: the CPU time of that, s, with that of compilers called."""
     what = (id(run.case), run.solver.name, run.value if run.solver.builds_each else 0.0)
     if what in built:
         return None
     built.add(what)
-    began = time.process_time()
+    began = os.times()
     warm_up(run, repeat, limit)
-    return time.process_time() - began
+    return sum(os.times()[:4]) - sum(began[:4])
 
 
 def warm_up(run: Run, repeat: int, limit: float = COMPILING) -> None:
