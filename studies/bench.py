@@ -310,7 +310,7 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, fl
 
 
 def build(run: Run, repeat: int, built: set[tuple[int, str, float]], limit: float = COMPILING) -> float | None:
-    """Let a run compile what it calls, unless `built` has it: the CPU time of that, s, with that of compilers called."""
+    """Let a run compile what it calls, unless `built` has it: its CPU time, s, with that of compilers."""
     what = (id(run.case), run.solver.name, run.value if run.solver.builds_each else 0.0)
     if what in built:
         return None
