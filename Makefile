@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers compile table3 reports test test-oldest lint docs lock clean
+.PHONY: help install peers compile table3 reports bench test test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -58,6 +58,9 @@ table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes secon
 
 reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
+
+bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
+	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
 # the inner loop first, which all others need; then two processes, so that none compiles what another compiles
 compile: install ## compile the kernels, on two cores

@@ -9,7 +9,7 @@ promise nothing to others: this was written for `WRITTEN_FOR`, and says so when 
 import ctypes
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +21,7 @@ from references.accelerations import accelerations
 from references.driver import TimeLimit, check_run, check_system, check_tolerances
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
-from references.sundials import LONG, POINTER, REAL, library
+from references.sundials import REAL, check, context, counted, flag_name, library, made
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -38,7 +38,6 @@ MOST_STEPS = 10**7  # between two output times
 STEPS_A_CALL = 100  # between two looks at the clock
 
 IDA_NORMAL, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 1, -1
-SUN_COMM_NULL = 0
 
 
 def solve_ida_c(
@@ -120,13 +119,14 @@ def solve_ida_c(
         limit, began = TimeLimit(time_limit), time.process_time()
         rows, flag, reached = _integrate(sundials.IDASolve, solver, state, t0, t1, times, limit)
         cpu = time.process_time() - began
-        statistics = _statistics(sundials, solver[0], cpu)
+        statistics = _statistics(solver[0], cpu)
     message = f"IDA reached the end, t = {reached:g}."
     if limit.exceeded:
         message = limit.message("IDA", reached, "take looser tolerances")
     elif flag < 0:
+        name = flag_name("IDAGetReturnFlagName", flag)
         message = (
-            f"IDA failed after t = {reached:.10g} with {_flag_name(sundials, flag)} ({flag}). Look for a "
+            f"IDA failed after t = {reached:.10g} with {name} ({flag}). Look for a "
             "discontinuity, a singular position, a value that is not finite or an exception in a callback near this "
             "time, or try other tolerances."
         )
@@ -160,23 +160,15 @@ def _integrator(
     data[: f.p.size] = f.p
     data[f.p.size : f.p.size + system.n_q**2] = system.mass(t0, state[: system.n_q]).ravel()
     with ExitStack() as stack:
-        context = _context(sundials, stack)
-
-        def made(name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
-            pointer = POINTER(getattr(sundials, name)(*arguments, context))
-            if not pointer:
-                raise MemoryError(f"{name} of SUNDIALS failed")
-            stack.callback(free, pointer)
-            return pointer
-
+        own = context(stack)
         y, yp, absolute = (
-            made("N_VMake_Serial", sundials.N_VDestroy, n, values.ctypes.data)
+            made(stack, "N_VMake_Serial", sundials.N_VDestroy, n, values.ctypes.data, own)
             for values in (state[:n], state[n:], atol)
         )
         # not banded: ordered by nodes, the beam of 4 elements has bandwidths 23 and 21 of 64, and nothing to gain
-        matrix = made("SUNDenseMatrix", sundials.SUNMatDestroy, n, n)
-        linear = made("SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix)
-        memory = made("IDACreate", lambda pointer: sundials.IDAFree(ctypes.byref(pointer)))
+        matrix = made(stack, "SUNDenseMatrix", sundials.SUNMatDestroy, n, n, own)
+        linear = made(stack, "SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix, own)
+        memory = made(stack, "IDACreate", lambda pointer: sundials.IDAFree(ctypes.byref(pointer)), own)
         for name, *arguments in (
             ("IDAInit", residual.address, t0, y, yp),
             ("IDASVtolerances", rtol, absolute),
@@ -189,22 +181,8 @@ def _integrator(
             ("IDASetMinStep", SMALLEST_STEP * (t1 - t0)),
             ("IDASetStopTime", t1),
         ):
-            _check(name, getattr(sundials, name)(memory, *arguments))
+            check(name, getattr(sundials, name)(memory, *arguments))
         yield memory, y, yp
-
-
-def _context(sundials: SimpleNamespace, stack: ExitStack) -> Any:
-    """What all objects of SUNDIALS belong to; without the error handlers, which print."""
-    context = POINTER()
-    _check("SUNContext_Create", sundials.SUNContext_Create(SUN_COMM_NULL, ctypes.byref(context)))
-    stack.callback(sundials.SUNContext_Free, ctypes.byref(context))
-    _check("SUNContext_ClearErrHandlers", sundials.SUNContext_ClearErrHandlers(context))
-    return context
-
-
-def _check(name: str, flag: int) -> None:
-    if flag != 0:
-        raise RuntimeError(f"{name} of SUNDIALS failed with {flag}")
 
 
 def _integrate(
@@ -232,31 +210,16 @@ def _integrate(
     return rows[:stored], flag, reached.value
 
 
-def _statistics(sundials: SimpleNamespace, memory: Any, cpu: float) -> Statistics:
-    def counted(what: str) -> int:
-        number = LONG()
-        _check(f"IDAGet{what}", getattr(sundials, f"IDAGet{what}")(memory, ctypes.byref(number)))
-        return number.value
-
+def _statistics(memory: Any, cpu: float) -> Statistics:
     return Statistics(
-        n_accepted=counted("NumSteps"),
-        n_rejected_error=counted("NumErrTestFails"),
-        n_rejected_convergence=counted("NumStepSolveFails"),
-        n_outer=counted("NumNonlinSolvIters"),
-        n_evaluations=counted("NumResEvals"),
-        n_factorizations=counted("NumJacEvals"),
+        n_accepted=counted("IDAGetNumSteps", memory),
+        n_rejected_error=counted("IDAGetNumErrTestFails", memory),
+        n_rejected_convergence=counted("IDAGetNumStepSolveFails", memory),
+        n_outer=counted("IDAGetNumNonlinSolvIters", memory),
+        n_evaluations=counted("IDAGetNumResEvals", memory),
+        n_factorizations=counted("IDAGetNumJacEvals", memory),
         cpu_time=cpu,
     )
-
-
-def _flag_name(sundials: SimpleNamespace, flag: int) -> str:
-    """IDA's name of a flag; the text is ours to free."""
-    text = sundials.IDAGetReturnFlagName(flag)
-    name = ctypes.string_at(text).decode()
-    free = ctypes.CDLL(None).free
-    free.argtypes, free.restype = [POINTER], None
-    free(text)
-    return name
 
 
 def _result(

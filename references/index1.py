@@ -26,6 +26,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 METHODS: dict[str, type[OdeSolver]] = {"DOP853": DOP853, "RK45": RK45, "LSODA": LSODA, "Radau": Radau, "BDF": BDF}
+PAIRS = ("Pr8", "Pr9")  # explicit Runge-Kutta pairs of extensisq (P. J. Prince), of orders 8(7) and 9(8)
 ONE_STEP = ("DOP853", "RK45")  # explicit, and nothing of them but y and f outlives a step: they can be projected
 STABILISATIONS = {
     "none": "C_q a = Q_d; drifts off the constraints",
@@ -63,8 +64,9 @@ def solve_index1(
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities.
-    method : {"DOP853", "RK45", "LSODA", "Radau", "BDF"}
-        The solver of `scipy.integrate`. The implicit ones difference the right-hand side for their Jacobian.
+    method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr8", "Pr9"}
+        The solver of `scipy.integrate`, or of extensisq (`PAIRS`: on the four-bar the best of its pairs from 1e-5 down,
+        Pr9 at tight tolerances). The implicit ones difference the right-hand side for their Jacobian.
     rtol, atol : float
         SciPy's tolerances for q and v.
     stabilisation : {"none", "baumgarte", "projection"}
@@ -104,26 +106,37 @@ def solve_index1(
     ------
     TypeError, ValueError
         If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
+    RuntimeError
+        If extensisq is asked for and not installed.
     """
     _check_choices(method, stabilisation, alpha)
     check_tolerances(rtol, atol)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     check_start(system, t0, q0, v0)
+    solver_type = METHODS[method] if method in METHODS else _pair(method)
 
     strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0
-    equations = _RightHandSide(system, t0, q0, strength)
+    equations = RightHandSide(system, t0, q0, strength)
     y0 = np.concatenate([q0, v0])
     equations.warm(t0, y0, stabilisation == "projection")
     run = _Run(equations, times, stabilisation == "projection", time_limit)
     options = {"rtol": float(rtol), "atol": float(atol)}
     began = time.process_time()
-    run.go(METHODS[method], t0, y0, t1, options)
+    run.go(solver_type, t0, y0, t1, options)
     cpu = time.process_time() - began
     return _result(method, equations, run, t1, cpu)
 
 
+def _pair(method: str) -> type[OdeSolver]:
+    try:
+        import extensisq
+    except ImportError as error:
+        raise RuntimeError("extensisq is not installed: make peers, or pip install 'twoloop[peers]'") from error
+    return getattr(extensisq, method)  # type: ignore[no-any-return]
+
+
 def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None:
-    check_choice("method", method, METHODS)
+    check_choice("method", method, (*METHODS, *PAIRS))
     check_choice("stabilisation", stabilisation, STABILISATIONS)
     if stabilisation == "projection" and method not in ONE_STEP:
         raise ValueError(
@@ -138,7 +151,7 @@ def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None
             )
 
 
-class _RightHandSide(Equations):
+class RightHandSide(Equations):
     """The ODE of one system as SciPy calls it, and the projection onto its constraints."""
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, alpha: float):
@@ -184,7 +197,7 @@ class _Run:
     """The loop over a solver's steps, and what it stores."""
 
     def __init__(
-        self, equations: _RightHandSide, times: Array | None, projection: bool, time_limit: float | None
+        self, equations: RightHandSide, times: Array | None, projection: bool, time_limit: float | None
     ) -> None:
         self.equations, self.times, self.projection = equations, times, projection
         self.limit = TimeLimit(time_limit)
@@ -270,7 +283,7 @@ class _Run:
         self.y.append(y)
 
 
-def _result(method: str, equations: _RightHandSide, run: _Run, t1: float, cpu: float) -> Result:
+def _result(method: str, equations: RightHandSide, run: _Run, t1: float, cpu: float) -> Result:
     n = equations.system.n_q
     evaluations = int(equations.counters[0])
     t = np.array(run.t)

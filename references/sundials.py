@@ -1,6 +1,8 @@
-"""SUNDIALS IDA's functions by ctypes, from the library inside the scikit-sundae wheel: private to that wheel."""
+"""SUNDIALS IDA's and CVODE's functions by ctypes, from the library inside scikit-sundae: private to that wheel."""
 
 import ctypes
+from collections.abc import Callable
+from contextlib import ExitStack
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, files
 from types import SimpleNamespace
@@ -11,6 +13,7 @@ WRITTEN_FOR = "scikit-sundae 1.2.0 for Linux, with SUNDIALS 7.9.0 (any 7.x), sun
 POINTER, INT, LONG, REAL, INDEX = ctypes.c_void_p, ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_int32
 REALS = ctypes.POINTER(REAL)
 COUNTER = (INT, POINTER, POINTER)
+SUN_COMM_NULL = 0
 
 # library: function: (what it returns, what it takes ...)
 FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
@@ -52,6 +55,29 @@ FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
         "IDAGetNumResEvals": COUNTER,
         "IDAGetNumJacEvals": COUNTER,
     },
+    "cvode": {
+        "CVodeCreate": (POINTER, INT, POINTER),
+        "CVodeFree": (None, POINTER),
+        "CVodeInit": (INT, POINTER, POINTER, REAL, POINTER),
+        "CVodeSStolerances": (INT, POINTER, REAL, REAL),
+        "CVodeSetLinearSolver": (INT, POINTER, POINTER, POINTER),
+        "SUNNonlinSol_FixedPoint": (POINTER, POINTER, INT, POINTER),
+        "SUNNonlinSolFree_FixedPoint": (INT, POINTER),
+        "CVodeSetNonlinearSolver": (INT, POINTER, POINTER),
+        "CVodeSetMaxNumSteps": (INT, POINTER, LONG),
+        "CVodeSetMinStep": (INT, POINTER, REAL),
+        "CVodeSetMaxStep": (INT, POINTER, REAL),
+        "CVodeSetStopTime": (INT, POINTER, REAL),
+        "CVode": (INT, POINTER, REAL, POINTER, POINTER, INT),
+        "CVodeGetReturnFlagName": (POINTER, LONG),
+        "CVodeGetNumSteps": COUNTER,
+        "CVodeGetNumErrTestFails": COUNTER,
+        "CVodeGetNumStepSolveFails": COUNTER,
+        "CVodeGetNumNonlinSolvIters": COUNTER,
+        "CVodeGetNumRhsEvals": COUNTER,
+        "CVodeGetNumLinRhsEvals": COUNTER,
+        "CVodeGetNumLinSolvSetups": COUNTER,
+    },
 }
 
 
@@ -86,6 +112,47 @@ def library() -> SimpleNamespace:
     if (version := _version(sundials))[0] != 7:
         raise _another_wheel(f"SUNDIALS has the version {'.'.join(map(str, version))}")
     return sundials
+
+
+def check(name: str, flag: int) -> None:
+    """Raise unless the function of this name returned 0."""
+    if flag != 0:
+        raise RuntimeError(f"{name} of SUNDIALS failed with {flag}")
+
+
+def made(stack: ExitStack, name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
+    """What the function of this name makes; freed at the end of the stack."""
+    pointer = POINTER(getattr(library(), name)(*arguments))
+    if not pointer:
+        raise MemoryError(f"{name} of SUNDIALS failed")
+    stack.callback(free, pointer)
+    return pointer
+
+
+def context(stack: ExitStack) -> Any:
+    """What all objects of SUNDIALS belong to; without the error handlers, which print."""
+    sundials, pointer = library(), POINTER()
+    check("SUNContext_Create", sundials.SUNContext_Create(SUN_COMM_NULL, ctypes.byref(pointer)))
+    stack.callback(sundials.SUNContext_Free, ctypes.byref(pointer))
+    check("SUNContext_ClearErrHandlers", sundials.SUNContext_ClearErrHandlers(pointer))
+    return pointer
+
+
+def counted(get: str, memory: Any) -> int:
+    """The number that a function IDAGet... or CVodeGet... tells."""
+    number = LONG()
+    check(get, getattr(library(), get)(memory, ctypes.byref(number)))
+    return number.value
+
+
+def flag_name(get: str, flag: int) -> str:
+    """SUNDIALS' name of a flag, by the function `get`; the text is ours to free."""
+    text = getattr(library(), get)(flag)
+    name = ctypes.string_at(text).decode()
+    free = ctypes.CDLL(None).free
+    free.argtypes, free.restype = [POINTER], None
+    free(text)
+    return name
 
 
 def _another_wheel(found: str) -> RuntimeError:

@@ -142,6 +142,8 @@ class Solver:
         Settings that do not vary, numbers or texts, for the row.
     own_accelerations : bool
         Whether the accelerations in its results are not those of eq. (6) at its q and v.
+    builds_each : bool
+        Whether it compiles or builds anew for each value of the setting, not once a case.
     """
 
     name: str
@@ -153,6 +155,7 @@ class Solver:
     values: tuple[float, ...] = ()
     fixed: Mapping[str, float | str] = field(default_factory=dict)
     own_accelerations: bool = False
+    builds_each: bool = False
 
     def grid(self, case: Case) -> tuple[float, ...]:
         """The values of the setting to run on a case."""
@@ -241,7 +244,7 @@ def _rows_of(
     left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None, processes: int
 ) -> Generator[tuple[Run, int, Row], None, None]:
     if processes == 1:
-        warm: set[tuple[int, str]] = set()
+        warm: set[tuple[int, str, float]] = set()
         for run, k in left:
             first = kept[run.key(0)] if k > 0 else {}
             if first.get("status") != "TIME_LIMIT" and (first.get("cpu_s") or 0.0) <= ONCE:
@@ -278,15 +281,12 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) -> Row:
+def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
     case, solver = run.case, run.solver
     row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
     row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
     row |= {**run.settings, "t_end": case.t_end, "repeat": k}
-    what = (id(case), solver.name)
-    if what not in warm:
-        warm.add(what)
-        warm_up(run, k)
+    row["build_s"] = build(run, k, warm)
     result, status, message = attempt(run, k)
     stats = Statistics() if result is None else result.stats
     spent = [] if result is None else [stats.cpu_time]
@@ -307,6 +307,17 @@ def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str]]) 
     invariants = dict(case.invariants)
     row |= metrics.measure(case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants)
     return row if measure is None else row | measure(run, result)
+
+
+def build(run: Run, repeat: int, built: set[tuple[int, str, float]], limit: float = COMPILING) -> float | None:
+    """Let a run compile what it calls, unless `built` has it: its CPU time, s, with that of compilers."""
+    what = (id(run.case), run.solver.name, run.value if run.solver.builds_each else 0.0)
+    if what in built:
+        return None
+    built.add(what)
+    began = os.times()
+    warm_up(run, repeat, limit)
+    return sum(os.times()[:4]) - sum(began[:4])
 
 
 def warm_up(run: Run, repeat: int, limit: float = COMPILING) -> None:

@@ -5,7 +5,7 @@ that it cannot run, which becomes a row. Foreign packages are imported when they
 installed is a row too.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import product
 from typing import Any
@@ -33,11 +33,20 @@ ADAMS = "Adams"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", OWN_BDF)
 PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS)  # of twoloop, with their own options
+OWN = (ADAMS, OWN_EXPLICIT, "Gauss12", "Gauss16", "RadauIIA5", OWN_BDF)  # of ours, beside the rivals
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
+HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 GEAR_STARTS = ("accurate", "ramp")
+
+# other projects' solvers, beside ours on every mechanism: called from compiled code, then from Python
+RIVALS = (
+    *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi", "collocation, CasADi"),
+    *("CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "Pr9, index 1", "Radau, index 1", "BDF, index 1"),
+    *("IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
+)
 
 # what `compare` runs, and the lines from which its figure takes the cheapest seven
 COMPARED = (
@@ -94,6 +103,59 @@ def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> R
     from references.fully_implicit import solve_fully_implicit  # type: ignore[import-untyped, import-not-found, unused-ignore]
 
     return solve_fully_implicit(*_start(case), method, tolerance, tolerance, time_limit=case.time_limit)
+
+
+def _by_expressions(run: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
+    """Run a solver that takes expressions; `NotApplicable` where there are none."""
+    from references.expressions import NotSymbolic
+
+    try:
+        return run(*arguments, **options)
+    except NotSymbolic as why:
+        raise NotApplicable(str(why)) from None
+
+
+def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.heyoka_taylor import solve_heyoka
+
+    times = np.append(0.0, case.instants)
+    return _by_expressions(solve_heyoka, *_start(case), tolerance, t_eval=times, time_limit=case.time_limit)
+
+
+def _cvode_c(method: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.cvode_c import solve_cvode_c
+
+    setting = (method, tolerance, tolerance)
+    times = np.append(0.0, case.instants)
+    return _by_expressions(solve_cvode_c, *_start(case), *setting, t_eval=times, time_limit=case.time_limit)
+
+
+def _cvode(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.cvode import solve_cvode
+
+    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
+    return solve_cvode(*_start(case), "Adams", *tolerances, t_eval=times, time_limit=case.time_limit)
+
+
+def _diffrax(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.diffrax_dopri8 import solve_diffrax
+
+    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
+    return _by_expressions(solve_diffrax, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
+
+
+def _idas(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.casadi_integrators import solve_idas
+
+    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
+    return _by_expressions(solve_idas, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
+
+
+def _collocation(case: Case, step: float, repeat: int) -> Result:
+    from references.casadi_integrators import solve_collocation
+
+    n_steps = round(case.t_end / step)
+    return _by_expressions(solve_collocation, *_start(case), n_steps, time_limit=case.time_limit)
 
 
 def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
@@ -160,7 +222,7 @@ def _all() -> Iterator[Solver]:
     yield _solver(IRK_LINE, "two-loop", "compiled", "tol", _paper_irk)
     yield paper_newmark_at(ERR_IN)
     yield paper_newmark_at(ERR_IN, 0.25)
-    for preset in PRESETS:
+    for preset in dict.fromkeys((*PRESETS, *OWN)):
         run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
         yield _solver(preset, "two-loop", "compiled", "tol", run)
     newton = RungeKutta(radau_iia(4), "newton")
@@ -172,10 +234,20 @@ def _all() -> Iterator[Solver]:
         yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
     for name, options in ((IDA_C, {}), (IDA_C_ORDER_2, {"max_order": 2, "error_test": "positions"})):
         yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
+    yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True)
+    for method in ("Adams", "BDF"):
+        run = partial(_cvode_c, method)
+        yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False)
+    yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
+    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False)
+    yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True)
+    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
         yield _index_1(f"{name}, index 1", False, name, "none")
+    run = partial(_index1, {"method": "Pr9"})
+    yield _solver("Pr9, index 1", "extensisq", "Python", "tol", run, keeps=False)
     for name in ("DOP853", "RK45"):
         yield _index_1(f"{name}, projected", True, name, "projection")
     for name, alpha in product(("LSODA", "DOP853"), ALPHAS):

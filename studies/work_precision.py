@@ -1,13 +1,19 @@
-"""Every mechanism of the comparison with the same solvers: what each accuracy costs, and which solver to take."""
+"""Every mechanism with every solver, ours and others': what each accuracy costs, and which solver to take.
 
-from collections.abc import Sequence
+Four cases are run at length, over their whole motion; all others, with more rivals, by `studies.rivals`. How cost grows
+with size is in `studies.scaling`, how far it is from what the machine can do in `studies.limit`.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from typing import Any
 
 import pandas as pd
 
-from studies import cases, figures, study, tables
+from studies import cases, figures, limit, rivals, scaling, study, tables
 from studies.bench import Case, Run, collect
 from studies.cli import StudyError
 from studies.compare import runs_of
@@ -22,6 +28,11 @@ STIFF = (NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studi
 QUICK = (*COMPARED[:6], "DOP853, projected")  # others take seconds to compile or to run
 DEFAULT = "SunRadau5"  # of solve_dae
 SETTINGS = ("tol", "h", "err_out")
+PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP)  # groups of rows that are not of the four cases
+IN_TABLE = 3  # solvers of a case in the report; the figure has more, the rows have all
+SLOW = 0.2  # s to build: quicker ones are not listed
+STEEP = 2.0  # exponent of a cost that grows faster than with the square of the size
+PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
@@ -127,27 +138,66 @@ def make(output: Output) -> pd.DataFrame:
     """Make all rows."""
     quick = output.call.quick
     with output.kept() as kept:
-        return collect([run for case in cases.load(quick) for run in runs(case, quick)], kept)
+        made = [collect([run for case in cases.load(quick) for run in runs(case, quick)], kept)]
+        made.append(rivals.collect(rivals.runs(quick), kept))
+        made += [scaling.collect(quick, kept), limit.collect(kept, quick)]
+    return pd.concat(made, ignore_index=True)
+
+
+def part(rows: pd.DataFrame, group: str | None = None) -> pd.DataFrame:
+    """The rows of one group, without columns that it has not; None: of the four cases."""
+    chosen = ~rows["group"].isin(PARTS) if group is None else rows["group"] == group
+    return rows[chosen].dropna(axis="columns", how="all").reset_index(drop=True)
+
+
+def versions() -> dict[str, str]:
+    """Of the packages compared, those that are installed."""
+    found = {}
+    for package in PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report; the findings."""
-    rows = tables.medians(rows)
-    known = cases.load(output.call.quick)
-    findings = findings_of(rows, known)
+    everywhere = tables.medians(part(rows, rivals.GROUP))
+    known, medians = cases.load(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
+    findings = findings_of(medians, known) | {"rivals": rivals.findings_of(everywhere)}
+    findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
+    steep = [line for line in findings["scaling"] if (line.get("step_exponent") or 0.0) > STEEP]
+    findings |= {"steep": [f"{line['method']}, {line['family']}" for line in steep], "fitted": scaling.FITTED}
+    findings |= {"machine": limit.findings_of(part(rows, limit.GROUP)), "slow": SLOW}
     output.save_findings(findings)
-    work = {}
+    ready = {}
     for case, found in zip(known, findings["cases"], strict=True):
-        runs = rows[rows["case"] == case.name]
-        lines = figures.cheapest_lines(runs, ERRORS)
+        own = medians[medians["case"] == case.name]
+        lines = figures.cheapest_lines(own, ERRORS)
         header = ["solver", "called from", *(power(error) for error in ERRORS)]
-        reached = set(tables.ranking(runs, ERRORS[0]).get("solver", ()))
-        shown = [name for name in dict.fromkeys(runs["solver"]) if name in reached]
-        work[case.name] = table(header, tables.work_precision(runs, ERRORS, shown))
-        plot = figures.work_precision(runs, lines, f"{case.name}, {number(case.t_end)} s")
+        ready[case.name] = table(
+            header, tables.work_precision(own, ERRORS, figures.cheapest_lines(own, ERRORS, IN_TABLE))
+        )
+        plot = figures.work_precision(own, lines, f"{case.name}, {number(case.t_end)} s")
         figures.save(plot, output, found["figure"].removesuffix(".png"))
-    output.write("work_precision.md", render("work_precision", findings, work, stamp=line, quick=output.call.quick))
+    ratios = ["mechanism", *(power(error) for error in rivals.SHOWN)]
+    ready["ratios"] = table(ratios, rivals.lines(findings["rivals"]))
+    ready["solvers"] = table(
+        ["solver", "called from", "build (s)", "most", "max abs C"], built(findings["rivals"]["solvers"])
+    )
+    sizes = ["mechanism", "method", "n", "step at largest n (µs)", "evaluation (µs)", "exponent"]
+    ready["scaling"] = table(sizes, scaling.lines(findings["scaling"]))
+    figures.save(rivals.headline(everywhere), output, "work_precision")
+    figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")
+    text = render("work_precision", findings, ready, stamp=line, quick=output.call.quick)
+    output.write("work_precision.md", text)
     return findings
+
+
+def built(solvers: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
+    """Of the table of solvers: what it takes to compile or to build each, and how far it leaves the constraints."""
+    for line in solvers:
+        if line["build_s"] and line["build_s"][1] > SLOW:
+            yield [line["solver"], line["called_from"], *line["build_s"], line["violation"]]
 
 
 def main(words: Sequence[str] | None = None) -> None:

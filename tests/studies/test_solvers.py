@@ -18,6 +18,7 @@ COMPILING = (
     "Radau,",
     "Radau9,",
     "BDF,",
+    *("heyoka", "CVODE", "Dopri8", "Pr9", "collocation"),
 )  # seconds each, and tested by the studies that show them
 
 

@@ -1,0 +1,185 @@
+"""SUNDIALS CVODE without Python in its way: the library of scikit-sundae, driven by ctypes, its right-hand side in C.
+
+The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-line machine code. The constraints are
+not kept. See `references.ida_c` for what the library promises.
+"""
+
+import ctypes
+import itertools
+import time
+from contextlib import ExitStack
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import carray, cfunc, types
+from numpy.typing import ArrayLike, NDArray
+
+from references.driver import TimeLimit, check_choice, check_run, check_tolerances
+from references.ode import ADVICE, ode_result, output_times
+from references.straight_line import straight_line
+from references.sundials import REAL, check, context, counted, flag_name, library, made
+from twoloop.consistency import check_start
+from twoloop.result import Result, Statistics
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+METHODS = {"Adams": 1, "BDF": 2}  # CV_ADAMS and CV_BDF
+SMALLEST_STEP = 1e-12  # of the length of t_span
+STEPS_A_CALL = 100  # between two looks at the clock
+CV_NORMAL, CV_TSTOP_RETURN, CV_TOO_MUCH_WORK = 1, 1, -1
+
+
+def solve_cvode_c(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    method: str = "Adams",
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    *,
+    t_eval: ArrayLike | None = None,
+    time_limit: float | None = None,
+) -> Result:
+    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
+
+    What it was given: accelerations as straight-line code of the one mechanism (`references.straight_line`); Adams with
+    fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's and dense differences; no
+    output in the run that is timed.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem, of compiled callbacks, which give Q_d and do not branch on q or v.
+    t_span : (float, float)
+        Start and end, s; the end after the start.
+    q0, v0 : array_like (n_q,)
+        Consistent initial coordinates and velocities.
+    method : {"Adams", "BDF"}
+        Orders up to 12, or up to 5.
+    rtol, atol : float
+        CVODE's tolerances.
+    t_eval : array_like, optional
+        Increasing times in t_span at which to store the solution, interpolated by CVODE, in a second run that is not
+        timed. None: 1001 times, evenly.
+    time_limit : float, optional
+        Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps. A run past it is a
+        failed one. None: no limit.
+
+    Returns
+    -------
+    Result
+        `a` and `lam` from eq. (6) at the stored states; `h` is empty. The statistics are CVODE's counters, those of the
+        evaluations for the Jacobian included, of the run that is timed. A failure gives what was computed before it,
+        `Status.SOLVER_FAILED` and the name of CVODE's flag.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong, or the equations cannot be had as expressions: before any work, naming it.
+    RuntimeError
+        If scikit-sundae is not the one that this was written for.
+    """
+    check_choice("method", method, METHODS)
+    check_tolerances(rtol, atol)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    times = output_times(times, t0, t1)
+    check_start(system, t0, q0, v0, derivatives=False)
+    function, start = _right_hand_side(system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
+    arguments = (function, start, t0, t1, METHODS[method], float(rtol), float(atol))
+
+    limit = TimeLimit(time_limit)
+    _, flag, reached, statistics = _run(*arguments, np.empty(0), limit)
+    failure = ""
+    if limit.exceeded:
+        failure = limit.message("CVODE", reached, "take looser tolerances")
+    elif flag < 0:
+        name = flag_name("CVodeGetReturnFlagName", flag)
+        failure = f"CVODE failed after t = {reached:.10g} with {name} ({flag}). {ADVICE}"
+    kept = times[times <= reached]
+    rows = _run(*arguments, kept, TimeLimit(None))[0]
+    end = f"CVODE, {method}, reached the end, t = {t1:g}."
+    return ode_result(system, kept[: len(rows)], rows.T, failure, end, statistics)
+
+
+@lru_cache(maxsize=32)
+def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    """CVODE's right-hand side function."""
+    derivative = straight_line(system, t0, np.frombuffer(q0), np.frombuffer(v0))
+    array_of, size = library().N_VGetArrayPointer, 2 * system.n_q
+    pointer = types.voidptr
+
+    @cfunc(types.int32(types.float64, pointer, pointer, pointer), error_model="numpy")
+    def right_hand_side(t, y, rate, memory):  # type: ignore[no-untyped-def]
+        derivative(t, carray(array_of(y), (size,)), carray(array_of(rate), (size,)))
+        return 0
+
+    return right_hand_side
+
+
+def _run(
+    function: Any,
+    start: Array,
+    t0: float,
+    t1: float,
+    kind: int,
+    rtol: float,
+    atol: float,
+    times: Array,
+    limit: TimeLimit,
+) -> tuple[Array, int, float, Statistics]:
+    """Rows y at the times before a failure, CVODE's last flag, the time that it reached, its counters."""
+    sundials, state, n = library(), start.copy(), start.size
+    reached, flag = REAL(t0), 0
+    rows: list[Array] = []
+    with ExitStack() as stack:
+        own = context(stack)
+        y = made(stack, "N_VMake_Serial", sundials.N_VDestroy, n, state.ctypes.data, own)
+        memory = made(stack, "CVodeCreate", lambda pointer: sundials.CVodeFree(ctypes.byref(pointer)), kind, own)
+        check("CVodeInit", sundials.CVodeInit(memory, function.address, t0, y))
+        check("CVodeSStolerances", sundials.CVodeSStolerances(memory, rtol, atol))
+        if kind == METHODS["Adams"]:
+            iteration = made(stack, "SUNNonlinSol_FixedPoint", sundials.SUNNonlinSolFree_FixedPoint, y, 0, own)
+            check("CVodeSetNonlinearSolver", sundials.CVodeSetNonlinearSolver(memory, iteration))
+        else:
+            matrix = made(stack, "SUNDenseMatrix", sundials.SUNMatDestroy, n, n, own)
+            linear = made(stack, "SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix, own)
+            check("CVodeSetLinearSolver", sundials.CVodeSetLinearSolver(memory, linear, matrix))
+        for name, value in (
+            ("MaxNumSteps", STEPS_A_CALL),
+            ("MaxStep", t1 - t0),
+            ("MinStep", SMALLEST_STEP * (t1 - t0)),
+            ("StopTime", t1),
+        ):
+            check(name, getattr(sundials, f"CVodeSet{name}")(memory, value))
+        place, began = ctypes.byref(reached), time.process_time()
+        for stop in [*times.tolist(), t1]:
+            if stop > t0 and flag != CV_TSTOP_RETURN:
+                for _ in itertools.count():
+                    flag = sundials.CVode(memory, stop, y, place, CV_NORMAL)
+                    if flag != CV_TOO_MUCH_WORK or limit.passed():
+                        break
+                if flag < 0:
+                    break
+            if len(rows) < times.size:
+                rows.append(state.copy())
+        cpu = time.process_time() - began
+        return np.array(rows).reshape(-1, n), flag, reached.value, _statistics(memory, kind, cpu)
+
+
+def _statistics(memory: Any, kind: int, cpu: float) -> Statistics:
+    def number(what: str) -> int:
+        return counted(f"CVodeGetNum{what}", memory)
+
+    differenced = kind == METHODS["BDF"]
+    return Statistics(
+        n_accepted=number("Steps"),
+        n_rejected_error=number("ErrTestFails"),
+        n_rejected_convergence=number("StepSolveFails"),
+        n_outer=number("NonlinSolvIters"),
+        n_evaluations=number("RhsEvals") + (number("LinRhsEvals") if differenced else 0),
+        n_factorizations=number("LinSolvSetups") if differenced else 0,
+        cpu_time=cpu,
+    )

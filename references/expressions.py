@@ -1,0 +1,245 @@
+"""The equations of a compiled mechanism as expressions of another package, for solvers that take nothing else.
+
+The callbacks are Python functions that numba compiled. Here they run in Python on symbols instead of numbers:
+arithmetic makes expressions, `math.sin` and its kin become those of the package. Eq. (6), M a + C_q^T lam = Q and
+C_q a = Q_d, is then eliminated symbolically, without what is zero by its structure, in an order of little fill.
+"""
+
+import builtins
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from types import FunctionType, ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from references.driver import check_system
+from twoloop.kernels.common import GAMMA_GIVEN
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+Functions = Mapping[str, Callable[[Any], Any]]  # "sin", "cos", "sqrt" of the package
+
+SAMPLES = 4  # states, displaced from the start, at which an entry that is zero is zero by its structure
+DISPLACED = 0.3
+RANK = 1e-9  # a pivot below this, of the largest, is zero
+
+
+class NotSymbolic(ValueError):
+    """Raised for a system whose equations cannot be had as expressions; the text says why."""
+
+
+class Expressions:
+    """The equations of one system, as functions of symbols.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        Of compiled callbacks that do not branch on q or v.
+    t0 : float
+    q0, v0 : ndarray (n_q,)
+        A consistent state, about which zeros are looked for and at which redundant rows are.
+
+    Raises
+    ------
+    NotSymbolic
+        If the callbacks are Python functions, Q_d is not given, or the mass stays singular with rows of C_q added.
+    """
+
+    def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, v0: Array):
+        check_system(system)
+        if system.called_in_python:
+            raise NotSymbolic(f"the callbacks of {system.name!r} are Python functions, not compiled ones")
+        if system.n_c and not system.functions.flags[GAMMA_GIVEN]:
+            raise NotSymbolic(f"{system.name!r} does not give Q_d (gamma)")
+        self.system = system
+        samples = _samples(system, t0, q0)
+        self.rows = _independent_rows(samples[0][1])
+        self.mass_pattern = np.any([M != 0.0 for M, _ in samples], axis=0)
+        self.jacobian_pattern = np.any([C[self.rows] != 0.0 for _, C in samples], axis=0)
+        self.added = _rows_for_mass(samples[0][0], samples[0][1][self.rows])
+        self.pattern = self._matrix_pattern()
+        self.order = _order(self.pattern, system.n_q)
+
+    def _matrix_pattern(self) -> NDArray[np.bool_]:
+        n, m = self.system.n_q, len(self.rows)
+        pattern = np.zeros((n + m, n + m), dtype=bool)
+        pattern[:n, :n] = self.mass_pattern | np.eye(n, dtype=bool)
+        for k in self.added:
+            pattern[:n, :n] |= np.outer(self.jacobian_pattern[k], self.jacobian_pattern[k])
+        pattern[n:, :n] = self.jacobian_pattern
+        pattern[:n, n:] = self.jacobian_pattern.T
+        return pattern
+
+    def equations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> SimpleNamespace:
+        """M, Q, C, C_q, C_t and Q_d as arrays of expressions; what is zero is the number 0.0."""
+        f, n, m = self.system.functions, self.system.n_q, self.system.n_c
+        p, positions, velocities = [float(value) for value in f.p], _objects(q), _objects(v)
+        made = SimpleNamespace()
+        for name, shape, state in (
+            ("mass", (n, n), (positions,)),
+            ("force", (n,), (positions, velocities)),
+            ("constraint", (m,), (positions,)),
+            ("jacobian", (m, n), (positions,)),
+            ("constraint_rate", (m,), (positions,)),
+            ("gamma", (m,), (positions, velocities)),
+        ):
+            out = np.full(shape, 0.0, dtype=object)
+            if shape[0]:
+                try:
+                    _traced(getattr(f, name), functions, {})(t, *state, p, out)
+                except Exception as error:  # each package has its own for what it cannot do
+                    raise NotSymbolic(
+                        f"{name} of {self.system.name!r} does not run on symbols; it must not branch on t, q or v, nor "
+                        f"call but sin, cos, sqrt and hypot on them: {error}"
+                    ) from error
+            setattr(made, name, out)
+        return made
+
+    def accelerations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> list[Any]:
+        """The accelerations (n_q,) of eq. (6) as expressions."""
+        made, n = self.equations(functions, t, q, v), self.system.n_q
+        Cq, gamma = made.jacobian[self.rows], made.gamma[self.rows]
+        matrix: dict[tuple[int, int], Any] = {}
+        for i, j in np.argwhere(self.mass_pattern):
+            matrix[int(i), int(j)] = made.mass[i, j]
+        for k in self.added:  # M + C_q^T C_q has the same accelerations
+            places = np.flatnonzero(self.jacobian_pattern[k]).tolist()
+            for i in places:
+                for j in places:
+                    term = Cq[k, i] * Cq[k, j]
+                    matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
+        for k, i in np.argwhere(self.jacobian_pattern):
+            matrix[n + int(k), int(i)] = matrix[int(i), n + int(k)] = Cq[k, i]
+        right = [*made.force]
+        for i in range(n):
+            for k in self.added:
+                if self.jacobian_pattern[k, i]:
+                    right[i] = right[i] + Cq[k, i] * gamma[k]
+        return _solved(matrix, [*right, *gamma], self.order)[:n]
+
+
+def _objects(values: Sequence[Any]) -> NDArray[Any]:
+    made = np.empty(len(values), dtype=object)
+    for i, value in enumerate(values):
+        made[i] = value
+    return made
+
+
+def _samples(system: ConstrainedSystem, t0: float, q0: Array) -> list[tuple[Array, Array]]:
+    """M and C_q at the start, and at states displaced at random."""
+    rng = np.random.default_rng(0)
+    states = [q0, *(q0 + DISPLACED * rng.standard_normal(q0.size) for _ in range(SAMPLES))]
+    return [(system.mass(t0, q), system.jacobian(t0, q)) for q in states]
+
+
+def _independent_rows(jacobian: Array) -> list[int]:
+    """Rows of C_q, the first ones, that do not follow from those before."""
+    rows: list[int] = []
+    basis = np.zeros((0, jacobian.shape[1]))
+    for k, row in enumerate(jacobian):
+        left = row - basis.T @ (basis @ row)
+        left -= basis.T @ (basis @ left)
+        if np.linalg.norm(left) > RANK * np.linalg.norm(row):
+            rows.append(k)
+            basis = np.vstack([basis, left / np.linalg.norm(left)])
+    return rows
+
+
+def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:
+    """Rows k for which M + sum C_k^T C_k is positive definite; none where M is."""
+    chosen: list[int] = []
+    rank = np.linalg.matrix_rank(mass)
+    order = np.argsort([np.count_nonzero(row) for row in jacobian], kind="stable")
+    for k in order.tolist():
+        if rank == mass.shape[0]:
+            break
+        more = mass + np.outer(jacobian[k], jacobian[k])
+        if np.linalg.matrix_rank(more) > rank:
+            mass, rank = more, rank + 1
+            chosen.append(k)
+    if rank < mass.shape[0]:
+        raise NotSymbolic("the mass matrix stays singular with the constraints added")
+    return chosen
+
+
+def _order(pattern: NDArray[np.bool_], n: int) -> list[int]:
+    """An order of elimination: least degree first, a row of C_q only after all its coordinates.
+
+    The pivots are then those of definite matrices: M, and -C_q M^-1 C_q^T.
+    """
+    size = pattern.shape[0]
+    neighbours = [set(np.flatnonzero(row).tolist()) - {i} for i, row in enumerate(pattern)]
+    waits = [sum(j < n for j in neighbours[i]) if i >= n else 0 for i in range(size)]
+    own = [[k for k in neighbours[i] if k >= n] if i < n else [] for i in range(size)]
+    left, order = set(range(size)), []
+    while left:
+        i = min((j for j in left if waits[j] == 0), key=lambda j: (len(neighbours[j]), j))
+        left.remove(i)
+        order.append(i)
+        for k in own[i]:
+            waits[k] -= 1
+        for j in neighbours[i]:
+            neighbours[j] |= neighbours[i]
+            neighbours[j] -= {i, j}
+    return order
+
+
+def _solved(matrix: dict[tuple[int, int], Any], right: list[Any], order: list[int]) -> list[Any]:
+    """Solution of a symmetric system by LDL^T in this order; entries that are not in `matrix` are zero."""
+    rows: list[dict[int, Any]] = [{} for _ in right]
+    for (i, j), value in matrix.items():
+        rows[i][j] = value
+    factors: list[tuple[int, Any, list[tuple[int, Any]]]] = []
+    for i in order:
+        inverse = 1.0 / rows[i].pop(i)
+        column = [(j, value * inverse) for j, value in rows[i].items()]
+        for j, multiple in column:
+            for k, value in rows[i].items():
+                rows[j][k] = rows[j][k] - multiple * value if k in rows[j] else -(multiple * value)
+            del rows[j][i]
+            right[j] = right[j] - multiple * right[i]
+        factors.append((i, inverse, column))
+    solution: list[Any] = list(right)
+    for i, inverse, column in reversed(factors):
+        total = right[i] * inverse
+        for j, multiple in column:
+            total = total - multiple * solution[j]
+        solution[i] = total
+    return solution
+
+
+def _traced(function: Any, functions: Functions, done: dict[int, Any]) -> Callable[..., Any]:
+    """The Python function behind a compiled one, with the mathematics of expressions in its globals."""
+    if id(function) in done:
+        return done[id(function)]  # type: ignore[no-any-return]
+    plain = function.py_func
+    names = inspect.getclosurevars(plain)
+    scope: dict[str, Any] = {"__builtins__": builtins}
+    copy = FunctionType(plain.__code__, scope, plain.__name__, plain.__defaults__, plain.__closure__)
+    done[id(function)] = copy
+    for name, value in names.globals.items():
+        if isinstance(value, Dispatcher):
+            value = _traced(value, functions, done)
+        elif isinstance(value, ModuleType) and value in (math, np):
+            value = _Mathematics(value, functions)
+        scope[name] = value
+    return copy
+
+
+class _Mathematics:
+    """Stand in for `math` or `numpy`: their functions on numbers, the package's on expressions."""
+
+    def __init__(self, module: ModuleType, functions: Functions):
+        self._module, self._functions = module, functions
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "hypot":
+            return lambda x, y: self.sqrt(x * x + y * y)
+        if name not in self._functions:
+            return getattr(self._module, name)
+        known, own = getattr(math, name), self._functions[name]
+        return lambda x: known(x) if isinstance(x, float | int) else own(x)

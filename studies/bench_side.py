@@ -1,0 +1,110 @@
+"""One side of `studies.bench_commits`: runs benchmarks by name, in a process whose folder is a commit's.
+
+    python bench_side.py FOLDER < names > measurements
+
+Each line of the input is the name of a benchmark, each line of the output what one repetition of it took, as JSON. It
+needs nothing of the commit but `solve_dae` and `mechanisms.four_bar`, so that it runs on old commits.
+"""
+
+import ctypes
+import json
+import platform
+import struct
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+METHODS = ("Adams", "DOP853", "Gauss12", "SunRadau5", "RadauIIA5", "BDF", "TRBDF2", "auto")
+TOLERANCE = 1e-8
+T_END = 10.0  # s of motion
+WARM_UP = 0.1
+SOL_POINTS = 10_000
+PERF_EVENT_OPEN = {"x86_64": 298, "aarch64": 241}  # number of the system call
+EXCLUDED = 0b1100000  # kernel and hypervisor
+
+
+class Instructions:
+    """A counter of the instructions of this process in user space; `None` everywhere where the machine has none."""
+
+    def __init__(self) -> None:
+        self.file = None
+        number = PERF_EVENT_OPEN.get(platform.machine())
+        if number is None or platform.system() != "Linux":
+            return
+        # struct perf_event_attr: hardware event 1, instructions retired
+        attributes = struct.pack("IIQQQQQ", 0, 112, 1, 0, 0, 0, EXCLUDED) + bytes(112 - 48)
+        libc = ctypes.CDLL(None, use_errno=True)
+        handle = libc.syscall(number, attributes, 0, -1, -1, 0)
+        if handle >= 0:
+            self.file = open(handle, "rb", buffering=0)  # noqa: SIM115  (for the life of the process)
+
+    def read(self) -> int | None:
+        """Instructions so far."""
+        return None if self.file is None else struct.unpack("Q", self.file.read(8))[0]
+
+
+def benchmarks(solve_dae: Callable[..., Any], problem: Any) -> dict[str, Callable[[], tuple[dict[str, int], int]]]:
+    """By name, functions that return counts, and by how many units time and instructions are to be divided."""
+
+    def run(method: str, **options: Any) -> Any:
+        span = (0.0, T_END)
+        result = solve_dae(
+            problem.system, span, problem.q0, problem.v0, method=method, rtol=TOLERANCE, atol=TOLERANCE, **options
+        )
+        if not result.success:
+            raise RuntimeError(result.message)
+        return result
+
+    def step(method: str) -> tuple[dict[str, int], int]:
+        stats = run(method).stats
+        return {"steps": stats.n_accepted, "evaluations": stats.n_evaluations}, stats.n_accepted
+
+    def evaluation() -> tuple[dict[str, int], int]:
+        stats = run("DOP853").stats
+        return {"evaluations": stats.n_evaluations}, stats.n_evaluations
+
+    def motion() -> tuple[dict[str, int], int]:
+        result = run("Adams", dense_output=True)
+        times = [T_END * k / SOL_POINTS for k in range(SOL_POINTS)]
+        result.sol(times)
+        return {"points": SOL_POINTS}, 1
+
+    made: dict[str, Callable[[], tuple[dict[str, int], int]]] = {"evaluation": evaluation, "sol": motion}
+    for method in METHODS:
+        made[f"step of {method}"] = lambda method=method: step(method)  # type: ignore[misc]
+    return made
+
+
+def main() -> None:
+    """Measure what is asked for until the input ends."""
+    sys.path.insert(0, sys.argv[1])
+    began = time.process_time()
+    from twoloop import solve_dae
+    from twoloop.mechanisms import four_bar
+
+    problem, counter, warm = four_bar(), Instructions(), set()
+    made = benchmarks(solve_dae, problem)
+    solve_dae(problem.system, (0.0, WARM_UP), problem.q0, problem.v0)
+    started = time.process_time() - began
+    for line in sys.stdin:
+        name = line.strip()
+        try:
+            if name == "compile":
+                answer: dict[str, Any] = {"cpu": started, "instructions": None, "counts": {}}
+            else:
+                if name not in warm:
+                    made[name]()
+                    warm.add(name)
+                before, began = counter.read(), time.process_time()
+                counts, units = made[name]()
+                cpu, after = time.process_time() - began, counter.read()
+                instructions = None if before is None or after is None else (after - before) / units
+                answer = {"cpu": cpu / units, "instructions": instructions, "counts": counts}
+        except Exception as error:  # a method that one of the commits does not have, or a run that fails there
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""Every mechanism with a verified end x every solver of ours and of other projects: which is ahead at which error.
+
+Errors are those at the end of the reference, which is known there to more digits than by any motion between. A part of
+`studies.work_precision`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from references.four_bar_minimal import MinimalFourBar
+from studies import figures, tables
+from studies.bench import MOST_CALLS, NOTHING_RUN, Run, attempt, build
+from studies.cases.four_bar import SECOND
+from studies.cli import StudyError
+from studies.end_states import case_of, row_of
+from studies.render import number, power
+from studies.solvers import CATALOGUE, HEYOKA, OWN, RIVALS
+from studies.store import KeptRows, Row
+from studies.validation import MAKE
+from twoloop import mechanisms, solve_dae
+from twoloop.mechanisms import Problem, Reference
+
+GROUP = "every mechanism"
+DECADES = tuple(10.0**-k for k in range(3, 14))
+SHOWN = DECADES[::2]  # in the table
+TIED = 1.2  # times that differ by less are equal
+HEADLINE = "four-bar"
+GEOMETRIES: dict[str, Callable[[], Problem]] = {
+    HEADLINE: mechanisms.four_bar,
+    "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
+}
+QUICK = ("four-bar", "knife edge")
+QUICK_SOLVERS = ("Adams", "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-14)
+BUILT = (1e-3, 1e-6, 1e-9, 1e-12, 1e-15)  # of solvers that are built for each tolerance
+STEPS = (100, 300, 1000)  # of those of fixed steps
+QUICK_TOLERANCES = (1e-3, 1e-5)
+REPEATS = 3
+ONCE = 0.1  # s of CPU; a run that takes longer is not repeated
+TIMED = 0.02  # s; a shorter run is called until it has used so much
+SLOW = 0.2  # s of CPU; after a run that takes longer its solver is not asked for more accuracy on that mechanism
+TIME_LIMIT = 1.0  # s of CPU of a run
+COMPILING = 60.0  # s of what is built before
+TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
+FAR = 1e-11  # ... to so much
+
+
+@cache
+def problems(quick: bool) -> dict[str, Problem]:
+    """The mechanisms by name, each with a reference."""
+    made = {name: replace(make(), name=name) for name, make in GEOMETRIES.items()}
+    made["four-bar, second"] = replace(made["four-bar, second"], reference=_end_of_second(made["four-bar, second"]))
+    for problem in (make() for make in MAKE):
+        made[problem.name] = problem
+    return {name: problem for name, problem in made.items() if not quick or name in QUICK}
+
+
+def _end_of_second(problem: Problem) -> Reference:
+    """Its state after 10 s by Gauss16, from which DOP853 differs in the last of its digits.
+
+    Raises
+    ------
+    StudyError
+        If the equation in one coordinate, which shares nothing with them, does not agree to FAR.
+    """
+    t_end, ends = 10.0, []
+    for method in ("Gauss16", "DOP853"):
+        span = (0.0, t_end)
+        result = solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=TIGHT, atol=TIGHT)
+        ends.append((result.q[:, -1], result.v[:, -1]))
+    known = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))[0]
+    apart = float(np.abs(ends[0][0] - known[:, 0]).max())
+    if apart > FAR:
+        raise StudyError(f"the end of {problem.name} is {apart:.1e} from that of the equation in one coordinate")
+    differ = max(float(np.abs(ends[0][0] - ends[1][0]).max()), 1e-15)
+    said = f"DOP853, which differs by {differ:.1e}; the equation in one coordinate, by {apart:.1e}"
+    return Reference(t_end, *ends[0], "Gauss16 at 1e-14", digits={"q": float(-np.log10(differ))}, verified=said)
+
+
+def runs(quick: bool) -> list[Run]:
+    """Every mechanism, solver and setting."""
+    found = []
+    for name, problem in problems(quick).items():
+        case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT)
+        case = replace(case, step_sizes=tuple(case.t_end / n for n in STEPS))
+        for solver in (CATALOGUE[each] for each in (QUICK_SOLVERS if quick else (*OWN, *RIVALS))):
+            grid = BUILT if solver.builds_each else TOLERANCES if solver.setting == "tol" else case.steps()
+            values = QUICK_TOLERANCES if quick else grid
+            repeats = 1 if quick or solver.called_from == "Python" else REPEATS
+            found += [Run(case, solver, value, GROUP, repeats) for value in values]
+    return found
+
+
+def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
+    """Rows of all runs, the repetitions interleaved, each solver's from its loosest setting on.
+
+    Of what a solver cannot run at all there is the first row alone, and none after one of more than SLOW seconds: such
+    a solver is far from the fastest, and would take most of the study's time.
+    """
+    built: set[tuple[int, str, float]] = set()
+    ended: set[tuple[str, str]] = set()
+    for repeat in range(REPEATS):
+        for run in todo:
+            who = run.case.name, run.solver.name
+            if not _again(run, repeat, kept) if repeat > 0 else who in ended:
+                continue
+            if run.key(repeat) not in kept:
+                kept.add(run.key(repeat), _row(run, repeat, built))
+            row = kept[run.key(repeat)]
+            if row["status"] in (*NOTHING_RUN, "RAISED", "TIME_LIMIT") or (row["cpu_s"] or 0.0) > SLOW:
+                ended.add(who)
+    keys = [run.key(k) for run in todo for k in range(run.repeats)]
+    return pd.DataFrame([kept[key] for key in keys if key in kept])
+
+
+def _again(run: Run, repeat: int, kept: KeptRows) -> bool:
+    """Whether a run is repeated: one that was made, ended and was short."""
+    if repeat >= run.repeats or run.key(0) not in kept:
+        return False
+    first = kept[run.key(0)]
+    return first["error_q"] is not None and (first["cpu_s"] or 0.0) <= ONCE
+
+
+def _row(run: Run, repeat: int, built: set[tuple[int, str, float]]) -> Row:
+    seconds = build(run, repeat, built, COMPILING)
+    row = row_of(run) | {"repeat": repeat, "build_s": seconds, "keeps_constraints": run.solver.keeps_constraints}
+    spent = [float(row.pop("cpu_time") or 0.0)]
+    while row["error_q"] is not None and sum(spent) < TIMED and len(spent) < MOST_CALLS:
+        again = attempt(run, repeat)[0]
+        spent += [] if again is None else [again.stats.cpu_time]
+    return row | {"cpu_s": sum(spent) / len(spent) or None, "calls": len(spent), "n_steps": row.pop("n_accepted")}
+
+
+def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
+    """The cheapest of ours and of others at one error on one mechanism, and their ratio."""
+    both = tables.of_both(tables.ranking(rows, error))
+    found: dict[str, Any] = {"error": error, "ratio": None}
+    for which, best in both.items():
+        found[which] = (
+            None if best is None else {key: best[key] for key in ("solver", "cpu_s", "n_evaluations", "keeps")}
+        )
+    if found["ours"] and found["others"]:
+        found["ratio"] = found["others"]["cpu_s"] / found["ours"]["cpu_s"]
+    return found
+
+
+def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """What a solver's column says: how many mechanisms, how long it builds, what one evaluation costs."""
+    ran = rows[rows["error_q"].notna()]
+    found = {"solver": name, "family": rows["family"].iloc[0], "called_from": rows["called_from"].iloc[0]}
+    found |= {"mechanisms": int(ran["case"].nunique()), "build_s": None, "evaluation_us": None}
+    seconds = rows[rows["case"].isin(ran["case"])]["build_s"].dropna().astype(float)
+    if len(seconds):
+        found["build_s"] = [float(seconds.median()), float(seconds.max())]
+    counted = ran[ran["n_evaluations"].notna() & ran["cpu_s"].notna() & (ran["case"] == HEADLINE)]
+    if len(counted):
+        found["evaluation_us"] = float((1e6 * counted["cpu_s"] / counted["n_evaluations"].astype(float)).median())
+    drifts = ran["violation_q"].dropna().astype(float)
+    return found | {"violation": float(drifts.max()) if len(drifts) else None}
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Ratios of the fastest rival to the fastest of ours by mechanism and decade, and what of the goals holds."""
+    by_case = {str(name): own for name, own in rows.groupby("case", sort=False)}
+    made: list[dict[str, Any]] = [
+        {"case": name, "at": [at_decade(own, error) for error in DECADES]} for name, own in by_case.items()
+    ]
+    every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
+    behind = [at for at in every if at["ratio"] < 1.0 / TIED]
+    found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind), "tied": TIED}
+    found["n_ahead"] = sum(at["ratio"] > TIED for at in every)
+    found["behind"] = dict(pd.Series([at["others"]["solver"] for at in behind], dtype=object).value_counts())
+    found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
+    found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None
+    found["clear"] = [
+        each["case"] for each in made if all(at["ratio"] is None or at["ratio"] >= 1 / TIED for at in each["at"])
+    ]
+    found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
+    return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
+
+
+def _four_bar(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """On a four-bar, ours ahead of heyoka, of those called from Python, and of those called from compiled code."""
+    kinds: dict[str, Callable[[pd.DataFrame], pd.Series]] = {
+        "heyoka": lambda ranked: ranked["solver"] == HEYOKA,
+        "python": lambda ranked: ranked["called_from"] == "Python",
+        "compiled": lambda ranked: (ranked["called_from"] == "compiled") & (ranked["solver"] != HEYOKA),
+    }
+    found: dict[str, Any] = {"case": name} | {kind: [] for kind in kinds}
+    for error in SHOWN:
+        ranked = tables.ranking(rows, error)
+        if ranked.empty or not (ranked["family"] == "two-loop").any():
+            continue
+        own, others = ranked[ranked["family"] == "two-loop"], ranked[ranked["family"] != "two-loop"]
+        for kind, chosen in kinds.items():
+            some = others[chosen(others)] if len(others) else others
+            if len(some):
+                line = {"error": error, "ratio": float(some["cpu_s"].iloc[0] / own["cpu_s"].iloc[0])}
+                found[kind].append(line | {"solver": some["solver"].iloc[0], "ours": own["solver"].iloc[0]})
+    return found
+
+
+def lines(found: dict[str, Any]) -> Iterator[list[Any]]:
+    """Of the table of ratios: mechanism, ratio at each error shown."""
+    for each in found["mechanisms"]:
+        ratios = {at["error"]: at for at in each["at"]}
+        yield [each["case"], *(_cell(ratios[error]) for error in SHOWN)]
+
+
+def _cell(at: dict[str, Any]) -> str:
+    if at["ratio"] is None:
+        return "only ours" if at["ours"] else "only others" if at["others"] else "–"
+    text = number(at["ratio"])
+    return f"**{text}**" if at["ratio"] < 1.0 / TIED else text
+
+
+def headline(rows: pd.DataFrame, most: int = 9) -> Figure:
+    """The README's picture: CPU time over error on the four-bar, the cheapest three of ours and six of others."""
+    rows = rows[(rows["case"] == HEADLINE) & rows["error_q"].notna()]
+    own = rows["family"] == "two-loop"
+    chosen = figures.cheapest_lines(rows[own], SHOWN, most // 3)
+    chosen += figures.cheapest_lines(rows[~own], SHOWN, most - most // 3)
+    figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
+    for solver in chosen:
+        line = rows[rows["solver"] == solver].sort_values("error_q")
+        line = line[line["error_q"] > line["floor"]]
+        if len(line):
+            look = figures.look(line.iloc[0]) | ({"linewidth": 2.2} if line["family"].iloc[0] == "two-loop" else {})
+            axes.plot(line["error_q"].astype(float), 1e3 * line["cpu_s"].astype(float), **look)
+    axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time (ms)")
+    axes.invert_xaxis()
+    figures.legend(figure, [axes], "thick: twoloop; filled:\nkeeps the constraints")
+    figure.suptitle("Four-bar linkage, 10 s: what an accuracy costs", fontsize=10)
+    return figure
+
+
+def heat_map(found: dict[str, Any]) -> Figure:
+    """Mechanism x decade: the time of the fastest rival over that of the fastest of ours."""
+    names = [each["case"] for each in found["mechanisms"]]
+    shown = np.array([[at["ratio"] or np.nan for at in each["at"]] for each in found["mechanisms"]], dtype=float)
+    figure, axes = plt.subplots(figsize=(8.4, 0.28 * len(names) + 1.4), layout="constrained")
+    colours = plt.get_cmap("RdBu").with_extremes(bad="#e6e6e6")
+    image = axes.imshow(shown, norm=LogNorm(0.1, 10.0), cmap=colours, aspect="auto")
+    for (i, j), value in np.ndenumerate(shown):
+        if np.isfinite(value):
+            strong = abs(np.log10(value)) > 0.6
+            axes.text(j, i, number(value), ha="center", va="center", fontsize=7, color="white" if strong else "black")
+    axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES])
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(False)
+    axes.set_title("Time of the fastest rival over that of the fastest of ours (blue: ours ahead)")
+    figure.colorbar(image, ax=axes)
+    return figure

@@ -1,0 +1,75 @@
+"""Equations as expressions: the accelerations of every mechanism, the program that is made of them."""
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+from references import expressions
+from references.expressions import Expressions, NotSymbolic
+from references.ode import ode_result
+from references.straight_line import Program, Value, program_of, straight_line
+from studies.validation import MAKE
+from twoloop import Statistics
+from twoloop.mechanisms import double_pendulum, four_bar, heavy_top, n_four_bar, very_flexible_beam
+
+NUMBERS = {name: getattr(math, name) for name in ("sin", "cos", "sqrt")}  # "expressions" that are numbers
+HOLONOMIC = [make for make in (*MAKE, four_bar, very_flexible_beam) if make().system.n_a == 0]
+
+
+def known(problem):
+    """Accelerations at the start, from the whole matrix of eq. (6)."""
+    states = np.concatenate([problem.q0, problem.v0])[:, None]
+    return ode_result(problem.system, np.zeros(1), states, "", "", Statistics()).a[:, 0]
+
+
+@pytest.mark.parametrize("make", HOLONOMIC, ids=lambda make: make().name)
+def test_accelerations_of_every_mechanism(make):
+    problem = make()
+    made = Expressions(problem.system, 0.0, problem.q0, problem.v0)
+    a = made.accelerations(NUMBERS, 0.0, problem.q0.tolist(), problem.v0.tolist())
+    truth = known(problem)
+    assert np.abs(np.array(a, dtype=float) - truth).max() < 1e-9 * max(1.0, np.abs(truth).max())
+
+
+def test_redundant_rows_are_left_out_and_a_singular_mass_is_made_definite():
+    bricard, top = next(make() for make in MAKE if make().name == "A04 Bricard"), heavy_top()
+    assert len(Expressions(bricard.system, 0.0, bricard.q0, bricard.v0).rows) == 59
+    assert Expressions(top.system, 0.0, top.q0, top.v0).added == [0]  # e.e = 1
+    pendulum = double_pendulum()
+    assert Expressions(pendulum.system, 0.0, pendulum.q0, pendulum.v0).added == []
+
+
+def test_elimination_fills_little():
+    operations = []
+    for n in (5, 10, 20):
+        problem = n_four_bar(n)
+        operations.append(program_of(problem.system, 0.0, problem.q0, problem.v0)[0].operations)
+    assert operations[2] - operations[1] == pytest.approx(2 * (operations[1] - operations[0]), rel=0.02)  # linear in n
+
+
+def test_a_mass_that_no_rows_make_definite_is_refused():
+    with pytest.raises(NotSymbolic, match="stays singular"):
+        expressions._rows_for_mass(np.diag([1.0, 0.0]), np.array([[1.0, 0.0]]))
+
+
+def test_a_program_writes_each_operation_once_and_no_zeros():
+    program = Program()
+    x, y = Value(program, "x"), Value(program, "y")
+    assert (x * y).name == (y * x).name and program.operations == 1
+    assert (x + 0.0) is x and (1.0 * x) is x and 0.0 * x == 0.0 and (x - 0.0) is x and program.operations == 1
+    assert (x - y).name != (y - x).name
+    with pytest.raises(TypeError, match="given the power 3"):
+        _ = x**3
+
+
+@pytest.mark.parametrize("make", [four_bar, heavy_top, partial(n_four_bar, 2)])
+def test_straight_line_code_is_the_right_hand_side(make):
+    problem = make()
+    n = problem.q0.size
+    y, rate = np.concatenate([problem.q0, problem.v0]), np.full(2 * n, np.nan)
+    straight_line(problem.system, 0.0, problem.q0, problem.v0)(0.0, y, rate)
+    assert np.array_equal(rate[:n], problem.v0)
+    truth = known(problem)
+    assert np.abs(rate[n:] - truth).max() < 1e-10 * max(1.0, np.abs(truth).max())

@@ -1,0 +1,78 @@
+"""Two commits side by side: the same folder twice is equal, a slower side is seen, work trees come and go."""
+
+import subprocess
+
+import pytest
+
+from studies import bench_commits
+from studies.bench_commits import compared, measure, work_tree
+from studies.bench_side import Instructions, benchmarks
+from studies.cli import ROOT, StudyError
+from twoloop import solve_dae
+from twoloop.mechanisms import four_bar
+
+
+def measured(cpu, instructions=None, **counts):
+    return {"step": [{"cpu": each, "instructions": instructions, "counts": counts} for each in cpu]}
+
+
+def test_the_same_folder_twice_does_the_same_work():
+    found = measure({"a": ROOT, "b": ROOT}, ("compile", "step of Adams", "step of Nobody"), 2)
+    a, b = found["a"]["step of Adams"], found["b"]["step of Adams"]
+    assert len(a) == len(b) == 2 and a[0]["counts"] == b[0]["counts"]
+    assert a[0]["counts"]["steps"] > 500 and a[0]["cpu"] > 0.0
+    assert len(found["a"]["compile"]) == 1  # of a start there is one
+    assert "KeyError" in found["a"]["step of Nobody"][0]["error"]
+    lines = {line[0]: line for line in compared(found, ("a", "b"))}
+    assert lines["step of Nobody"][1:4] == ["KeyError", "KeyError", "–"]
+    assert "→" not in lines["step of Adams"][-1]
+
+
+def test_medians_ratio_and_counts_are_of_both_sides():
+    found = {"a": measured((1e-6, 9e-6, 2e-6), 100.0, steps=5), "b": measured((4e-6, 4e-6, 4e-6), 150.0, steps=6)}
+    assert list(compared(found, ("a", "b"))) == [["step", "2.0", "4.0", "2.0", "100.0 → 150.0", "5 → 6 steps"]]
+    assert next(compared(found, ("a", "a")))[3] == "="
+    unknown = {"a": measured((1e-6,)), "b": measured((1e-6,))}
+    assert next(compared(unknown, ("a", "b")))[4] == "not counted here"
+
+
+def test_a_side_that_ends_is_an_error(tmp_path):
+    with pytest.raises(StudyError, match="the process of old ended without an answer to 'evaluation'"):
+        measure({"old": broken(tmp_path)}, ("evaluation",), 1)
+
+
+def broken(path):
+    """A folder whose package cannot be imported."""
+    (path / "twoloop").mkdir()
+    (path / "twoloop" / "__init__.py").write_text("raise ImportError('nothing here')\n")
+    return path
+
+
+def test_a_work_tree_is_made_and_removed(tmp_path):
+    def git(*words):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        subprocess.run(["git", "-C", str(tmp_path), *identity, *words], check=True, capture_output=True)
+
+    git("init")
+    (tmp_path / "file").write_text("one")
+    git("add", "file")
+    git("commit", "-m", "first")
+    with work_tree("HEAD", tmp_path) as folder:
+        assert (folder / "file").read_text() == "one"
+    assert not folder.exists()
+    with pytest.raises(StudyError, match="there is no work tree of 'nothing'"), work_tree("nothing", tmp_path):
+        pass
+
+
+def test_the_same_commit_twice_is_refused():
+    with pytest.raises(SystemExit, match="base and head are the same"):
+        bench_commits.main(["HEAD", "--head", "HEAD"])
+
+
+def test_benchmarks_count_what_they_divide_by():
+    made = benchmarks(solve_dae, four_bar())
+    counts, units = made["step of Adams"]()
+    assert counts["steps"] == units and counts["evaluations"] > units
+    assert made["evaluation"]()[1] == made["step of DOP853"]()[0]["evaluations"]
+    before = Instructions().read()
+    assert before is None or before > 0

@@ -1,0 +1,139 @@
+"""Every mechanism against the rivals: ratios, goals and sentences follow from the rows; sizes and the limit."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from references.straight_line import program_of
+from studies import limit, rivals, scaling
+from studies.render import number
+from studies.solvers import CATALOGUE, OWN, RIVALS
+from twoloop import solve_dae
+from twoloop.mechanisms import four_bar
+
+
+def rows(*lines, case="four-bar"):
+    """Rows of (solver, family, called from, error, seconds)."""
+    made = []
+    for solver, family, called_from, error, cpu in lines:
+        row = {"group": rivals.GROUP, "case": case, "solver": solver, "family": family, "called_from": called_from}
+        row |= {
+            "error_q": error,
+            "cpu_s": cpu,
+            "cpu_q1": cpu,
+            "cpu_q3": cpu,
+            "n_evaluations": 1e6 * cpu,
+            "floor": 1e-14,
+        }
+        row |= {"violation_q": 1e-15, "violation_v": 1e-15, "energy": 0.0, "keeps_constraints": True, "build_s": 0.5}
+        made.append(row | {"status": "REACHED_END", "repeat": 0})
+    return pd.DataFrame(made)
+
+
+def compared(own, heyoka, python=9.0, error=1e-14):
+    kinds = ("heyoka", "heyoka", "compiled", error, heyoka), ("LSODA, index 1", "SciPy", "Python", error, python)
+    return rows(("Adams", "two-loop", "compiled", error, own), *kinds)
+
+
+@pytest.mark.parametrize(("own", "behind"), [(1.0, 0), (3.0, len(rivals.DECADES)), (2.1, 0)])
+def test_ahead_and_behind_follow_the_rows(own, behind):
+    found = rivals.findings_of(compared(own, 2.0))
+    assert found["n_behind"] == behind and found["n"] == len(rivals.DECADES)
+    assert found["n_ahead"] == (len(rivals.DECADES) if own == 1.0 else 0)
+    assert found["clear"] == ([] if behind else ["four-bar"])
+    assert found["behind"] == ({"heyoka": behind} if behind else {})
+    assert found["worst"]["ratio"] == pytest.approx(2.0 / own)
+
+
+def test_the_goals_are_of_each_kind_of_rival():
+    found = rivals.findings_of(compared(1.0, 2.0, python=7.0))["four_bar"][0]
+    assert {at["ratio"] for at in found["heyoka"]} == {2.0} and {at["ratio"] for at in found["python"]} == {7.0}
+    assert found["compiled"] == []  # heyoka is judged for itself
+
+
+def test_where_one_side_does_not_come_there_is_no_ratio():
+    table = pd.concat([compared(1.0, 2.0, error=1e-4), compared(1.0, 2.0, error=1e-14)[1:]], ignore_index=True)
+    at = {round(-np.log10(at["error"])): at for at in rivals.findings_of(table)["mechanisms"][0]["at"]}
+    assert at[3]["ratio"] == 2.0 and at[4]["ratio"] == 2.0
+    assert at[5]["ratio"] is None and at[5]["ours"] is None and at[5]["others"]["solver"] == "heyoka"
+    (cells,) = rivals.lines(rivals.findings_of(table))
+    assert cells == ["four-bar", "2.0", *["only others"] * 5]
+
+
+def test_a_ratio_that_we_lose_is_bold():
+    assert next(rivals.lines(rivals.findings_of(compared(4.0, 2.0))))[1] == "**0.50**"
+
+
+def test_figures_are_drawn_of_rows():
+    table = pd.concat([compared(1.0, 2.0), compared(0.5, 1.0, error=1e-3)], ignore_index=True)
+    (axes,) = rivals.headline(table).axes
+    assert len(axes.lines) == 3
+    assert len(rivals.heat_map(rivals.findings_of(table)).axes) == 2
+
+
+def test_every_solver_has_its_settings_and_every_mechanism_is_there():
+    todo = rivals.runs(False)
+    assert {run.solver.name for run in todo} == {*OWN, *RIVALS} <= set(CATALOGUE)
+    assert len({run.key(0) for run in todo}) == len(todo) and len({run.case.name for run in todo}) >= 23
+    heyoka = [run.value for run in todo if run.solver.name == "heyoka" and run.case.name == "four-bar"]
+    assert heyoka == list(rivals.BUILT)
+    assert all(run.repeats == rivals.REPEATS for run in todo if run.solver.called_from == "compiled")
+
+
+def test_the_reference_of_the_second_geometry_is_held_by_a_second_way():
+    known = rivals.problems(False)["four-bar, second"].reference
+    assert known.digits["q"] > 11.5
+
+
+class Kept(dict):
+    add = dict.__setitem__
+
+
+def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
+    todo = [run for run in rivals.runs(True) if run.solver.name in ("Adams", "CVODE from C, Adams")]
+    pytest.importorskip("sksundae")
+    kept = Kept()
+    table = rivals.collect(todo, kept)
+    refused = table[(table["case"] == "knife edge") & (table["solver"] == "CVODE from C, Adams")]
+    assert len(refused) == 1 and refused["status"].iloc[0] == "RAISED"
+    good = table[table["case"] == "four-bar"]
+    assert (good["error_q"].astype(float) < 0.1).all() and (good["cpu_s"] > 0.0).all()
+    assert good.groupby("solver")["build_s"].count().eq(1).all()
+    n_rows = len(kept)
+    rivals.collect(todo, kept)  # goes on from what is kept
+    assert len(kept) == n_rows
+
+
+def test_exponents_are_fitted_to_large_sizes():
+    assert scaling.exponent([1, 10, 20, 40], [99.0, 1.0, 4.0, 16.0]) == pytest.approx(2.0)
+    assert scaling.exponent([1, 2, 5], [1.0, 2.0, 5.0]) is None
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_chains_start_on_their_constraints(closed):
+    problem = scaling.chain(7, closed)
+    assert problem.system.n_c == 7 + closed
+    assert np.abs(problem.system.constraint(0.0, problem.q0)).max() < 1e-15
+    result = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, method="Adams")
+    assert (
+        result.success
+        and np.abs(problem.energy(0.0, result.q, result.v) - problem.energy(0.0, problem.q0, problem.v0)).max() < 1e-6
+    )
+
+
+def test_a_failed_size_is_a_row_and_no_cost():
+    row = scaling._row("open chain", scaling.chain(2, False), 2, "Nobody", 0)
+    assert row["status"] == "FAILED" and row["step_us"] is None
+    (line,) = scaling.findings_of(pd.DataFrame([row]))
+    assert line["failed"] and next(scaling.lines([line]))[2:] == ["–", "failed", "failed", "–"]
+
+
+def test_the_limit_is_counted_and_shared():
+    problem = four_bar()
+    operations = program_of(problem.system, 0.0, problem.q0, problem.v0)[0].operations
+    row = {"repeat": 0, "operations": operations, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "straight_ns": 50.0}
+    row |= {"callbacks_ns": 40.0, "Adams_evaluation_ns": 400.0, "DOP853_evaluation_ns": 200.0}
+    found = limit.findings_of(pd.DataFrame([row]))
+    assert found["best"] == "DOP853" and found["straight_faster"] == 4.0
+    assert found["share"] == pytest.approx(operations / 2000.0) and found["callbacks_share"] == 0.2
+    assert number(found["memory_share"]) == "0.014"
