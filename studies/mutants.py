@@ -52,7 +52,7 @@ ARGUED: dict[tuple[str, ...], str] = {
         "memory[DEPTH] = 0.0",
         "0.0",
         "1.0",
-    ): "another history after three refusals in a row: past a jump 15 % fewer steps, the same answers",
+    ): "another history after three refusals in a row: past a jump it takes fewer steps, to the same answers",
     (
         "adams",
         "width = (n + 3) // 4 * 4",
