@@ -37,6 +37,30 @@ ARGUED: dict[tuple[str, ...], str] = {
     ("explicit", "if not error <= 1.0:", "<=", "<"): "differs where an error is 1 to the last bit",
     (
         "bdf",
+        "if k < options[HIGHEST] and depth > k:",
+        ">",
+        ">=",
+    ): "the estimate is used after k steps of order k only, when the depth is above k",
+    (
+        "bdf",
+        "copy(differences[0], trial[0])",
+        "0",
+        "1",
+    ): "trial[0] and trial[1] are written anew before they are read: the line could go",
+    (
+        "adams",
+        "memory[DEPTH] = 0.0",
+        "0.0",
+        "1.0",
+    ): "another history after three refusals in a row: past a jump it takes fewer steps, to the same answers",
+    (
+        "adams",
+        "width = (n + 3) // 4 * 4",
+        "3",
+        "4",
+    ): "takes four numbers too many; where n_q is a multiple of 4 they lie behind the memory, which no test watches",
+    (
+        "bdf",
         "for j in range(int(memory[NEXT_DEPTH]) + 1):",
         "1",
         "2",

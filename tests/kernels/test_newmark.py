@@ -3,6 +3,7 @@
 import pytest
 
 from tests.problems import run
+from twoloop import Newmark
 
 # bounds are about 1.1 times what was counted when they were written
 PRICES = {
@@ -21,3 +22,9 @@ def test_price_of_five_seconds(linkage, tol, request):
     assert stats.n_outer < iterations
     assert stats.n_rejected_error < 0.05 * stats.n_accepted
     assert stats.n_rejected_convergence == 0
+
+
+def test_price_with_the_error_tolerance_of_the_paper(default_four_bar):
+    stats = run(default_four_bar, 5.0, method=Newmark(error_tol=1e-5)).stats
+    assert 500 < stats.n_accepted < 660
+    assert stats.n_outer < 2800
