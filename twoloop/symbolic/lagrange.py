@@ -70,12 +70,10 @@ def from_lagrangian(
     F = _forces(x, forces, coordinates)
     C, W = read_rows(x, constraints, nonholonomic)
 
-    d = x.differentiation
-    momenta = [d.by(kinetic, v) for v in x.v]
-    M = linear("dT/dv", momenta, x)
-
     def derive() -> Equations:
-        rate, n = along(momenta, x), len(x.q)
+        d, n = x.differentiation, len(x.q)
+        momenta = [d.by(kinetic, v) for v in x.v]
+        M, rate = linear("dT/dv", momenta, x), along(momenta, x)
         Q = [d.by(kinetic - potential, x.q[i]) - rate[i] - d.by(lost, x.v[i]) + F[i] for i in range(n)]
         mass = sympy.ImmutableMatrix(n, n, lambda i, j: M.get((i, j), ZERO))
         still = dict.fromkeys(x.v, ZERO)
