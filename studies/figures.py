@@ -44,6 +44,9 @@ YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "DOP853 (two-loop)": (RED, "o"),
     "Adams": (BLACK, "o"),
+    "auto": (PINK, "s"),
+    "TRBDF2": (GREEN, "v"),
+    "ESDIRK4": (BROWN, "v"),
     "Gauss12": (BLUE, "s"),
     "Gauss6": (SKY, "D"),
     "SunRadau5": (PINK, "v"),

@@ -27,10 +27,10 @@ from twoloop import ConstrainedSystem, Result, solve_dae
 
 Array = NDArray[np.float64]
 
-OWN = ("SunRadau5", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+OWN = ("auto", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA_C = "IDA from C"
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
-QUICK_OWN, QUICK_SCIPY = ("SunRadau5", "DOP853", "BDF"), ("DOP853",)
+QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
 GRACE = 6.0  # s beyond the time limit of a run after which it hangs

@@ -31,9 +31,10 @@ IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions
 CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
 ADAMS = "Adams"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
-IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "Newmark", OWN_BDF)
-PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS)  # of twoloop, with their own options
-OWN = (ADAMS, OWN_EXPLICIT, "Gauss12", "Gauss16", "RadauIIA5", OWN_BDF)  # of ours, beside the rivals
+DEFAULT = "auto"  # of solve_dae
+IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
+PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS)  # of twoloop, with their own options
+OWN = (DEFAULT, ADAMS, OWN_EXPLICIT, "Gauss12", "Gauss16", "RadauIIA5", "TRBDF2", OWN_BDF)  # of ours, beside the rivals
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
@@ -50,7 +51,7 @@ RIVALS = (
 
 # what `compare` runs, and the lines from which its figure takes the cheapest seven
 COMPARED = (
-    *(ADAMS, "DOP853 (two-loop)", "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
+    *(DEFAULT, ADAMS, "DOP853 (two-loop)", "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
     *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
 )
 

@@ -18,7 +18,7 @@ from studies.bench import Case, Run, collect
 from studies.cli import StudyError
 from studies.compare import runs_of
 from studies.render import number, power, render, table
-from studies.solvers import COMPARED, IDA_C_ORDER_2, IDA_FORMS, IRK_LINE, NEWTON_4, QUARTER, TOLERANCES
+from studies.solvers import COMPARED, DEFAULT, IDA_C_ORDER_2, IDA_FORMS, IRK_LINE, NEWTON_4, QUARTER, TOLERANCES
 from studies.store import Output
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
@@ -26,7 +26,6 @@ DOMINATED = 2.0  # a solver that costs this many times as much as another at eve
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
 STIFF = (NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studies.beam` has the paper's procedures
 QUICK = (*COMPARED[:6], "DOP853, projected")  # others take seconds to compile or to run
-DEFAULT = "SunRadau5"  # of solve_dae
 SETTINGS = ("tol", "h", "err_out")
 PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP)  # groups of rows that are not of the four cases
 IN_TABLE = 3  # solvers of a case in the report; the figure has more, the rows have all

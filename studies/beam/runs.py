@@ -33,7 +33,7 @@ PAPER = IRK
 NEWTON, NEWTON_5, DIFFERENCES = "RadauIIA5", "RadauIIA9, Newton", "RadauIIA7, Newton, by differences"
 EXPLICIT = "DOP853, projected"  # SciPy's
 EXUDYN = "Exudyn, GeneralizedAlpha, its own cable"
-OURS = ("SunRadau5", "Gauss6", "BDF", OWN_EXPLICIT)
+OURS = ("auto", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", OWN_EXPLICIT)
 INDEX_1, PEERS = ("Radau, index 1", "BDF, index 1"), ("Radau, solve_dae", "BDF, solve_dae")
 OTHERS = (IDA_C, IDA_C_ORDER_2, "IDA, stabilised", EXPLICIT, *INDEX_1, *PEERS)
 
