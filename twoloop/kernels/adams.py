@@ -19,6 +19,7 @@ from twoloop.kernels.predictor import departure, keep_predicted
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do
 N_TERMS = HIGHEST + 2  # differences that a step makes, and coefficients g and G
+STRICT = 5.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
 SAFETY = 0.8  # of advance()
 GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
 START_GROWTH = 2.0  # ... while the order still rises with every step
@@ -278,8 +279,8 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in range(n):
         d[m] = a1[m] - new[0, m]
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
-        per_v[m] = 1.0 / (atol + rtol * max(abs(v[m]), abs(v1[m])))
-        per_q[m] = 1.0 / (atol + rtol * max(abs(q[m]), abs(q1[m])))
+        per_v[m] = STRICT / (atol + rtol * max(abs(v[m]), abs(v1[m])))
+        per_q[m] = STRICT / (atol + rtol * max(abs(q[m]), abs(q1[m])))
     error = _next(memory, h, k, new, d, n)
     if not error <= 1.0:
         return DONE, error
