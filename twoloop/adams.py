@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twoloop.plan import Plan, largest_move
+from twoloop.plan import LARGEST_MOVE, Plan
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Adams:
             )
         return Plan(
             kernels.adams_step,
-            np.array([largest_move(rtol, atol, fixed)]),
+            np.array([LARGEST_MOVE]),
             np.zeros(kernels.memory_size(n_q)),
             exponent=1.0,  # the step returns the root of its error that belongs to its order
             safety=kernels.SAFETY,

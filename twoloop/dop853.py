@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from twoloop.checks import check_choice
-from twoloop.plan import INNER_TOL, Plan, check_tolerances, largest_move, least_tolerance
+from twoloop.plan import INNER_TOL, LARGEST_MOVE, Plan, check_tolerances, least_tolerance
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
@@ -82,7 +82,7 @@ class DOP853:
                 COARSE_SHARE * source.E3[:s],
                 INNER_TOL if self.inner_tol is None else self.inner_tol,
                 self.stages == "free",
-                largest_move(rtol, atol, fixed),
+                LARGEST_MOVE,
             ),
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,

@@ -47,7 +47,9 @@ class RungeKutta:
         Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
         "richardson": its largest component counts, and the step continues from the extrapolated state, put back on
         the constraints, whose order is one higher. "richardson-paper": its root mean square (27) counts, and the step
-        continues from the two half steps. Fixed steps estimate nothing and are the tableau's own.
+        continues from the two half steps. Fixed steps estimate nothing and are the tableau's own. Beside "richardson"
+        the accelerations at both ends of the step are compared with the polynomial through those of the stages: so a
+        jump of the force between an end and the stage next to it, which no stage sees, is found.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
@@ -81,7 +83,7 @@ class RungeKutta:
 
     tableau: Tableau
     outer: Literal["auto", "fixed-point", "newton", "paper"] = "fixed-point"
-    error: Literal["embedded", "richardson", "richardson-paper"] | None = None
+    error: Literal["richardson", "richardson-paper"] = "richardson"
     inner_tol: float | None = None
     outer_tol: float | None = None
     variables: Literal["velocities", "momenta"] = "velocities"
@@ -97,14 +99,7 @@ class RungeKutta:
         check_choice("outer", self.outer, ("auto", "fixed-point", "newton", "paper"))
         check_choice("variables", self.variables, ("velocities", "momenta"))
         check_choice("partition", self.partition, ("lasting", "symmetric"))
-        if self.error is not None:
-            check_choice("error", self.error, ("embedded", "richardson", "richardson-paper"))
-        if self.error == "embedded" and not self._can_embed():
-            raise ValueError(
-                f"error='embedded' needs a collocation method of three stages or more, variables='velocities' and "
-                f"outer='fixed-point' or 'auto'; given {self.tableau.name}, {self.variables!r}, {self.outer!r}. Take "
-                "error='richardson'"
-            )
+        check_choice("error", self.error, ("richardson", "richardson-paper"))
         check_choice("tested", self.tested, ("all", "positions"))
         if self.tested == "positions" and self.outer not in ("auto", "newton"):
             raise ValueError(f"tested='positions' goes with outer='newton' or 'auto' only; given {self.outer!r}")
@@ -129,7 +124,7 @@ class RungeKutta:
         """Shown in messages and tables."""
         usual = {"variables": "velocities", "partition": "lasting", "tested": "all", "outer_test": "all"}
         changed = [getattr(self, option) for option, value in usual.items() if getattr(self, option) != value]
-        return ", ".join([self.tableau.name, self.outer, self.estimate, *changed])
+        return ", ".join([self.tableau.name, self.outer, self.error, *changed])
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -147,9 +142,9 @@ class RungeKutta:
             tableau.c,
             INNER_TOL if self.inner_tol is None else self.inner_tol,
             outer_tol,
-            self._extrapolation(),
+            1.0 / (2.0**tableau.order - 1.0) if self.error == "richardson" else 0.0,
             float(self.outer_test == "all"),
-            (tableau.order - tableau.stages) / max(1, tableau.stages - 1),
+            tableau.order - 1.0,
         )
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         plan = Plan(kernels.runge_kutta_step, options, memory, 1.0 / (tableau.order + 1))
@@ -182,25 +177,6 @@ class RungeKutta:
             memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
             exponent=1.0 / (tableau.stages + 1),
         )
-
-    def _extrapolation(self) -> float:
-        from twoloop.kernels.stages import EMBEDDED
-
-        if self.estimate == "embedded":
-            return EMBEDDED
-        return 1.0 / (2.0**self.tableau.order - 1.0) if self.estimate == "richardson" else 0.0
-
-    @property
-    def estimate(self) -> str:
-        """How the error is estimated: `error`, or what stands for None there."""
-        if self.error is not None:
-            return self.error
-        return "embedded" if self._can_embed() else "richardson"
-
-    def _can_embed(self) -> bool:
-        """Whether the stages lie on the polynomial that the estimate reads, and enough of them."""
-        usual = self.outer in ("auto", "fixed-point") and self.variables == "velocities"
-        return usual and self.tableau.stages > 2 and self.tableau.collocation
 
     def _parts(self) -> int:
         """Parts of a step whose states carry the solution between its ends to the accuracy of the method."""

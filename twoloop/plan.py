@@ -13,9 +13,7 @@ Array = NDArray[np.float64]
 # Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
-LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated, with fixed steps; else ...
-MOVE_SHARE = 0.1  # ... this share of the tolerance: velocities are then off by as much, positions by the square
-MOST_MOVED = 1e-7  # ... but not more: positions are on the constraints to rounding
+LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
 LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them
@@ -49,11 +47,6 @@ class Plan:
 def least_tolerance(rtol: float, atol: float) -> float:
     """The smaller of the two, but not below rounding."""
     return max(min(rtol, atol), LEAST_TOLERANCE)
-
-
-def largest_move(rtol: float, atol: float, fixed: bool) -> float:
-    """The last move of a position in a projection."""
-    return LARGEST_MOVE if fixed else min(MOST_MOVED, MOVE_SHARE * least_tolerance(rtol, atol))
 
 
 def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:

@@ -77,13 +77,6 @@ class Tableau:
         return len(self.b)
 
     @property
-    def collocation(self) -> bool:
-        """Whether A integrates the polynomials through values at c, to rounding: sum_j a_ij c_j^(k-1) = c_i^k / k."""
-        powers = np.arange(1, self.stages + 1)
-        off = self.A @ self.c[:, None] ** (powers - 1) - self.c[:, None] ** powers / powers
-        return bool(np.abs(off).max() < CONSISTENT)
-
-    @property
     def symplectic(self) -> bool:
         """Whether b_i a_ij + b_j a_ji = b_i b_j (Sanz-Serna 1988), to rounding."""
         bA = self.b[:, None] * self.A

@@ -67,7 +67,7 @@ SHARE_IF_LINEAR = 0.01  # of the tolerance of the outer loop, where it does not 
 KEPT_WHILE = 0.1  # contraction up to which derivatives that were differenced serve on
 
 # `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^
-PLACE = N_SCALARS + 2 + 3
+PLACE = N_SCALARS + 2 + 5
 TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
 
 

@@ -42,7 +42,7 @@ def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
 @merged
 def eigen_place(options, s):
     """First place of the eigenvalue scalars."""
-    return N_SCALARS + 2 * s * s + 3 * s
+    return N_SCALARS + 2 * s * s + 5 * s
 
 
 @merged

@@ -24,14 +24,11 @@ from twoloop.kernels.common import (
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import restore_predicted
 from twoloop.kernels.stages import (
-    DECAY,
-    EMBEDDED,
     EXTRAPOLATION,
     FARTHEST,
     INNER_TOL,
     OUTER_TEST,
     OUTER_TOL,
-    STAGES,
     end_error,
     interpolate,
     tableau_of,
@@ -40,8 +37,7 @@ from twoloop.kernels.stages import (
 MAX_ITERATIONS = 60
 MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
 GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
-SHARE_OF_ENDS = 10.0  # of end_error, as the estimate of a step without half steps: errors then are near the tolerance
-SHARE_BESIDE = 0.01  # ... and beside Richardson's, for jumps between the ends and the stages
+SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
 PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
@@ -232,8 +228,6 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
     """The error of the two half steps and, with EXTRAPOLATION, their extrapolation with the whole step."""
     share = options[EXTRAPOLATION]
-    if share == EMBEDDED:
-        share = 1.0 / (2.0 ** (options[STAGES] + options[DECAY] * (options[STAGES] - 1.0)) - 1.0)
     error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
     if not (share > 0.0 and error <= 1.0):
         return DONE, error
@@ -279,9 +273,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code != DONE:
         return code, np.inf
     error = 0.0
-    # where velocities follow from rows of A, positions do not have the order that end_error goes by
-    embedded = options[EXTRAPOLATION] == EMBEDDED and w.Rate.size == w.C.size
-    if tolerances[ESTIMATE] == 1.0 and not embedded:
+    if tolerances[ESTIMATE] == 1.0:
         copy(q1, q_full)
         copy(v1, v_full)
         for j in range(s):
@@ -303,8 +295,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
-        seen = end_error(tolerances, options[DECAY], c, h, state, new_state, trial, weights, q_mid)
-        error = max(error, (SHARE_OF_ENDS if embedded else SHARE_BESIDE) * seen)
+        error = max(error, SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, trial))
     return code, max(error, w.notes[DEPARTURE])
 
 

@@ -7,10 +7,9 @@ from twoloop.kernels.common import ATOL, RTOL, compiled, inlined
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
-# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s)
-# EXTRAPOLATION: 1 / (2^order - 1), 0 without, EMBEDDED for an estimate without half steps; DECAY: see end_error
-STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, DECAY, N_SCALARS = range(7)
-EMBEDDED = -1.0
+# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`
+# EXTRAPOLATION: 1 / (2^order - 1), or 0 without; POWER: order - 1
+STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
 
 def options_array(
@@ -21,12 +20,20 @@ def options_array(
     outer_tol: float,
     extrapolation: float,
     outer_test: float = 1.0,
-    decay: float = 0.0,
+    power: float = 0.0,
 ) -> NDArray[np.float64]:
     """The parameter block that `tableau_of` reads; `outer_test` 1: (32) over dependent coordinates too."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
-    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, decay])
-    return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), b, b @ A, c])
+    scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
+    rows = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
+    return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), *rows])
+
+
+def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
+    """Weights by which the polynomial through values at distinct nodes has its value at x."""
+    factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
+    np.fill_diagonal(factors, 1.0)
+    return np.asarray(factors.prod(axis=1))
 
 
 @inlined
@@ -58,30 +65,34 @@ def interpolate(c, theta, A_stage, weights, a):
 
 
 @compiled
-def end_error(tolerances, decay, c, h, state, new_state, A_stage, weights, scratch):
-    """Error of a step as the stage polynomial of the accelerations shows it at the ends of the step, over (26).
+def end_error(tolerances, options, h, state, new_state, A_stage):
+    """Error of a step as the stage polynomial of the accelerations shows it, over (26).
 
-    It misses the accelerations there by d, a term of order h^s, where those of the stages differ by w: the terms fall
-    by (d / w)^(1 / (s - 1)) from order to order if they fall evenly, and that of the method's own order makes the error
-    h d (d / w)^decay, decay = (order - s) / (s - 1). Where they do not fall, as at a jump of the force, even one
-    between the end and the stage beside it, d is not less than w, and the error h d: steps shrink until it does not
-    matter.
+    The accelerations of the stages differ by w, a term of order h. The polynomial through them misses that at an end of
+    the step by a term of order h^s. If terms fall evenly, by a factor f an order, that of the method's own order makes
+    the error h w f^(order - 1). Where terms do not fall, as at a jump of the force, even one between an end and the
+    stage beside it, the error is h w: steps shrink until it does not matter. It is no estimate to rely on alone: the
+    one term may pass through zero, and on pendulums errors of single steps then were 100 tolerances.
     """
     s, n = A_stage.shape
+    place = N_SCALARS + 2 * s * s + 3 * s
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-    rtol = tolerances[RTOL]
     top = 0.0
-    for end in range(2):
-        interpolate(c, float(end), A_stage, weights, scratch)
-        for m in range(n):
-            d = abs(scratch[m] - (a1[m] if end == 1 else a[m]))
-            low, high = A_stage[0, m], A_stage[0, m]
-            for j in range(1, s):
-                low, high = min(low, A_stage[j, m]), max(high, A_stage[j, m])
-            if d < high - low:
-                d *= (d / (high - low)) ** decay
-            in_v = h * d / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
-            in_q = h * h * d / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
-            top = max(top, in_v, in_q)
+    for m in range(n):
+        low, high = A_stage[0, m], A_stage[0, m]
+        start, end = -a[m], -a1[m]
+        for j in range(s):
+            value = A_stage[j, m]
+            low, high = min(low, value), max(high, value)
+            start += options[place + j] * value
+            end += options[place + s + j] * value
+        width, missed = high - low, max(abs(start), abs(end))
+        error = h * max(width, missed)
+        if missed < width:
+            error *= (missed / width) ** (options[POWER] / (s - 1.0))
+        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(v[m]), abs(v1[m]))
+        top = max(top, error / scale)
+        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
+        top = max(top, h * error / scale)
     return top
