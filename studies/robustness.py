@@ -217,23 +217,29 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
 
 
+def _span(line: dict[str, Any]) -> str:
+    """From where to where a method is right, and what it reports beyond."""
+    if line["low"] is None or line["high"] is None:
+        return "–"
+    beyond = f" ({', '.join(word.lower() for word in line['said'])})" if line["said"] else ""
+    return f"{power(line['low'])} … {power(line['high'])}{beyond}"
+
+
 def tables_of(found: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
+    methods, kinds = (list(dict.fromkeys(line[key] for line in found["linkages"])) for key in ("method", "kind"))
+    of = {(line["method"], line["kind"]): line for line in found["linkages"]}
     drawn = [
-        [line["method"], line["kind"], line[RIGHT], line[SAID], line[SILENT], line["median"], line["worst"]]
-        for line in found["linkages"]
-    ]
-    names = {"size": "size, m", "density": "density, kg/m", "ratio": "density of bar 2 over the others"}
-    reached = [
         [
-            line["method"],
-            names[line["group"]],
-            "–" if line["low"] is None else power(line["low"]),
-            "–" if line["high"] is None else power(line["high"]),
-            ", ".join(word.lower() for word in line["said"]) or "–",
+            name,
+            *("/".join(str(of[name, kind][what]) for what in (RIGHT, SAID, SILENT)) for kind in kinds),
+            max(of[name, kind]["median"] for kind in kinds),
+            max(of[name, kind]["worst"] for kind in kinds),
         ]
-        for line in found["scales"]
+        for name in methods
     ]
+    reach = {(line["method"], line["group"]): line for line in found["scales"]}
+    reached = [[name, *(_span(reach[name, group]) for group in ("size", "density", "ratio"))] for name in methods]
     lasting = [
         [
             line["method"],
@@ -245,8 +251,8 @@ def tables_of(found: dict[str, Any]) -> dict[str, str]:
         for line in found["long"]
     ]
     return {
-        "linkages": table(("method", "linkages", RIGHT, SAID, SILENT, "median error", "worst / allowed"), drawn),
-        "scales": table(("method", "of", "from", "to", "beyond"), reached),
+        "linkages": table(("method", *kinds, "median error", "worst / allowed"), drawn),
+        "scales": table(("method", "size, m", "density, kg/m", "density of bar 2 over the others"), reached),
         "long": table(("method", "steps", "max abs C", "max abs C_q v", "energy (J)", "bytes a step"), lasting),
     }
 

@@ -265,10 +265,14 @@ def test_what_can_be_trusted_turns_with_the_findings(tmp_path):
     text = screen(tmp_path, validation=found | {"n_wrong": {"ours": 1, "others": 57}})
     assert "right on 17, ours only on 1 (and on 1 that our adapters do not put to others), others only on 0" in text
     assert "1 of ours, 57 of others" in text
-    traps = {"n_traps": 15, "ours_bad": [{}], "others_bad": [{}, {}], "missed_by_all": []}
+    traps = {"n_traps": 15, "ours_bad": [{}], "others_bad": [{}, {}], "missed_by_all": [], "unasked": 0}
     assert "wrong and silent, or hang: 1 of ours, 2 of others." in screen(tmp_path, honesty=traps)
+    assert "; 3 more step over a force that they never evaluate." in screen(tmp_path, honesty=traps | {"unasked": 3})
     text = screen(tmp_path, honesty=traps | {"missed_by_all": ["pulse"]})
     assert "no solver notices: pulse." in text
+    robust = {"n_linkages": 300, "long": [{}, {}], "silent": [{}]}
+    text = screen(tmp_path, robustness=robust)
+    assert "300 random linkages by 2 of our methods" in text and "1 runs are wrong and silent" in text
     assert "73 planted faults" in screen(tmp_path, planted_errors={"n": 73, "missed": ["x"]})
 
 
@@ -286,7 +290,7 @@ def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):
         "honesty",
     ):
         assert f"not run yet (`python -m studies.{name}`)" in text
-    assert text.count(": not run yet") + text.count("(not run yet:") == 13 + len(index.STUDIES)
+    assert text.count(": not run yet") + text.count("(not run yet:") == 14 + len(index.STUDIES)
     assert "Not judged by quick runs" in index.first_screen(tmp_path, True)
     (tmp_path / "beam.json").write_text("{")
     with pytest.raises(StudyError, match=r"beam.json cannot be read.*studies.beam again"):
