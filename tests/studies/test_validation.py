@@ -113,3 +113,11 @@ def test_sentences_turn_with_the_rows():
     assert "Ours alone" not in text
     text, _ = text_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
     assert "Ours alone: double pendulum." in text
+
+
+def test_a_run_that_did_not_move_has_no_drift():
+    problem = mechanisms.double_pendulum()
+    result = CATALOGUE["Adams"].run(end_states.case_of(problem), 1e-6, 0)
+    assert end_states.drift(problem, result) > 0.0
+    at_rest = replace(result, t=result.t[:1], q=result.q[:, :1], v=result.v[:, :1])
+    assert end_states.drift(problem, at_rest) is None
