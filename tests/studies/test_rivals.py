@@ -122,7 +122,7 @@ def test_chains_start_on_their_constraints(closed):
 
 
 def test_a_failed_size_is_a_row_and_no_cost():
-    row = scaling._row("open chain", scaling.chain(2, False), 2, "Nobody", 0)
+    row = scaling._row("open chain", scaling.chain(2, False), 2, "Unknown", 0)
     assert row["status"] == "FAILED" and row["step_us"] is None
     (line,) = scaling.findings_of(pd.DataFrame([row]))
     assert line["failed"] and next(scaling.lines([line]))[2:] == ["–", "failed", "failed", "–"]
