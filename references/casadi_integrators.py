@@ -27,6 +27,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 STEPS_A_RUN = 100_000  # at most, of IDAS
+LARGEST_COMPILED = 9  # coordinates; the compiler takes minutes for the exact Jacobian of large ones
 OUTPUTS = 1000  # of collocation, at most: CasADi divides its elements at every output
 DEGREE = 5  # of the Gauss collocation, so of order 10
 ROOT = {"abstol": 1e-12, "max_iter": 60}  # of its root finder, which has no control of the step: less fails
@@ -46,7 +47,8 @@ def solve_idas(
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with IDAS of CasADi.
 
     What it was given: exact Jacobians, by CasADi's derivatives; accelerations eliminated symbolically; where there is a
-    C compiler `cc`, expressions compiled by it with -O3, which halves the time. Else CasADi interprets them.
+    C compiler `cc`, expressions compiled by it with -O3, which halves the time (up to `LARGEST_COMPILED` coordinates).
+    Else CasADi interprets them.
 
     Parameters
     ----------
@@ -195,7 +197,7 @@ def _integrator(
     casadi, compiler = _casadi(), shutil.which("cc")
     arguments = ("motion", plugin, _equations(system, t0, q0, v0), t0, np.frombuffer(times).tolist())
     given = dict(options) | ({"rootfinder_options": ROOT} if plugin == "collocation" else {})
-    if plugin != "idas" or compiler is None:
+    if plugin != "idas" or compiler is None or system.n_q > LARGEST_COMPILED:
         return casadi.integrator(*arguments, given)
     # CasADi writes for the compiler into the working folder, whatever it is told; it has loaded all when it returns
     with tempfile.TemporaryDirectory() as folder, chdir(folder):

@@ -92,12 +92,14 @@ def violations(system: ConstrainedSystem, result: Result) -> dict[str, float]:
 
 
 def drift(problem: Problem, result: Result) -> float | None:
-    """Largest change of the energy over the largest kinetic energy of the run; None where it is no invariant."""
+    """Largest change of the energy over the largest kinetic energy; None where it is no invariant or nothing moved."""
     if not problem.conserved:
         return None
     t, q, v = result.t, result.q, result.v
     energy = problem.energy(t, q, v)
     kinetic = float((energy - problem.energy(t, q, 0.0 * v)).max())
+    if kinetic == 0.0:  # a run that failed at its start
+        return None
     return float(np.abs(energy - problem.energy(t[0], problem.q0, problem.v0)).max()) / kinetic
 
 

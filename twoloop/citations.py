@@ -68,6 +68,20 @@ ENTRIES = {
   edition = {2},
   year = {1993}
 }""",
+    "hosea": """@article{hosea1996,
+  title = {Analysis and implementation of {TR-BDF2}},
+  author = {Hosea, M. E. and Shampine, L. F.},
+  journal = {Applied Numerical Mathematics},
+  volume = {20},
+  pages = {21--37},
+  year = {1996}
+}""",
+    "kennedy": """@techreport{kennedy2016,
+  title = {Diagonally Implicit {Runge}-{Kutta} Methods for Ordinary Differential Equations: A Review},
+  author = {Kennedy, C. A. and Carpenter, M. H.},
+  number = {NASA/TM-2016-219173},
+  year = {2016}
+}""",
     "krogh": """@incollection{krogh1974,
   title = {Changing stepsize in the integration of differential equations using modified divided differences},
   author = {Krogh, F. T.},
@@ -90,7 +104,10 @@ METHODS = {
     "Lobatto IIIE": ("geometric",),
     "Newmark": ("newmark",),
     "BDF": ("brenan",),
+    "TRBDF2": ("hosea",),
+    "ESDIRK4": ("kennedy",),
     "DOP853": ("explicit",),
+    "auto": ("explicit", "krogh", "shampine", "hosea", "stiff"),
     "Adams": ("krogh", "shampine"),
 }
 

@@ -204,7 +204,7 @@ def test_lsoda_does_not_step_towards_a_singularity_without_end():
         (
             {"method": "Euler"},
             ValueError,
-            "method must be one of DOP853, RK45, LSODA, Radau, BDF, Pr8, Pr9; given",
+            "method must be one of DOP853, RK45, LSODA, Radau, BDF, Pr8, Pr9; given 'Euler'",
         ),
         ({"stabilisation": "glue"}, ValueError, "stabilisation must be one of none, baumgarte, projection"),
         ({"stabilisation": "projection", "method": "LSODA"}, ValueError, "explicit one-step method, DOP853 or RK45"),

@@ -17,14 +17,14 @@ def measured(cpu, instructions=None, **counts):
 
 
 def test_the_same_folder_twice_does_the_same_work():
-    found = measure({"a": ROOT, "b": ROOT}, ("compile", "step of Adams", "step of Nobody"), 2)
+    found = measure({"a": ROOT, "b": ROOT}, ("compile", "step of Adams", "step of Unknown"), 2)
     a, b = found["a"]["step of Adams"], found["b"]["step of Adams"]
     assert len(a) == len(b) == 2 and a[0]["counts"] == b[0]["counts"]
     assert a[0]["counts"]["steps"] > 500 and a[0]["cpu"] > 0.0
     assert len(found["a"]["compile"]) == 1  # of a start there is one
-    assert "KeyError" in found["a"]["step of Nobody"][0]["error"]
+    assert "KeyError" in found["a"]["step of Unknown"][0]["error"]
     lines = {line[0]: line for line in compared(found, ("a", "b"))}
-    assert lines["step of Nobody"][1:4] == ["KeyError", "KeyError", "–"]
+    assert lines["step of Unknown"][1:4] == ["KeyError", "KeyError", "–"]
     assert "→" not in lines["step of Adams"][-1]
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from references.straight_line import program_of
 from studies import limit, rivals, scaling
-from studies.render import number
+from studies.render import number, render
 from studies.solvers import CATALOGUE, OWN, RIVALS
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
@@ -122,7 +122,7 @@ def test_chains_start_on_their_constraints(closed):
 
 
 def test_a_failed_size_is_a_row_and_no_cost():
-    row = scaling._row("open chain", scaling.chain(2, False), 2, "Nobody", 0)
+    row = scaling._row("open chain", scaling.chain(2, False), 2, "Unknown", 0)
     assert row["status"] == "FAILED" and row["step_us"] is None
     (line,) = scaling.findings_of(pd.DataFrame([row]))
     assert line["failed"] and next(scaling.lines([line]))[2:] == ["–", "failed", "failed", "–"]
@@ -137,3 +137,24 @@ def test_the_limit_is_counted_and_shared():
     assert found["best"] == "DOP853" and found["straight_faster"] == 4.0
     assert found["share"] == pytest.approx(operations / 2000.0) and found["callbacks_share"] == 0.2
     assert number(found["memory_share"]) == "0.014"
+
+
+@pytest.mark.parametrize(
+    ("own", "said", "not_said"),
+    [
+        (0.5, ["No rival is ahead anywhere.", "at least the 2 aimed at"], ["the worst is"]),
+        (1.5, ["No rival is ahead anywhere.", "the goal of 2 is missed at 1e-3"], ["the worst is"]),
+        (4.0, ["the worst is four-bar at 1e-3, where `heyoka` takes 0.50 of the time of `Adams`"], ["No rival"]),
+    ],
+)
+def test_sentences_follow_the_rows(own, said, not_said):
+    machine = {"operations": 700.0, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "straight_ns": 50.0, "repeat": 0}
+    machine |= {"callbacks_ns": 40.0, "divisions": 8.0, "functions": 6.0}
+    machine |= {f"{method}_evaluation_ns": 200.0 for method in limit.METHODS}
+    found = {"cases": [], "drift": None, "scaling": [], "steep": [], "fitted": 10, "versions": {}, "slow": 0.2}
+    found |= {"rivals": rivals.findings_of(compared(own, 2.0, python=9.0))}
+    found |= {"machine": limit.findings_of(pd.DataFrame([machine]))}
+    ready = dict.fromkeys(("ratios", "solvers", "scaling"), "")
+    text = render("work_precision", found, ready, stamp="", quick=False)
+    assert all(words in text for words in said) and not any(words in text for words in not_said)
+    assert "4.0 times faster" in text

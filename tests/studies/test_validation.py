@@ -160,3 +160,11 @@ def test_sentences_of_steps_and_of_models_follow_their_rows():
     assert "first steps with too large an error" not in text
     assert "Exudyn" not in text
     assert number_of_words(text) < 1000
+
+
+def test_a_run_that_did_not_move_has_no_drift():
+    problem = mechanisms.double_pendulum()
+    result = CATALOGUE["Adams"].run(end_states.case_of(problem), 1e-6, 0)
+    assert end_states.drift(problem, result) > 0.0
+    at_rest = replace(result, t=result.t[:1], q=result.q[:, :1], v=result.v[:, :1])
+    assert end_states.drift(problem, at_rest) is None
