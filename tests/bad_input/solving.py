@@ -143,7 +143,7 @@ SOLVE = [
         solve,
         "method",
         [
-            ("RK45", ValueError, "must be one of SunRadau5.*given 'RK45'", "take one of the names listed"),
+            ("RK45", ValueError, "must be one of auto.*given 'RK45'", "take one of the names listed"),
             (None, TypeError, "must be a name .*given None", "leave it out for the default"),
             (5, TypeError, "must be a name .*given 5", "take a name or a method object"),
         ],
