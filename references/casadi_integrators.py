@@ -179,7 +179,7 @@ def _casadi() -> Any:
     return casadi
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=256)
 def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> dict[str, Any]:
     casadi, n = _casadi(), system.n_q
     made = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
@@ -189,7 +189,7 @@ def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> di
     return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions, t, q, v))}
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def _integrator(
     plugin: str, system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, options: tuple[Any, ...], times: bytes
 ) -> Any:

@@ -104,7 +104,7 @@ def solve_cvode_c(
     return ode_result(system, kept[: len(rows)], rows.T, failure, end, statistics)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
     """CVODE's right-hand side function."""
     derivative = straight_line(system, t0, np.frombuffer(q0), np.frombuffer(v0))

@@ -104,7 +104,7 @@ def solve_diffrax(
     return ode_result(system, times, states, failure, f"diffrax reached the end, t = {t1:g}.", statistics)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
     """(t0, t1, y0, rtol, atol, times) -> states as rows, what failed ("": nothing), steps, rejected ones."""
     try:

@@ -101,7 +101,7 @@ def solve_heyoka(
     return ode_result(system, kept, states, failure, end, Statistics(n_accepted=steps, cpu_time=cpu))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> tuple[Any, Any]:
     """An integrator, and heyoka's names of outcomes."""
     try:

@@ -108,7 +108,7 @@ def straight_line(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) ->
     return _compiled(system, t0, q0.tobytes(), v0.tobytes())
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
     n = system.n_q
     program, names = program_of(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
