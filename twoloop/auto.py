@@ -27,11 +27,6 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
         step=kernels.switching_step,
         options=kernels.switching_options(limit, MATRIX_COST + n_q / 8.0, each, first.options, second.options),
         memory=kernels.switching_memory(n_q, first.memory, second.memory),
-        exponent=1.0,
-        safety=kernels.SAFETY_OF_ALL,
-        factor_min=min(plan.factor_min for plan in plans),
-        factor_max=max(plan.factor_max for plan in plans),
-        predictive=False,
         first=first.step,
         second=second.step,
     )

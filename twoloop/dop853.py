@@ -88,6 +88,7 @@ class DOP853:
             exponent=1.0 / 8.0,
             safety=SAFETY,
             predictive=True,
+            free=self.stages == "free",
             least_error=LEAST_ERROR,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )

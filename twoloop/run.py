@@ -104,7 +104,9 @@ class Run:
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
         q0 = self.state[: self.system.n_q]
-        return workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
+        work = workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
+        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.free else 1.0
+        return work
 
     def _begin(self) -> None:
         code = self.a.start(self.kit, self.work, self.t0, self.state)

@@ -34,6 +34,7 @@ from twoloop.kernels.common import (
     PIVOT,
     REDUCED,
     SINGULAR,
+    STEP_FACTOR,
     VECTOR,
     WORK,
     f8,
@@ -209,6 +210,7 @@ def advance(
         w.notes[DEPARTURE] = 0.0
         w.notes[ORIENTATION_NEW] = 0.0
         w.notes[FAULT_KIND] = -1.0
+        w.notes[STEP_FACTOR] = 0.0
         code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
             code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
@@ -249,6 +251,8 @@ def advance(
             factor = min(control[FACTOR_MAX], max(control[FACTOR_MIN], factor))
             if accepted and control[PREDICTIVE] == 1.0 and 1.0 <= factor <= KEPT:
                 factor = 1.0
+        if w.notes[STEP_FACTOR] > 0.0:
+            factor = w.notes[STEP_FACTOR]
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1

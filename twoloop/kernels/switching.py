@@ -22,7 +22,9 @@ from twoloop.kernels.common import (
     N_JACOBIANS,
     OUTER_DIVERGED,
     REUSE,
+    ROUNDED,
     STEP,
+    STEP_FACTOR,
     compiled,
     inlined,
     kernel,
@@ -30,8 +32,6 @@ from twoloop.kernels.common import (
 from twoloop.kernels.linalg import copy
 
 KEPT = 1.2  # see advance.py
-JUST_REFUSED = 1.0 + 1e-9
-SAFETY_OF_ALL = 0.8  # of advance(); no method of a pair has less
 EARLY = 100.0  # evaluations before the first look at the rate
 INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
 ITERATIONS = 4
@@ -227,7 +227,7 @@ def _factor(memory, each, h, error):
 
 @kernel(STEP)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt by one of the two; the error is returned such that advance() takes the step which that method wants.
+    """One attempt by one of the two, and the step that it asks for next, as advance() would choose it.
 
     A method of the second kind begins anew each time; its memory is all zeros then.
     """
@@ -251,7 +251,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
     begin = N_OPTIONS + int(options[SIZE_1])
     each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
-    w.notes[REUSE] = each[REUSE_OF]
+    w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         first[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
         code, error = f.first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
@@ -268,7 +268,5 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if memory[PHASE] == ON_TRIAL:
         error *= STRICT
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
-    factor = _factor(memory, each, h, error)
-    if error > 1.0:
-        return code, max(JUST_REFUSED, SAFETY_OF_ALL / factor)
-    return code, min(1.0, SAFETY_OF_ALL / factor)
+    w.notes[STEP_FACTOR] = _factor(memory, each, h, error)
+    return code, error
