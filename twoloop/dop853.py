@@ -71,7 +71,7 @@ class DOP853:
         from twoloop.kernels import explicit as kernels
 
         source = scipy.integrate.DOP853
-        s = len(source.B)
+        s, free = len(source.B), self.stages == "free"
         return Plan(
             kernels.explicit_step,
             kernels.options_array(
@@ -81,14 +81,14 @@ class DOP853:
                 source.E5[:s],  # the last weight, of the slope at the end, is 0 in both
                 COARSE_SHARE * source.E3[:s],
                 INNER_TOL if self.inner_tol is None else self.inner_tol,
-                self.stages == "free",
+                free,
                 LARGEST_MOVE,
             ),
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,
             safety=SAFETY,
-            predictive=True,
-            free=self.stages == "free",
+            predictive=free,
+            watchful=free,
             least_error=LEAST_ERROR,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )

@@ -39,7 +39,7 @@ class Plan:
     predictive: bool = False
     least_error: float = LEAST_ERROR
     reuse: float = 0.0  # correction of a position up to which the Jacobian before it serves, within a step
-    free: bool = False  # whether stages are off the constraints: not near singular positions
+    watchful: bool = False  # whether short steps are a reason to look how near a singular position is
     lands: bool = False  # whether steps are shortened to end at output times
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends

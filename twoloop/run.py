@@ -105,7 +105,7 @@ class Run:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
         q0 = self.state[: self.system.n_q]
         work = workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
-        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.free else 1.0
+        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
 
     def _begin(self) -> None:

@@ -33,6 +33,7 @@ from twoloop.kernels.common import (
     ORIENTATION_NEW,
     PIVOT,
     REDUCED,
+    SENSITIVITY,
     SINGULAR,
     STEP_FACTOR,
     VECTOR,
@@ -209,7 +210,8 @@ def advance(
             return STEP_TOO_SMALL
         w.notes[DEPARTURE] = 0.0
         w.notes[ORIENTATION_NEW] = 0.0
-        w.notes[FAULT_KIND] = -1.0
+        if clock[FAILURE_CODE] == DONE:
+            w.notes[FAULT_KIND] = -1.0
         w.notes[STEP_FACTOR] = 0.0
         code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
@@ -267,7 +269,6 @@ def advance(
         w.counters[N_ACCEPTED] += 1
         clock[H_LONG] = max(size, FADING * clock[H_LONG])
         clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
-        clock[FAILURE_CODE] = DONE
         clock[N_FIXED] += in_grid
         if lands:
             clock[T] = target
@@ -290,6 +291,7 @@ def advance(
         clock[LIMIT_AGE] += 1.0
         if clock[LIMIT_AGE] > control[LIMIT_MEMORY]:
             clock[H_LIMIT] = control[LIMIT_START]
+            clock[FAILURE_CODE] = DONE  # until then it is why steps are short
         if lands:
             clock[NEXT_OUTPUT] += 1.0
             if int(clock[NEXT_OUTPUT]) == outputs.size:
@@ -307,6 +309,7 @@ def advance(
                 # a motion may go straight towards a singular position, and its partition show nothing of it
                 if renew_partition(f, w, clock[T], state[:n]) != DONE:
                     return RANK_LOST
+                w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
                 if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
                     w.notes[NEARLY_SINGULAR] = 1.0
             short = size < SHORT * clock[H_LONG] and not fixed and not lands

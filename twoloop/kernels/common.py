@@ -141,7 +141,7 @@ def _type_of_work(value: Any, context: Any) -> Any:
     RANK_V,
     CONTRADICTION,  # row that was taken for redundant and is violated
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
-    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or its stages are on the constraints anyhow
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
     STEP_FACTOR,  # the step that a method asks for next, over this one; 0: advance() chooses it from the error
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     N_NOTES,
