@@ -99,6 +99,7 @@ class Run:
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
         self.clock[advance.H_LIMIT] = plan.limit_start
+        self.crossings: list[float] = []  # times near which steps went across a singular position
         self._begin()
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
@@ -316,6 +317,7 @@ class Run:
         from twoloop.kernels import bridge
 
         a, clock = self.a, self.clock
+        self.crossings.append(float(clock[a.T]))
         plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
         control = self.control.copy()
         control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
@@ -343,6 +345,16 @@ class Run:
         self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
         return self.plan, self.control, a.PAUSED
 
+    def _crossed(self) -> str:
+        """What a run that succeeded has to say of singular positions."""
+        if not self.crossings:
+            return ""
+        times = ", ".join(f"{t:.4g}" for t in self.crossings[:3]) + (", ..." if len(self.crossings) > 3 else "")
+        return (
+            f" Near t = {times} steps went across positions where the constraints lose rank: beyond these, errors may "
+            "exceed the tolerances."
+        )
+
     def _statistics(self, cpu: float) -> Statistics:
         c = self.work.counters
         return Statistics(
@@ -365,7 +377,7 @@ class Run:
         failure = int(self.clock[a.FAILURE_CODE])
         if code == a.ALL_OUTPUT_DONE:
             fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
-            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}."
+            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._crossed()}"
         if code == INTERRUPTED:
             return (
                 Status.INTERRUPTED,
