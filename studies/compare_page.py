@@ -27,6 +27,7 @@ MEASURES = {
     "violation_q": "largest violation of positions, |C|",
     "violation_v": "largest violation of velocities",
 }
+SETTINGS = ("h", "err_out", "tol")
 COSTS = {"cpu_s": "CPU time (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 
@@ -54,7 +55,9 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         stamps[name] = first.removeprefix("# ")
     if not parts:
         raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
-    return pd.concat(parts, ignore_index=True), stamps
+    rows = pd.concat(parts, ignore_index=True)
+    # rows of cost against size have no setting, and no error to compare
+    return rows[rows[[name for name in SETTINGS if name in rows]].notna().any(axis=1)].reset_index(drop=True), stamps
 
 
 def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
