@@ -15,6 +15,8 @@ author = "The twoloop contributors"
 copyright = author
 version = release = twoloop.__version__
 
+# Sphinx links the word for a type in a docstring to attributes of that name, of which classes may share one
+suppress_warnings = ["ref.python"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build", "generated/extra"]
 html_extra_path = ["generated/extra"]  # the animations of the gallery, copied as they are
