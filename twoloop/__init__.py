@@ -15,6 +15,7 @@ from twoloop.solve import solve_dae
 from twoloop.storage import load
 from twoloop.sweeps import sweep
 from twoloop.system import ConstrainedSystem
+from twoloop.taylor import Taylor
 
 __version__ = "0.1.0"
 
@@ -32,6 +33,7 @@ __all__ = [
     "RungeKutta",
     "Statistics",
     "Status",
+    "Taylor",
     "callback",
     "citation",
     "consistent_state",

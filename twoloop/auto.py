@@ -3,8 +3,11 @@
 from dataclasses import dataclass, replace
 
 from twoloop.plan import Method, Plan, least_tolerance
+from twoloop.system import ConstrainedSystem
+from twoloop.taylor import Taylor
 
 MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method
+SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853, for few coordinates
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
 LIMIT_FEW, LIMIT_MANY = 2.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
@@ -36,7 +39,8 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
 class Auto:
     """Explicit steps where nothing is stiff, Newton's method where stiffness is measured; both ways during a run.
 
-    A run begins with `few`, or with `many` where there are 16 coordinates or more and evaluations are the cost. Every
+    A run begins with `series` where the operations of the callbacks can be seen, and the tolerance is below 1e-6 or
+    there are 16 coordinates or more; else with `few`, or with `many` for as many coordinates. Every
     600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where the
     steps have come near the limit of stability that it sets, the implicit method is tried for 15 steps and kept if a
     second of motion costs it less, counted in evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, else
@@ -49,6 +53,8 @@ class Auto:
     ----------
     few, many : method object
         Explicit methods, for few and for many coordinates.
+    series : Taylor or None
+        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows.
     loose, tight : method object
         Implicit methods, for loose and for tight tolerances.
     fixed : method object
@@ -57,6 +63,7 @@ class Auto:
 
     few: Method
     many: Method
+    series: Taylor | None
     loose: Method
     tight: Method
     fixed: Method
@@ -66,11 +73,22 @@ class Auto:
         """Shown in messages and tables."""
         return "auto"
 
+    def for_system(self, system: ConstrainedSystem) -> "Auto":
+        """The same for the operations of a system, without `series` where they cannot be seen."""
+        if self.series is None or system.called_in_python:  # functions whose values may depend on more than arguments
+            return replace(self, series=None)
+        try:
+            return replace(self, series=self.series.for_system(system))
+        except ValueError:
+            return replace(self, series=None)
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
+        tolerance = least_tolerance(rtol, atol)
+        second = (self.loose if tolerance >= LOOSE else self.tight).plan(n_q, rtol, atol, False)
+        if self.series is not None and (n_q >= MANY or tolerance < SERIES):
+            return switching(self.series.plan(n_q, rtol, atol, False), second, LIMIT_FEW, n_q)
         explicit, limit = (self.few, LIMIT_FEW) if n_q < MANY else (self.many, LIMIT_MANY)
-        implicit = self.loose if least_tolerance(rtol, atol) >= LOOSE else self.tight
-        first, second = (method.plan(n_q, rtol, atol, False) for method in (explicit, implicit))
-        return switching(first, second, limit, n_q)
+        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q)

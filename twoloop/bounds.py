@@ -64,7 +64,7 @@ def _index_error(function: Dispatcher, t: float, state: list[Array], p: Array, o
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                _Rewritten(wrap).value(function)(
+                Rewritten(wrap).value(function)(
                     t, *(array.copy() for array in state), p.copy(), *(array.copy() for array in out)
                 )
         except IndexError as error:
@@ -83,8 +83,10 @@ def _with_bounds_checked(function: types.FunctionType) -> Any:
     return njit(boundscheck=True, error_model="numpy")(function)
 
 
-class _Rewritten:
+class Rewritten:
     """Copies of functions with other ones in the place of the compiled helpers that they name or enclose."""
+
+    functions: tuple[type, ...] = (Dispatcher,)  # what is copied
 
     def __init__(self, wrap: Callable[[types.FunctionType], Any]):
         self.wrap = wrap
@@ -92,7 +94,7 @@ class _Rewritten:
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
         """What stands in the place of a value; `names` are those in the code that names it."""
-        if isinstance(value, Dispatcher):
+        if isinstance(value, self.functions):
             if id(value) not in self.known:
                 self._rewrite(value)
             return self.known[id(value)]
@@ -107,8 +109,8 @@ class _Rewritten:
                 return module
         return value
 
-    def _rewrite(self, helper: Dispatcher) -> None:
-        function = helper.py_func
+    def _rewrite(self, helper: Any) -> None:
+        function = getattr(helper, "py_func", helper)
         names = frozenset(names_in(function.__code__))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         own_globals = dict(function.__globals__)

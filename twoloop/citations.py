@@ -33,6 +33,22 @@ ENTRIES = {
   pages = {50--64},
   year = {1964}
 }""",
+    "pryce": """@article{pryce2001,
+  title = {A simple structural analysis method for {DAE}s},
+  author = {Pryce, J. D.},
+  journal = {BIT Numerical Mathematics},
+  volume = {41},
+  pages = {364--394},
+  year = {2001}
+}""",
+    "jorba": """@article{jorba2005,
+  title = {A software package for the numerical integration of {ODE}s by means of high-order {Taylor} methods},
+  author = {Jorba, {\\`A}. and Zou, M.},
+  journal = {Experimental Mathematics},
+  volume = {14},
+  pages = {99--117},
+  year = {2005}
+}""",
     "stiff": """@book{hairer1996,
   title = {Solving Ordinary Differential Equations {II}: Stiff and Differential-Algebraic Problems},
   author = {Hairer, E. and Wanner, G.},
@@ -107,8 +123,9 @@ METHODS = {
     "TRBDF2": ("hosea",),
     "ESDIRK4": ("kennedy",),
     "DOP853": ("explicit",),
-    "auto": ("explicit", "krogh", "shampine", "hosea", "stiff"),
+    "auto": ("explicit", "krogh", "shampine", "pryce", "jorba", "hosea", "stiff"),
     "Adams": ("krogh", "shampine"),
+    "Taylor": ("pryce", "jorba"),
 }
 
 

@@ -13,6 +13,7 @@ from twoloop.dop853 import DOP853
 from twoloop.esdirk import ESDIRK
 from twoloop.plan import INNER_TOL, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
+from twoloop.taylor import Taylor
 
 NEWTON_TOL_FIXED = 1e-12  # the same where stiff forces magnify rounding
 LIMIT_OF_FIXED_POINT = 1.5  # h rho from which on the fixed-point iteration converges slowly: Newton's method is tried
@@ -333,6 +334,7 @@ PRESETS: dict[str, Method] = {
     "auto": Auto(
         few=DOP853(),
         many=Adams(),
+        series=Taylor(),
         loose=ESDIRK("TRBDF2"),
         tight=RungeKutta(radau_iia(3), outer="newton", tested="positions"),
         fixed=RungeKutta(sun_radau_iib(3), outer="auto"),
@@ -346,6 +348,7 @@ PRESETS: dict[str, Method] = {
     "BDF": BDF(),
     "DOP853": DOP853(),
     "Adams": Adams(),
+    "Taylor": Taylor(),
     "PaperIRK": paper_irk(),
     "PaperNewmark": paper_newmark(),
 }

@@ -70,8 +70,8 @@ def solve_dae(
         Consistent initial coordinates and velocities (see `consistent_state`).
     method : str or method object
         "auto" (default: explicit where nothing is stiff, Newton's method where stiffness is measured, see `Auto`),
-        "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "TRBDF2", "ESDIRK4", "BDF", "Newmark",
-        "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`, `ESDIRK(...)`, `Newmark(...)`, `BDF(...)`, ...
+        "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "TRBDF2", "ESDIRK4", "BDF",
+        "Newmark", "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`, `ESDIRK(...)`, `Newmark(...)`, ...
     rtol : float
     atol : float or array_like (n_q,)
         A step is accepted when the largest component of its estimated error over atol + rtol |value| is at most 1:
@@ -130,7 +130,7 @@ def solve_dae(
     if progress is not None:
         check_flag("progress", progress)
     check_flag("check_derivatives", check_derivatives)
-    method = check_method(method)
+    chosen = check_method(method)
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)
@@ -154,7 +154,7 @@ def solve_dae(
         check_size("max_steps", max_steps, 1)
     if time_limit is not None:
         check_positive("time_limit", time_limit)
-    if system.n_a > 0 and getattr(method, "variables", "velocities") == "momenta":
+    if system.n_a > 0 and getattr(chosen, "variables", "velocities") == "momenta":
         raise ValueError(
             f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
             f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
@@ -162,17 +162,21 @@ def solve_dae(
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     check_start(system, t0, q0, v0, derivatives=check_derivatives)
 
-    plan = method.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-    interior = method.plan(system.n_q, float(rtol), float(atol.min()), True) if plan.parts > 1 else None
+    if hasattr(chosen, "for_system"):
+        chosen = chosen.for_system(system)
+    plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
+    interior = plan.interior
+    if plan.parts > 1 and interior is None:
+        interior = chosen.plan(system.n_q, float(rtol), float(atol.min()), True)
     run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interior)
     if step_size is None:
         run.set_sizes(first_step, float(max_step), t1)
     if max_steps is not None:
         run.control[run.a.MAX_STEPS] = max_steps
-    with _progress_bar(progress, method.name, t0, t1) as report:
+    with _progress_bar(progress, chosen.name, t0, t1) as report:
         wanted = Wanted(times, plan.lands or step_size is not None, bool(dense_output), event_functions)
         result = run.go(t1, wanted, report, time_limit, check_derivatives)
-    return replace(result, method=method.name)
+    return replace(result, method=chosen.name)
 
 
 def check_method(method: str | Method) -> Method:

@@ -126,6 +126,7 @@ class ConstrainedSystem:
         self._returning: dict[str, Any] = {}
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
+        self.series: Any = None  # the program of its Taylor series, when it was first needed
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
@@ -209,6 +210,11 @@ class ConstrainedSystem:
         system = cls(**sizes, **options, **wrappers, parameters=[python.handle])
         system._python = python  # the registry holds it weakly
         return system
+
+    @property
+    def python_functions(self) -> dict[str, Any]:
+        """The plain Python functions by kind, where it is made of these and they are not compiled."""
+        return {} if self._python is None else self._python.functions
 
     @property
     def called_in_python(self) -> bool:

@@ -367,3 +367,61 @@ def _least_norm(w, lam):
             for k in range(r):
                 lam[rows[k]] += part[i] * Z[i, k]
             i += 1
+
+
+@merged
+def solve_for_order(f, w, r, c, a, lam):
+    """M a + G^T lam = r and G a = c, by the factors of the accelerations found just before; r is overwritten."""
+    n, rows_v = r.size, w.rows_v
+    lam[:] = 0.0
+    if f.flags[REDUCED] == 0:
+        _times_inverse_mass(f, w, r, a)
+        for i in range(rows_v.size):
+            total = -c[rows_v[i]]
+            for j in range(n):
+                total += w.G[rows_v[i], j] * a[j]
+            w.z[i] = total
+        ldl_solve(w.S, w.z)
+        for i in range(rows_v.size):
+            lam[rows_v[i]] = w.z[i]
+            for j in range(n):
+                a[j] -= w.W[i, j] * w.z[i]
+        return
+    rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
+    n_dof, z, x, y = independent.size, w.z, w.x, w.y
+    for k in range(rows.size):
+        z[k] = c[rows[k]]
+    solve(w.index_v, w.values_v, z)
+    diagonal = f.flags[DIAGONAL_MASS] == 1
+    copy(r, y)
+    for k in range(rows.size):
+        m = columns[k]
+        if diagonal:
+            y[m] -= w.M[m, m] * z[k]
+        else:
+            for j in range(n):
+                y[j] -= w.M[j, m] * z[k]
+    for j in range(n_dof):
+        total = y[independent[j]]
+        for k in range(rows.size):
+            total += w.D[j, k] * y[columns[k]]
+        x[j] = total
+    ldl_solve(w.A, x)
+    for j in range(n_dof):
+        a[independent[j]] = x[j]
+        for k in range(rows.size):
+            z[k] += w.D[j, k] * x[j]
+    for k in range(rows.size):
+        a[columns[k]] = z[k]
+    for k in range(rows.size):
+        m = columns[k]
+        total = r[m]
+        if diagonal:
+            total -= w.M[m, m] * a[m]
+        else:
+            for j in range(n):
+                total -= w.M[m, j] * a[j]
+        z[k] = total
+    solve_transposed(w.index_v, w.values_v, z)
+    for k in range(rows.size):
+        lam[rows[k]] = z[k]

@@ -1,0 +1,196 @@
+"""The Taylor series of the motion: every operation that it knows, every kind of mechanism, and what it refuses."""
+
+import math
+
+import numpy as np
+import pytest
+
+from twoloop import ConstrainedSystem, Taylor, callback, consistent_state, solve_dae
+from twoloop.mechanisms import (
+    andrews,
+    bricard,
+    driven_crank,
+    four_bar,
+    heavy_top,
+    knife_edge,
+    redundant_slider_crank,
+    rolling_disc,
+    spatial_four_bar,
+)
+from twoloop.series import series_program
+
+FORCES = {
+    "sine and cosine": lambda t, q, v: math.sin(q) * math.cos(2.0 * q),
+    "tangent": lambda t, q, v: -math.tan(0.3 * q),
+    "square root": lambda t, q, v: -math.sqrt(1.0 + q * q),
+    "hypot": lambda t, q, v: -math.hypot(q, v),
+    "exponential": lambda t, q, v: -math.exp(0.5 * q),
+    "logarithm": lambda t, q, v: -math.log(3.0 + q),
+    "arctangent": lambda t, q, v: -math.atan(2.0 * q),
+    "hyperbolic": lambda t, q, v: -math.sinh(0.3 * q) + 0.1 * math.cosh(0.2 * v) - math.tanh(q),
+    "quotient": lambda t, q, v: (1.0 - q) / (4.0 + q + v),
+    "powers": lambda t, q, v: -(q**3) + (5.0 + q) ** -2 - 0.1 * (4.0 + q) ** 2.5 + 0.01 * (4.0 + v) ** 1.7,
+    "time": lambda t, q, v: -q + math.sin(3.0 * t) / (1.0 + 0.1 * t * t),
+    "velocity": lambda t, q, v: -q - 0.2 * v * v * math.sin(v),
+}
+
+
+def one_coordinate(law):
+    return ConstrainedSystem.from_python(
+        n_q=1,
+        n_c=0,
+        mass=lambda t, q: np.array([[1.0]]),
+        force=lambda t, q, v: np.array([law(t, q[0], v[0])]),
+        name="one coordinate",
+    )
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_every_operation_gives_the_motion_of_another_method(name):
+    system = one_coordinate(FORCES[name])
+    ends = [
+        solve_dae(system, (0.0, 2.0), [0.4], [0.7], method, 1e-12, 1e-12).q[0, -1]
+        for method in ("Taylor", Taylor(order=11), "DOP853")
+    ]
+    assert abs(ends[0] - ends[2]) < 1e-10
+    assert abs(ends[1] - ends[2]) < 1e-10
+
+
+PROBLEMS = {
+    "loop": (four_bar, 1e-10),
+    "varying mass": (andrews, 1e-9),
+    "redundant rows": (redundant_slider_crank, 1e-9),
+    "60 rows of rank 59": (bricard, 1e-10),
+    "drive": (driven_crank, 1e-10),
+    "singular mass": (heavy_top, 1e-9),
+    "non-holonomic row": (knife_edge, 1e-10),
+    "both kinds of row": (rolling_disc, 1e-10),
+    "spatial loop": (spatial_four_bar, 1e-10),
+}
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_every_kind_of_mechanism_ends_at_its_reference(name):
+    make, allowed = PROBLEMS[name]
+    problem = make()
+    known = problem.reference
+    result = solve_dae(problem.system, (0.0, known.t), problem.q0, problem.v0, "Taylor", 1e-12, 1e-12)
+    assert result.success, result.message
+    assert np.nanmax(np.abs(result.q[:, -1] - known.q)) < allowed
+    for t, q in zip(result.t, result.q.T, strict=True):
+        assert np.abs(problem.system.constraint(t, q)).max(initial=0.0) < 1e-12
+    balance = problem.system.mass(known.t, result.q[:, -1]) @ result.a[:, -1]
+    balance += problem.system.rows(known.t, result.q[:, -1]).T @ result.lam[:, -1]
+    force = problem.system.force(known.t, result.q[:, -1], result.v[:, -1])
+    assert np.abs(balance - force).max() < 1e-9 * max(1.0, np.abs(force).max())
+
+
+@pytest.mark.parametrize("order", [4, 6, 8])
+def test_constant_steps_have_the_order_asked_for(order):
+    problem = driven_crank()
+    errors = []
+    for steps in (40, 80):
+        h = problem.reference.t / steps
+        result = solve_dae(
+            problem.system, (0.0, problem.reference.t), problem.q0, problem.v0, Taylor(order), step_size=h
+        )
+        errors.append(np.nanmax(np.abs(result.q[:, -1] - problem.reference.q)))
+    assert order - 0.5 < np.log2(errors[0] / errors[1]) < order + 1.0
+
+
+def test_the_error_follows_the_tolerance():
+    problem = four_bar()
+    for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
+        result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, "Taylor", tolerance, tolerance)
+        assert np.abs(result.q[:, -1] - problem.reference.q).max() < 5.0 * tolerance
+
+
+def test_between_steps_the_solution_is_as_good_as_at_their_ends():
+    problem = four_bar()
+    times = np.linspace(0.0, 3.0, 61)
+    options = {"t_eval": times, "rtol": 1e-12, "atol": 1e-12}
+    series, other = (
+        solve_dae(problem.system, (0.0, 3.0), problem.q0, problem.v0, method, **options)
+        for method in ("Taylor", "DOP853")
+    )
+    assert np.abs(series.q - other.q).max() < 1e-10
+    assert np.abs(series.v - other.v).max() < 1e-9
+
+
+def test_the_program_shares_what_is_computed_twice():
+    program = series_program(four_bar().system)
+    assert len(program.early.first.column) == 12  # sines and cosines of three angles, and their products with rates
+    assert len(program.late.first.column) == 6  # their products with sums of multipliers
+    assert len(program.early.groups) == 2
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = 1.0
+
+
+@callback("force")
+def stop(t, q, v, p, Q):
+    Q[0] = -100.0 * q[0] if q[0] < 0.0 else -1.0
+
+
+def test_a_callback_that_branches_is_refused_by_name_and_auto_goes_on_without():
+    system = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=stop, constant_mass=True, name="stop")
+    with pytest.raises(ValueError, match=r"force of 'stop': it branches .* Take 'Adams' or 'DOP853'"):
+        solve_dae(system, (0.0, 1.0), [0.1], [0.0], "Taylor")
+    assert solve_dae(system, (0.0, 1.0), [0.1], [0.0]).success
+
+
+def pendulum(**changes):
+    functions = {
+        "mass": lambda t, q: np.eye(2),
+        "force": lambda t, q, v: np.array([0.0, -9.81]),
+        "constraint": lambda t, q: np.array([q[0] ** 2 + q[1] ** 2 - 1.0]),
+        "jacobian": lambda t, q: np.array([[2.0 * q[0], 2.0 * q[1]]]),
+    }
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, name="pendulum", **(functions | changes))
+
+
+def test_gamma_is_not_needed_but_the_jacobian_is():
+    known = solve_dae(pendulum(), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "DOP853", 1e-11, 1e-11)
+    result = solve_dae(pendulum(), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "Taylor", 1e-11, 1e-11)
+    assert np.abs(result.q[:, -1] - known.q[:, -1]).max() < 1e-8
+    with pytest.raises(ValueError, match="does not give jacobian"):
+        solve_dae(pendulum(jacobian=None), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
+
+
+def test_a_python_function_that_changes_is_followed():
+    gravity = [9.81]
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -gravity[0]]))
+    heavy = solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
+    gravity[0] = 1.0
+    light = solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
+    assert np.abs(light.q[:, -1] - heavy.q[:, -1]).max() > 0.1
+
+
+def test_a_function_that_returns_the_wrong_shape_on_symbols_is_refused():
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81]) if isinstance(q[0], float) else np.zeros(3))
+    with pytest.raises(ValueError, match=r"force of 'pendulum': on symbols .* shape \(3,\)"):
+        solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
+
+
+@pytest.mark.parametrize(("order", "kind"), [(3, ValueError), (41, ValueError), (8.5, TypeError), ("high", TypeError)])
+def test_an_order_out_of_range_is_refused(order, kind):
+    with pytest.raises(kind, match="order"):
+        Taylor(order)
+
+
+def test_the_method_alone_says_what_it_needs():
+    with pytest.raises(ValueError, match="for_system"):
+        Taylor().plan(2, 1e-8, 1e-8, False)
+
+
+def test_a_start_between_known_states_is_consistent_first():
+    problem = four_bar()
+    moved = problem.q0.copy()
+    moved[2] += 0.01
+    q, v = consistent_state(problem.system, 0.0, moved, problem.v0)
+    result = solve_dae(problem.system, (0.0, 1.0), q, v, "Taylor", 1e-10, 1e-10)
+    other = solve_dae(problem.system, (0.0, 1.0), q, v, "DOP853", 1e-10, 1e-10)
+    assert np.abs(result.q[:, -1] - other.q[:, -1]).max() < 1e-8

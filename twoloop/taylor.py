@@ -1,0 +1,131 @@
+"""Taylor(): the Taylor series of the motion, found from the equations of the callbacks."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks import check_size
+from twoloop.plan import LARGEST_MOVE, Plan, least_tolerance
+from twoloop.series import SeriesProgram, series_program
+from twoloop.system import ConstrainedSystem
+from twoloop.tracing import Untraceable
+
+Array = NDArray[np.float64]
+
+LOWEST, HIGHEST = 4, 40  # orders that may be asked for
+PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
+FIXED = 19  # order of constant steps
+FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
+PADDED = 8  # operations of a table are a multiple of this
+
+
+@dataclass(frozen=True)
+class Taylor:
+    """The Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
+
+    The cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes milliseconds
+    and compiles nothing. From the operations that they are made of follow the coefficients of q, v, a and lam, order by
+    order: one linear solution with the matrix of the accelerations each, and no derivative of the constraints beyond
+    C_q. gamma and kinematics are not used. A step is as long as the series allows; its end is moved to the nearest
+    state on the constraints, in the metric of M. So the method departs from the paper, whose outer loop knows
+    independent coordinates only.
+
+    It takes callbacks that give C_q and do not branch on t, q or v, made of + - * /, powers, sin, cos, tan, sqrt,
+    hypot, exp, log, atan, sinh, cosh and tanh. `solve_dae` raises ValueError where they are not, and names the
+    callback.
+
+    Parameters
+    ----------
+    order : int, optional
+        Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
+        digit of the smaller tolerance, or 19 with constant steps.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If order is not such a number.
+
+    Notes
+    -----
+    The orders to which each equation is to be differentiated: J. D. Pryce, A simple structural analysis method for
+    DAEs, BIT 41 (2001), 364-394. The step: the length at which each of the last two terms is within the tolerance, A.
+    Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
+    Experimental Mathematics 14 (2005), 99-117. In the statistics every coefficient counts as an evaluation.
+    """
+
+    order: int | None = None
+    program: SeriesProgram | None = None  # of one system; solve_dae puts it in
+
+    def __post_init__(self) -> None:
+        if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
+            raise ValueError(f"order must be between {LOWEST} and {HIGHEST}; given {self.order}")
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return "Taylor" if self.order is None else f"Taylor(order={self.order})"
+
+    def for_system(self, system: ConstrainedSystem) -> "Taylor":
+        """The method with the operations of this system.
+
+        Raises
+        ------
+        ValueError
+            If its callbacks do not run on symbols.
+        """
+        program = system.series
+        if program is None:
+            try:
+                program = series_program(system)
+            except Untraceable as error:
+                raise ValueError(
+                    f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
+                ) from error
+        if not system.called_in_python:  # what such functions find in their surroundings may change
+            system.series = program
+        return replace(self, program=program)
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels import taylor as kernels
+
+        program = self.program
+        if program is None:
+            raise ValueError("Taylor() knows no system yet: take for_system(system), as solve_dae does")
+        order = self.order
+        if order is None:
+            digits = -math.log10(least_tolerance(rtol, atol))
+            order = FIXED if fixed else math.ceil(LEAST + PER_DIGIT * max(digits, 0.0))
+        highest = order + 1
+        widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
+        plan = Plan(
+            kernels.taylor_step,
+            _options(program, highest, widths),
+            np.zeros(kernels.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
+            exponent=1.0 / highest,
+            safety=1.0,
+            factor_max=kernels.GROWTH,
+            watchful=True,
+            parts=min(max(highest // 3, FEWEST), MOST),
+        )
+        kept = plan.options.copy()
+        kept[kernels.KEEP] = 1.0
+        return replace(plan, interior=replace(plan, options=kept, memory=plan.memory.copy()))
+
+
+def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
+    """The parameter block that the step reads, integers by their bits."""
+    from twoloop.kernels import taylor as kernels
+
+    tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
+    arrays: list[Any] = [*tables[0], *tables[1], *program.rows, *program.balance]
+    arrays = [each.view(np.float64) if each.dtype == np.int64 else each for each in arrays]
+    scalars = np.zeros(kernels.N_SCALARS)
+    scalars[kernels.ORDER], scalars[kernels.THETA], scalars[kernels.N_NODES] = highest, LARGEST_MOVE, program.n_nodes
+    scalars[kernels.EARLY_WIDTH], scalars[kernels.LATE_WIDTH] = widths
+    begin = kernels.N_SCALARS + kernels.N_ARRAYS + 1
+    ends = begin + np.cumsum([0, *(len(each) for each in arrays)])
+    return np.concatenate([scalars, ends.astype(float), *arrays])
