@@ -63,10 +63,10 @@ class SeriesProgram:
         Ends with the products of G v.
     late : Table
         Ends with those of G^T lam + M a.
-    rows : Sums
-        G v + G_t, but for multiples of v.
-    balance : Sums
-        Q - G^T lam - M a, but for multiples of lam and a.
+    rows, row_places : Sums, ndarray
+        G v + G_t, but for multiples of v: those that are not zero, and which they are.
+    balance, balance_places : Sums, ndarray
+        Q - G^T lam - M a, but for multiples of lam and a, likewise.
     """
 
     n_q: int
@@ -74,7 +74,9 @@ class SeriesProgram:
     early: Table
     late: Table
     rows: Sums
+    row_places: Integers
     balance: Sums
+    balance_places: Integers
 
     @property
     def n_nodes(self) -> int:
@@ -205,9 +207,17 @@ def _assembled(
         n_rows,
         _table(tables[0], place),
         _table(tables[1], place),
-        _sums([_without(form, v_and_a) for form in rows], place),
-        _sums([_without(form, range(1 + 2 * n, n_inputs)) for form in balance], place),
+        *_scattered([_without(form, v_and_a) for form in rows], place),
+        *_scattered([_without(form, range(1 + 2 * n, n_inputs)) for form in balance], place),
     )
+
+
+def _scattered(forms: list[Form], place: dict[int, int]) -> tuple[Sums, Integers]:
+    """Those forms that are not zero, and which they are."""
+    kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
+    sums = _sums([forms[k] for k in kept], place)
+    places = np.array(kept, dtype=np.int64)
+    return sums._replace(row=places[sums.row]), places
 
 
 def _without(form: Form, inputs: range) -> Form:

@@ -121,7 +121,8 @@ def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
     from twoloop.kernels import taylor as kernels
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
-    arrays: list[Any] = [*tables[0], *tables[1], *program.rows, *program.balance]
+    arrays: list[Any] = [*tables[0], *tables[1], *program.rows, program.row_places]
+    arrays += [*program.balance, program.balance_places]
     arrays = [each.view(np.float64) if each.dtype == np.int64 else each for each in arrays]
     scalars = np.zeros(kernels.N_SCALARS)
     scalars[kernels.ORDER], scalars[kernels.THETA], scalars[kernels.N_NODES] = highest, LARGEST_MOVE, program.n_nodes

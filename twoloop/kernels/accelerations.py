@@ -371,10 +371,13 @@ def _least_norm(w, lam):
 
 @merged
 def solve_for_order(f, w, r, c, a, lam):
-    """M a + G^T lam = r and G a = c, by the factors of the accelerations found just before; r is overwritten."""
-    n, rows_v = r.size, w.rows_v
-    lam[:] = 0.0
+    """M a + G^T lam = r and G a = c, by the factors of the accelerations found just before.
+
+    Entries of lam that belong to rows that do not count are left as they are.
+    """
+    n = r.size
     if f.flags[REDUCED] == 0:
+        rows_v = w.rows_v
         _times_inverse_mass(f, w, r, a)
         for i in range(rows_v.size):
             total = -c[rows_v[i]]
@@ -388,40 +391,48 @@ def solve_for_order(f, w, r, c, a, lam):
                 a[j] -= w.W[i, j] * w.z[i]
         return
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
-    n_dof, z, x, y = independent.size, w.z, w.x, w.y
+    n_dof, z, x, y, D, M = independent.size, w.z, w.x, w.y, w.D, w.M
+    diagonal = f.flags[DIAGONAL_MASS] == 1
     for k in range(rows.size):
         z[k] = c[rows[k]]
     solve(w.index_v, w.values_v, z)
-    diagonal = f.flags[DIAGONAL_MASS] == 1
-    copy(r, y)
-    for k in range(rows.size):
-        m = columns[k]
-        if diagonal:
-            y[m] -= w.M[m, m] * z[k]
-        else:
+    if diagonal:
+        for k in range(columns.size):
+            m = columns[k]
+            y[k] = r[m] - M[m, m] * z[k]
+        for j in range(n_dof):
+            total = r[independent[j]]
+            for k in range(columns.size):
+                total += D[j, k] * y[k]
+            x[j] = total
+    else:
+        copy(r, a)  # for a while: r - M g
+        for k in range(columns.size):
+            m = columns[k]
             for j in range(n):
-                y[j] -= w.M[j, m] * z[k]
-    for j in range(n_dof):
-        total = y[independent[j]]
-        for k in range(rows.size):
-            total += w.D[j, k] * y[columns[k]]
-        x[j] = total
+                a[j] -= M[m, j] * z[k]
+        for j in range(n_dof):
+            total = a[independent[j]]
+            for k in range(columns.size):
+                total += D[j, k] * a[columns[k]]
+            x[j] = total
     ldl_solve(w.A, x)
     for j in range(n_dof):
         a[independent[j]] = x[j]
-        for k in range(rows.size):
-            z[k] += w.D[j, k] * x[j]
-    for k in range(rows.size):
-        a[columns[k]] = z[k]
-    for k in range(rows.size):
-        m = columns[k]
-        total = r[m]
+    for k in range(columns.size):
+        m, change = columns[k], 0.0
+        for j in range(n_dof):
+            change += D[j, k] * x[j]
+        a[m] = z[k] + change
         if diagonal:
-            total -= w.M[m, m] * a[m]
-        else:
+            z[k] = y[k] - M[m, m] * change
+    if not diagonal:
+        for k in range(columns.size):
+            m = columns[k]
+            total = r[m]
             for j in range(n):
-                total -= w.M[m, j] * a[j]
-        z[k] = total
+                total -= M[m, j] * a[j]
+            z[k] = total
     solve_transposed(w.index_v, w.values_v, z)
     for k in range(rows.size):
         lam[rows[k]] = z[k]

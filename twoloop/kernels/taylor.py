@@ -48,7 +48,9 @@ ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-EARLY, LATE, ROWS, BALANCE, N_ARRAYS = 0, N_TABLE, 2 * N_TABLE, 2 * N_TABLE + N_SUMS, 2 * N_TABLE + 2 * N_SUMS
+PLACES = N_SUMS  # behind the arrays of sums: which they are
+EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
+BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
 # places in `memory`: scalars, two series of q (ORDER + 1, n_q), then scratch, see _scratch
@@ -72,7 +74,7 @@ GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong t
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
     """Length of `memory`."""
     rows = order + 2
-    scratch = rows * (n_nodes + 2 * early + 2 * late) + early + late + 2 * (n_q + n_rows)
+    scratch = rows * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch
 
 
@@ -131,15 +133,16 @@ def _gather(options, sums, groups, g, more, values, out):
 
 
 @merged
-def _sum(options, sums, values, out):
-    """All sums of a list, less their constants."""
+def _sum(options, sums, scale, values, out):
+    """All sums of a list, less their constants, times a factor; the rest of `out` stays."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
+    places = _integers(options, sums + PLACES)
     for o in range(column.size):
-        out[o] = coefficient[o] * values[column[o]]
+        out[places[o]] = scale * coefficient[o] * values[column[o]]
     row, column = _integers(options, sums + ROW), _integers(options, sums + MORE_COLUMN)
     coefficient = _numbers(options, sums + MORE_COEFFICIENT)
     for e in range(row.size):
-        out[row[e]] += coefficient[e] * values[column[e]]
+        out[row[e]] += scale * coefficient[e] * values[column[e]]
 
 
 @compiled
@@ -246,23 +249,18 @@ def _expand(f, w, options, memory, t, state, unit, series):
     begin += early
     total2 = memory[begin : begin + late]
     begin += late
-    r = memory[begin : begin + n]
-    a = memory[begin + n : begin + 2 * n]
-    c = memory[begin + 2 * n : begin + 2 * n + n_rows]
-    lam = memory[begin + 2 * n + n_rows : begin + 2 * n + 2 * n_rows]
+    r, c = memory[begin : begin + n], memory[begin + n : begin + n + n_rows]
     T, Q, V, A, LAM = 0, 1, 1 + n, 1 + 2 * n, 1 + 3 * n
     first = 1 + 3 * n + n_rows
     second = first + _integers(options, EARLY + FIRST + COLUMN).size
-    balance_constant = _numbers(options, BALANCE + CONSTANT)
+    places, constant = _integers(options, BALANCE + PLACES), _numbers(options, BALANCE + CONSTANT)
 
+    r[:], c[:] = 0.0, 0.0
     N[0, T], N[1, T] = t, unit
     for j in range(n):
         N[0, Q + j] = series[0, j] = state[j]
         N[0, V + j] = state[n + j]
         N[1, Q + j] = series[1, j] = unit * state[n + j]
-        N[0, A + j] = 0.0
-    for i in range(n_rows):
-        N[0, LAM + i] = 0.0
     _begin(options, EARLY, N[0], N[0, first:], X1[0], Y1[0])
     for k in range(order - 1):
         K = k + 1
@@ -270,28 +268,25 @@ def _expand(f, w, options, memory, t, state, unit, series):
             N[K, T] = 0.0
         _interior(X1, Y1, K, total1)
         _operate(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
-        _sum(options, ROWS, N[K], c)
-        scale = -K / unit
-        for i in range(n_rows):
-            c[i] *= scale
+        _sum(options, ROWS, -K / unit, N[K], c)
         if k == 0:
             _begin(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
         else:
             _interior(X2, Y2, k, total2)
             _operate(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
-        _sum(options, BALANCE, N[k], r)
+        _sum(options, BALANCE, 1.0, N[k], r)
         if k == 0:
-            for j in range(n):
-                r[j] += balance_constant[j]
+            for o in range(places.size):
+                r[places[o]] += constant[o]
+        a, lam = N[k, A : A + n], N[k, LAM : LAM + n_rows]
+        if w.rows_v.size < n_rows:
+            lam[:] = 0.0
         solve_for_order(f, w, r, c, a, lam)
         per_v, per_q = unit / K, unit / (K + 1)
         for j in range(n):
-            N[k, A + j] = a[j]
             v = per_v * a[j]
             N[K, V + j] = v
             N[K + 1, Q + j] = series[K + 1, j] = per_q * v
-        for i in range(n_rows):
-            N[k, LAM + i] = lam[i]
         _complete(options, EARLY, N[K], Y1[K])
         _complete(options, LATE, N[k], Y2[k])
     w.counters[N_EVALUATIONS] += order - 1
