@@ -1,6 +1,7 @@
 """The Taylor series of the motion: every operation that it knows, every kind of mechanism, and what it refuses."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from twoloop.mechanisms import (
     rolling_disc,
     spatial_four_bar,
 )
+from twoloop.methods import PRESETS
 from twoloop.series import series_program
 
 FORCES = {
@@ -99,6 +101,36 @@ def test_constant_steps_have_the_order_asked_for(order):
     assert order - 0.5 < np.log2(errors[0] / errors[1]) < order + 1.0
 
 
+@pytest.mark.parametrize("make", [four_bar, heavy_top, rolling_disc, driven_crank])
+def test_code_compiled_for_a_mechanism_gives_the_same_run(make):
+    problem = make()
+    runs = [
+        solve_dae(problem.system, (0.0, problem.reference.t), problem.q0, problem.v0, method, 1e-9, 1e-9)
+        for method in (Taylor(), Taylor(compiled=True))
+    ]
+    assert runs[1].stats.n_accepted == runs[0].stats.n_accepted
+    assert np.abs(runs[1].q[:, -1] - runs[0].q[:, -1]).max() < 1e-9
+    assert runs[1].method == "Taylor(compiled=True)"
+
+
+@pytest.mark.parametrize("name", ["logarithm", "arctangent", "exponential", "square root", "quotient", "powers"])
+def test_compiled_operations_give_the_same_run(name):
+    system = one_coordinate(FORCES[name])
+    runs = [solve_dae(system, (0.0, 2.0), [0.4], [0.7], Taylor(compiled=each), 1e-10, 1e-10) for each in (False, True)]
+    assert abs(runs[1].q[0, -1] - runs[0].q[0, -1]) < 1e-12
+
+
+def test_equations_too_long_to_compile_are_refused():
+    problem = spatial_four_bar()
+    with pytest.raises(ValueError, match="of at most 200 operations; these are 322. Leave it out"):
+        solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, Taylor(compiled=True))
+
+
+def test_auto_takes_no_compiled_series():
+    with pytest.raises(ValueError, match="series of Auto must not be compiled"):
+        replace(PRESETS["auto"], series=Taylor(compiled=True))
+
+
 def test_the_error_follows_the_tolerance():
     problem = four_bar()
     for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
@@ -179,6 +211,8 @@ def test_a_function_that_returns_the_wrong_shape_on_symbols_is_refused():
 def test_an_order_out_of_range_is_refused(order, kind):
     with pytest.raises(kind, match="order"):
         Taylor(order)
+    with pytest.raises(TypeError, match="compiled"):
+        Taylor(compiled=1)
 
 
 def test_the_method_alone_says_what_it_needs():

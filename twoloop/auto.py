@@ -68,6 +68,10 @@ class Auto:
     tight: Method
     fixed: Method
 
+    def __post_init__(self) -> None:
+        if self.series is not None and self.series.compiled:
+            raise ValueError("series of Auto must not be compiled: leave compiled out of Taylor(...)")
+
     @property
     def name(self) -> str:
         """Shown in messages and tables."""

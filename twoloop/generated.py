@@ -85,11 +85,17 @@ def code_of(function: Any) -> GeneratedCode | None:
 @cache
 def _functions(code: GeneratedCode) -> dict[str, Any]:
     path, text = _path(code.key), f"{_head(code.source)}\n{code.source}"
-    if GeneratedCode.stored(code.key) != code:
+    names = {"math": math, "np": np, "GENERATED": code}
+    return module_of(f"twoloop_equations_{code.key}", path, text, GeneratedCode.stored(code.key) != code, names)
+
+
+def module_of(name: str, path: Path, text: str, missing: bool, names: dict[str, Any]) -> dict[str, Any]:
+    """What generated source defines, beside the names that it uses; it is written to a file first if it is missing."""
+    if missing:
         _write(path, text)
-    module = types.ModuleType(f"twoloop_equations_{code.key}")
-    vars(module).update(math=math, np=np, GENERATED=code)
-    sys.modules[module.__name__] = module  # numba reads no machine code of functions whose module it cannot import
+    module = types.ModuleType(name)
+    vars(module).update(names)
+    sys.modules[name] = module  # numba reads no machine code of functions whose module it cannot import
     exec(compile(text, str(path), "exec"), vars(module))
     linecache.checkcache(str(path))
     return vars(module)

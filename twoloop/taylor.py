@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks import check_size
+from twoloop.checks import check_flag, check_size
 from twoloop.plan import LARGEST_MOVE, Plan, least_tolerance
 from twoloop.series import SeriesProgram, series_program
+from twoloop.series_code import compiled_series, source_of
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import Untraceable
 
@@ -43,10 +44,14 @@ class Taylor:
         Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
         digit of the smaller tolerance, or 19 with constant steps.
 
+    compiled : bool
+        Whether the series is found by code compiled for the mechanism, in about two thirds of the time: worth its
+        compilation of some 3 s, kept on disk, for many runs of one mechanism with the same parameters.
+
     Raises
     ------
     TypeError, ValueError
-        If order is not such a number.
+        If order is not such a number, or compiled not True or False.
 
     Notes
     -----
@@ -57,16 +62,20 @@ class Taylor:
     """
 
     order: int | None = None
+    compiled: bool = False
     program: SeriesProgram | None = None  # of one system; solve_dae puts it in
 
     def __post_init__(self) -> None:
         if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
             raise ValueError(f"order must be between {LOWEST} and {HIGHEST}; given {self.order}")
+        check_flag("compiled", self.compiled)
 
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        return "Taylor" if self.order is None else f"Taylor(order={self.order})"
+        changed = {"order": self.order, "compiled": self.compiled or None}
+        given = ", ".join(f"{name}={value}" for name, value in changed.items() if value is not None)
+        return f"Taylor({given})" if given else "Taylor"
 
     def for_system(self, system: ConstrainedSystem) -> "Taylor":
         """The method with the operations of this system.
@@ -113,7 +122,11 @@ class Taylor:
         )
         kept = plan.options.copy()
         kept[kernels.KEEP] = 1.0
-        return replace(plan, interior=replace(plan, options=kept, memory=plan.memory.copy()))
+        interior = replace(plan, options=kept, memory=plan.memory.copy())
+        if not self.compiled:
+            return replace(plan, interior=interior)
+        plan.options[kernels.COMPILED] = 1.0
+        return replace(plan, first=compiled_series(source_of(program)), interior=interior)
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:

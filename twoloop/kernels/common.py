@@ -213,7 +213,7 @@ def _imports(text: str) -> set[str]:
 
 
 @cache
-def _stamp(module: str) -> str:
+def stamp(module: str) -> str:
     """A digest of what the kernels of a module depend on: its source, those of all it imports, and the callbacks."""
     known: set[str] = set()
     found = {module}
@@ -236,10 +236,10 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
         return compile_kept(
             function,
             signature,
-            (_stamp(Path(inspect.getfile(function)).stem), ""),
+            (stamp(Path(inspect.getfile(function)).stem), ""),
             announcement=_ANNOUNCEMENT,
             pipeline_class=VectorizingCompiler if vectorized else KernelCompiler,
-            **_OPTIONS,
+            **OPTIONS,
         )
 
     return compile_now
@@ -247,7 +247,7 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
 
 # NaN and infinity keep their meaning. Without numba's runtime no array can be allocated, so a step that would does not
 # compile, and none is reference-counted, which costs an evaluation of the four-bar a third of its time
-_OPTIONS: dict[str, Any] = {
+OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
     "nogil": True,
@@ -258,7 +258,7 @@ _OPTIONS: dict[str, Any] = {
 def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     """A decorator for what kernels call; such a function must not be called from Python."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return njit(**{**_OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
+    return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
 # a helper whose floating-point operations keep their order; said outright, because a callee inherits its caller's flags

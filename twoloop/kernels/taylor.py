@@ -44,7 +44,8 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits
 # KEEP: steps follow one another by the same series, about the first state, as between the ends of a step
-ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
+# COMPILED: the series is found by f.first, code made for the mechanism
+ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, COMPILED, N_SCALARS = range(8)
 # arrays of a table; arrays of sums as twoloop.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
@@ -64,8 +65,9 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_LENGTH,
     TRIED,  # 1: the last attempt left a series that takes over if it was accepted
     PASSED,  # with KEEP: time since the state of the series, s
+    TARGET,  # which of the two series is to be found
     N_MEMORY_SCALARS,
-) = range(10)
+) = range(11)
 
 ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
@@ -90,13 +92,14 @@ def _numbers(options, which):
 
 
 @inlined
-def _series(memory, order, n, which):
+def series_of(memory, order, n, which):
+    """One of the two series of q (order + 1, n_q)."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n].reshape((order + 1, n))
 
 
 @merged
-def _interior(X, Y, K, total):
+def interior(X, Y, K, total):
     """total[m] = sum over 0 < j < K of X[j, m] Y[K - j, m]."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
@@ -146,7 +149,7 @@ def _sum(options, sums, scale, values, out):
 
 
 @compiled
-def _begin(options, table, values, z, x, y):
+def begin_operations(options, table, values, z, x, y):
     """Order zero of all operations of a table: the functions themselves; those that wait stay zero."""
     groups = _integers(options, table + GROUPS)
     constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
@@ -228,11 +231,11 @@ def _complete(options, table, values, y):
     _gather(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
-@compiled
-def _expand(f, w, options, memory, t, state, unit, series):
-    """The series about a state whose factors are in w, in a unit of time; DONE, or why there is none."""
-    n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
+@inlined
+def arrays_of(options, memory, n, n_rows):
+    """Scratch: the coefficients of all quantities, of the arguments of operations, sums of products, r and c."""
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
+    order = int(options[ORDER])
     depth = order + 2
     begin = N_MEMORY_SCALARS + 2 * (order + 1) * n
     N = memory[begin : begin + depth * n_nodes].reshape((depth, n_nodes))
@@ -249,30 +252,66 @@ def _expand(f, w, options, memory, t, state, unit, series):
     begin += early
     total2 = memory[begin : begin + late]
     begin += late
-    r, c = memory[begin : begin + n], memory[begin + n : begin + n + n_rows]
-    T, Q, V, A, LAM = 0, 1, 1 + n, 1 + 2 * n, 1 + 3 * n
-    first = 1 + 3 * n + n_rows
+    return N, X1, Y1, X2, Y2, total1, total2, memory[begin : begin + n], memory[begin + n : begin + n + n_rows]
+
+
+@merged
+def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
+    """What is known of the orders 0 and 1, and the early operations of order 0; r and c are zero."""
+    n = r.size
+    r[:], c[:] = 0.0, 0.0
+    N[0, 0], N[1, 0] = t, unit
+    for j in range(n):
+        N[0, 1 + j] = series[0, j] = state[j]
+        N[0, 1 + n + j] = state[n + j]
+        N[1, 1 + j] = series[1, j] = unit * state[n + j]
+    begin_operations(options, EARLY, N[0], N[0, first:], x, y)
+
+
+@merged
+def take_order(w, K, unit, N, series, a):
+    """Velocities of order K and positions of order K + 1, from accelerations of order K - 1."""
+    n = a.size
+    per_v, per_q = unit / K, unit / (K + 1)
+    for j in range(n):
+        v = per_v * a[j]
+        N[K, 1 + n + j] = v
+        N[K + 1, 1 + j] = series[K + 1, j] = per_q * v
+
+
+@merged
+def end_series(w, order, series):
+    """Count, and look whether all is finite."""
+    w.counters[N_EVALUATIONS] += order - 1
+    for j in range(series.shape[1]):
+        if not np.isfinite(series[order, j]):
+            return NOT_FINITE
+    return DONE
+
+
+@compiled
+def _expand(f, w, options, memory, t, state, unit):
+    """The series about a state whose factors are in w, in a unit of time; DONE, or why there is none."""
+    n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
+    N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
+    series = series_of(memory, order, n, memory[TARGET])
+    A, LAM = 1 + 2 * n, 1 + 3 * n
+    first = LAM + n_rows
     second = first + _integers(options, EARLY + FIRST + COLUMN).size
     places, constant = _integers(options, BALANCE + PLACES), _numbers(options, BALANCE + CONSTANT)
 
-    r[:], c[:] = 0.0, 0.0
-    N[0, T], N[1, T] = t, unit
-    for j in range(n):
-        N[0, Q + j] = series[0, j] = state[j]
-        N[0, V + j] = state[n + j]
-        N[1, Q + j] = series[1, j] = unit * state[n + j]
-    _begin(options, EARLY, N[0], N[0, first:], X1[0], Y1[0])
+    begin_series(options, t, unit, state, N, series, first, X1[0], Y1[0], r, c)
     for k in range(order - 1):
         K = k + 1
         if K > 1:
-            N[K, T] = 0.0
-        _interior(X1, Y1, K, total1)
+            N[K, 0] = 0.0
+        interior(X1, Y1, K, total1)
         _operate(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
         _sum(options, ROWS, -K / unit, N[K], c)
         if k == 0:
-            _begin(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
+            begin_operations(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
         else:
-            _interior(X2, Y2, k, total2)
+            interior(X2, Y2, k, total2)
             _operate(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
         _sum(options, BALANCE, 1.0, N[k], r)
         if k == 0:
@@ -282,18 +321,20 @@ def _expand(f, w, options, memory, t, state, unit, series):
         if w.rows_v.size < n_rows:
             lam[:] = 0.0
         solve_for_order(f, w, r, c, a, lam)
-        per_v, per_q = unit / K, unit / (K + 1)
-        for j in range(n):
-            v = per_v * a[j]
-            N[K, V + j] = v
-            N[K + 1, Q + j] = series[K + 1, j] = per_q * v
+        take_order(w, K, unit, N, series, a)
         _complete(options, EARLY, N[K], Y1[K])
         _complete(options, LATE, N[k], Y2[k])
-    w.counters[N_EVALUATIONS] += order - 1
-    for j in range(n):
-        if not np.isfinite(series[order, j]):
-            return NOT_FINITE
-    return DONE
+    return end_series(w, order, series)
+
+
+@merged
+def _find_series(f, w, options, memory, t, state, unit, which):
+    """The series about a state, into one of the two places."""
+    memory[TARGET] = which
+    if options[COMPILED] == 1.0:
+        code, _ = f.first(f, w, options, memory, t, unit, state, state, state)
+        return code
+    return _expand(f, w, options, memory, t, state, unit)
 
 
 @merged
@@ -352,13 +393,13 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
         if code == DONE:
-            code = _expand(f, w, options, memory, t, new_state, h, _series(memory, order, n, memory[WHICH]))
+            code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH])
         if code != DONE:
             return code, np.inf
         memory[KNOWN], memory[UNIT] = 1.0, h
         if estimated:
-            memory[LENGTH] = _length(tolerances, _series(memory, order, n, memory[WHICH]), h, order, n)
-    series, unit = _series(memory, order, n, memory[WHICH]), memory[UNIT]
+            memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
+    series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
     error = 0.0
     if estimated:
@@ -378,9 +419,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
     if w.notes[DEPARTURE] > 1.0:
         return DONE, w.notes[DEPARTURE]
-    series = _series(memory, order, n, 1.0 - memory[WHICH])
+    series = series_of(memory, order, n, 1.0 - memory[WHICH])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
-    code = _expand(f, w, options, memory, t + h, new_state, unit, series)
+    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH])
     if code != DONE:
         return code, np.inf
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
