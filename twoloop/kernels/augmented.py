@@ -6,9 +6,10 @@ T^T M T and G M^-1 G^T are full there. The matrix of
     [G    0  ] [s lam] = [Gamma]
 
 is not; G has the rows that count, and the number s brings M to the size of G. Its factors are those of factors.py, by a
-program for its pattern. M need only be positive definite on the velocities that the constraints allow: the sign of the
-determinant is then (-1)^r. The same matrix gives the nearest position and velocity, in the metric of M, on the
-constraints. What does not pay this way is left to the dense forms.
+program for its pattern. The same matrix gives the nearest position and velocity on the constraints, in the metric of M.
+
+M need only be positive definite on the velocities that the constraints allow. At the start its eigenvalues tell, later
+the sign of the determinant, which then is (-1)^r. What is not sparse enough is left to the dense forms.
 """
 
 import numpy as np
@@ -56,7 +57,7 @@ def _make_program(w):
     note_pattern(w.M, w.mass_pattern)
     begin(index, n + rows.size)
     matrix = lists_of(index, values)
-    scale = 2.0 ** np.round(np.log2(_largest(w.G) / _largest(w.M)))
+    scale = 2.0 ** np.round(np.log2(_largest(w.G) / _largest(w.M))) if rows.size > 0 else 1.0
     w.notes[MASS_SCALE] = scale
     for i in range(n):
         for j in range(n):

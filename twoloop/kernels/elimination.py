@@ -21,9 +21,9 @@ ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # what `order` finds; the last: t
 # row, its column, and where it comes from; then the targets of the subtractions. Entries: the diagonal, U from its last
 # row up, L from its first. Behind that, lists for the time of ordering
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# of every row and column of the matrix: entries in its list, entries not eliminated yet, and place in the order so far;
-# and of every row where in the list of a column its entry is, from 1 on, or 0
-ROW_SIZE, COLUMN_SIZE, ROW_LEFT, COLUMN_LEFT, ROW_PLACE, COLUMN_PLACE, FOUND, N_COUNTS = range(8)
+# of every row and column of the matrix: entries in its list, from which a column loses those of eliminated rows; of a
+# row, entries that are left; places in the order so far; and of a row where in the list of a column it is, from 1 on
+ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_PLACE, COLUMN_PLACE, FOUND, N_COUNTS = range(7)
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # of a row: columns and sources of its entries; of a column: rows
 
 
@@ -115,36 +115,34 @@ def put(matrix, i, j, number, source):
     counts[ROW_SIZE, i] += 1
     counts[COLUMN_SIZE, j] += 1
     counts[ROW_LEFT, i] += 1
-    counts[COLUMN_LEFT, j] += 1
     return True
 
 
 @compiled
-def _choose_pivot(matrix, k):
+def _choose_pivot(matrix, rows, columns, k):
     """Row and column of pivot k: that with the least fill among those large enough; (-1, -1): none.
 
     Among equals it is the largest, then the first in the order so far.
     """
     counts, lists, numbers = matrix
-    r = numbers.shape[0]
+    r = rows.size
     least = r
-    for i in range(r):
-        if counts[ROW_PLACE, i] >= k:
-            least = min(least, counts[ROW_LEFT, i])
+    for p in range(k, r):
+        least = min(least, counts[ROW_LEFT, rows[p]])
     best_cost, best_size, best_place, row, column = r * r + 1, 0.0, r * r, -1, -1
-    for j in range(r):
-        left = counts[COLUMN_LEFT, j] - 1
-        if counts[COLUMN_PLACE, j] < k or left * (least - 1) > best_cost:
+    for p in range(k, r):
+        j = columns[p]
+        others = counts[COLUMN_SIZE, j] - 1
+        if others * (least - 1) > best_cost:
             continue
         largest = 0.0
-        for m in range(counts[COLUMN_SIZE, j]):
-            if counts[ROW_PLACE, lists[ROWS, j, m]] >= k:
-                largest = max(largest, abs(numbers[j, m]))
-        for m in range(counts[COLUMN_SIZE, j]):
+        for m in range(others + 1):
+            largest = max(largest, abs(numbers[j, m]))
+        for m in range(others + 1):
             i, size = lists[ROWS, j, m], abs(numbers[j, m])
-            if counts[ROW_PLACE, i] >= k and size > 0.0 and size >= THRESHOLD * largest:
-                cost = (counts[ROW_LEFT, i] - 1) * left
-                place = counts[ROW_PLACE, i] * r + counts[COLUMN_PLACE, j]
+            if size > 0.0 and size >= THRESHOLD * largest:
+                cost = (counts[ROW_LEFT, i] - 1) * others
+                place = counts[ROW_PLACE, i] * r + p
                 better = cost < best_cost or (cost == best_cost and size > best_size)
                 if better or (cost == best_cost and size == best_size and place < best_place):
                     best_cost, best_size, best_place, row, column = cost, size, place, i, j
@@ -161,31 +159,28 @@ def _exchange(order, place, k, chosen):
 
 
 @compiled
-def _eliminate(matrix, k, row, column, pivot, nothing):
-    """Subtract the row of pivot k from those left; False: no room for what comes in."""
+def _subtract(matrix, row, column, pivot, j, nothing):
+    """Subtract the row of the pivot from the others in column j, and take it away there; False: there is no room."""
     counts, lists, numbers = matrix
-    for m in range(counts[COLUMN_SIZE, column]):
-        counts[ROW_LEFT, lists[ROWS, column, m]] -= 1
+    for m in range(counts[COLUMN_SIZE, j]):
+        counts[FOUND, lists[ROWS, j, m]] = m + 1
+    place = counts[FOUND, row] - 1
+    number = numbers[j, place]
     done = True
-    for n in range(counts[ROW_SIZE, row]):
-        j = lists[COLUMNS, row, n]
-        if counts[COLUMN_PLACE, j] <= k:
+    for m in range(counts[COLUMN_SIZE, column]):
+        i = lists[ROWS, column, m]
+        if i == row:
             continue
-        counts[COLUMN_LEFT, j] -= 1
-        for m in range(counts[COLUMN_SIZE, j]):
-            counts[FOUND, lists[ROWS, j, m]] = m + 1
-        number = numbers[j, counts[FOUND, row] - 1]
-        for m in range(counts[COLUMN_SIZE, column]):
-            i = lists[ROWS, column, m]
-            if counts[ROW_PLACE, i] <= k:
-                continue
-            change, found = numbers[column, m] / pivot * number, counts[FOUND, i]
-            if found > 0:
-                numbers[j, found - 1] -= change
-            else:
-                done = done and put(matrix, i, j, -change, nothing)
-        for m in range(counts[COLUMN_SIZE, j]):
-            counts[FOUND, lists[ROWS, j, m]] = 0
+        change, found = numbers[column, m] / pivot * number, counts[FOUND, i]
+        if found > 0:
+            numbers[j, found - 1] -= change
+        else:
+            done = done and put(matrix, i, j, -change, nothing)
+    last = counts[COLUMN_SIZE, j] - 1
+    for m in range(last + 1):
+        counts[FOUND, lists[ROWS, j, m]] = 0
+    lists[ROWS, j, place], numbers[j, place] = lists[ROWS, j, last], numbers[j, last]
+    counts[COLUMN_SIZE, j] = last
     return done
 
 
@@ -204,19 +199,22 @@ def order(index, matrix, nothing, zero):
     index[SIGN] = 1
     first = 0.0
     for k in range(r):
-        i, j = _choose_pivot(matrix, k)
+        i, j = _choose_pivot(matrix, rows, columns, k)
         if i < 0:
             return SINGULAR_MATRIX
         index[SIGN] *= _exchange(rows, counts[ROW_PLACE], k, i) * _exchange(columns, counts[COLUMN_PLACE], k, j)
         pivot = 0.0
         for m in range(counts[COLUMN_SIZE, j]):
+            counts[ROW_LEFT, lists[ROWS, j, m]] -= 1
             if lists[ROWS, j, m] == i:
                 pivot = numbers[j, m]
         first = max(first, abs(pivot))
         if not abs(pivot) > zero * first:
             return SINGULAR_MATRIX
-        if not _eliminate(matrix, k, i, j, pivot, nothing):
-            return TOO_MANY
+        for n in range(counts[ROW_SIZE, i]):
+            other = lists[COLUMNS, i, n]
+            if counts[COLUMN_PLACE, other] > k and not _subtract(matrix, i, j, pivot, other, nothing):
+                return TOO_MANY
     return ORDERED if _write(index, counts, lists) else TOO_MANY
 
 

@@ -33,7 +33,7 @@ from twoloop.kernels.constraints import (
 )
 from twoloop.kernels.factors import columns_of, factor, rows_of, solve, solve_rows
 from twoloop.kernels.finite import CONSTRAINT, JACOBIAN, finite, not_finite
-from twoloop.kernels.partition import RANK_TOLERANCE, note_pattern, write_programs
+from twoloop.kernels.partition import RANK_TOLERANCE, note_entries, write_programs
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
@@ -44,7 +44,7 @@ CONTRADICTS = 1e-7  # relative to the mechanism's size: what a redundant row may
 @compiled
 def _factor_anew(w, t, q):
     """The factors by another order of elimination, or why there are none."""
-    note_pattern(w.G, w.pattern)
+    note_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
     if not write_programs(w):

@@ -18,6 +18,7 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.constraints import constraint_rows
+from twoloop.kernels.elimination import SIZE
 from twoloop.kernels.factors import factor, make_program, sign_of
 from twoloop.kernels.linalg import copy_matrix
 
@@ -80,8 +81,8 @@ def full_pivoting(A, order, row_order, largest, first, last, most):
             for i in range(A.shape[0]):
                 A[i, k], A[i, s] = A[i, s], A[i, k]
         for i in range(k + 1, A.shape[0]):
-            factor = A[i, k] / A[k, k]
-            if factor != 0.0:
+            if A[i, k] != 0.0:
+                factor = A[i, k] / A[k, k]
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
                 if i < last:
@@ -143,6 +144,8 @@ def _take_order(w):
     w.notes[GENERATION] += 1.0
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
+    if rank_v < w.Rate.size:
+        w.index_a[SIZE] = 0  # there may be other rows that count
     return write_programs(w)
 
 
@@ -150,7 +153,6 @@ def _take_order(w):
 def write_programs(w):
     """Choose the order of elimination for the numbers in w.G; False: singular."""
     _note_places(w)
-    w.index_a[:1] = 0
     done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
     if done and w.Rate.size > w.C.size:
         done = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v)
@@ -194,6 +196,15 @@ def note_pattern(G, pattern):
 
 
 @compiled
+def note_entries(w):
+    """Note the entries of w.G; whether there are new ones, so that its programs are to be written anew."""
+    if not note_pattern(w.G, w.pattern):
+        return False
+    w.index_a[SIZE] = 0
+    return True
+
+
+@compiled
 def partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q), and the rows that count.
 
@@ -202,7 +213,7 @@ def partition(f, w, t, q):
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
-    note_pattern(w.G, w.pattern)
+    note_entries(w)
     copy_matrix(w.G, w.Gx)
     w.counters[N_FACTORIZATIONS] += 1
     w.counters[N_PARTITIONS] += 1
@@ -233,7 +244,7 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
         w.x[j] = 0.5 * (state[j] + new_state[j])
     w.entries[:] = 0.0
     constraint_rows(f, w, t_mid, w.x, w.G)
-    new = note_pattern(w.G, w.pattern)
+    new = note_entries(w)
     copy_matrix(w.G, w.Gx)
     rank, rank_v = w.rows.size, w.rows_v.size
     w.counters[N_FACTORIZATIONS] += 1
