@@ -35,7 +35,8 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any) -> comm
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
     flags[common.DENSE_FORM] = flags[common.FORM]
-    if augmented_pays(system.n_q, system.n_c + system.n_a) and (definite or least_inertia(system, t0, q0)[0] > 0.0):
+    sparse = augmented_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
+    if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
     return common.Kit(system.functions._replace(flags=flags), inner_loop, *steps)
 

@@ -12,6 +12,7 @@ from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
 from twoloop.dop853 import DOP853
 from twoloop.kernels import common
 from twoloop.kernels.augmented import MANY, augmented_pays
+from twoloop.mechanisms import n_four_bar
 from twoloop.run import Run
 
 # every kind of row and of mass: redundant rows, driven ones, rows of velocities, a mass that varies and one without
@@ -77,10 +78,12 @@ def test_a_chain_of_fourteen(choose, closed, method):
 
 
 def test_chosen_where_rows_and_degrees_of_freedom_are_many():
-    assert augmented_pays(2 * MANY, MANY)
-    assert not augmented_pays(500, MANY - 1) and not augmented_pays(500, 500 - MANY + 1)
+    assert augmented_pays(2 * MANY, MANY, True) and augmented_pays(500, 499, False)
+    assert not augmented_pays(500, MANY - 1, True) and not augmented_pays(500, 499, True)
     assert form(started(chain(MANY, False))) == common.AUGMENTED
     assert form(started(chain(MANY - 1, False))) == common.NULL_SPACE
+    assert form(started(n_four_bar(2))) == common.NULL_SPACE
+    assert form(started(n_four_bar(20))) == common.AUGMENTED
 
 
 def full_mass(n):

@@ -33,12 +33,13 @@ from twoloop.kernels.finite import MASS, finite, not_finite
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.partition import note_pattern
 
-MANY = 10  # rows, and degrees of freedom, from which on this is the fastest form
+MANY = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
+LARGE = 32  # coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
 
 
-def augmented_pays(n_q: int, n_rows: int) -> bool:
-    """Whether this form is faster than the dense ones, for a pattern as chains have it."""
-    return min(n_rows, n_q - n_rows) >= MANY
+def augmented_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
+    """Whether this form is faster than the dense ones, for a sparse pattern; `diagonal`: M is constant and diagonal."""
+    return n_rows >= MANY and (n_q - n_rows >= MANY or (n_q >= LARGE and not diagonal))
 
 
 @compiled

@@ -81,8 +81,8 @@ def full_pivoting(A, order, row_order, largest, first, last, most):
             for i in range(A.shape[0]):
                 A[i, k], A[i, s] = A[i, s], A[i, k]
         for i in range(k + 1, A.shape[0]):
-            if A[i, k] != 0.0:
-                factor = A[i, k] / A[k, k]
+            factor = A[i, k] / A[k, k]
+            if factor != 0.0:
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
                 if i < last:
