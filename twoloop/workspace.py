@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.consistency import least_inertia
 from twoloop.kernels import common
+from twoloop.kernels.augmented import augmented_pays
 from twoloop.kernels.banded import banded_pays
 from twoloop.kernels.lapack import addresses
 from twoloop.kernels.layout import make_work
@@ -27,10 +29,15 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any) -> comm
     if system.constant_mass:
         flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
     definite = bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
-    flags[common.REDUCED] = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
+    reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
+    flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
-        flags[common.BANDWIDTH], flags[common.REDUCED] = bandwidth, 0
+        flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
+    flags[common.DENSE_FORM] = flags[common.FORM]
+    sparse = augmented_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
+    if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
+        flags[common.FORM] = common.AUGMENTED
     return common.Kit(system.functions._replace(flags=flags), inner_loop, *steps)
 
 
@@ -45,7 +52,8 @@ def workspace(
 ) -> common.Work:
     """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows."""
     flags = kit.flags
-    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(flags[common.REDUCED]))
+    reduced, augmented = flags[common.DENSE_FORM] == common.NULL_SPACE, flags[common.FORM] == common.AUGMENTED
+    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented))
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
     work.notes[common.ROUNDED] = ROUNDING * float(np.abs(q0).max())

@@ -21,7 +21,7 @@ def pivoted(A):
     order, row_order = np.arange(A.shape[1]), np.arange(A.shape[0])
     scaled = A.copy()
     called(scale_rows, scaled)
-    return called(full_pivoting, scaled, order, row_order, 0, len(A), len(A)), order
+    return called(full_pivoting, scaled, order, row_order, np.zeros(len(A)), 0, len(A), len(A)), order
 
 
 @given(st.integers(1, 8), st.integers(0, 6), seeds)

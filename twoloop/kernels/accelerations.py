@@ -1,27 +1,33 @@
 """Accelerations and multipliers, eqs. (6)-(8) of the paper, at a state on the constraints.
 
-Two forms. With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are the velocities that the constraints allow,
+Three forms. With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are the velocities that the constraints allow,
 a = g + T x, where g, with G g = Gamma, has no independent entries, and (T^T M T) x = T^T (Q - M g): M need only be
 positive definite on these velocities. Or, where degrees of freedom outnumber constraints and M is positive definite, by
-the multipliers: (G M^-1 G^T) lam = G M^-1 Q - Gamma.
+the multipliers: (G M^-1 G^T) lam = G M^-1 Q - Gamma. Or, where there are many of both, by the sparse matrix of
+augmented.py.
 """
 
 import numpy as np
 
+from twoloop.kernels.augmented import factor_augmented, solve_augmented
 from twoloop.kernels.banded import banded_mass, factor_banded_mass, solve_banded_mass
 from twoloop.kernels.common import (
+    AUGMENTED,
     CONSTANT_MASS,
     DIAGONAL_MASS,
     DONE,
+    FACTORED,
+    FORM,
     GAMMA_GIVEN,
     GAMMA_SCALE,
     KNOWN,
     MASS_NOT_DEFINITE,
+    MULTIPLIERS,
     N_EVALUATIONS,
     N_FACTORIZATIONS,
     NONHOLONOMIC_GAMMA_GIVEN,
     NOT_FINITE,
-    REDUCED,
+    NULL_SPACE,
     SINGULAR,
     compiled,
     merged,
@@ -29,6 +35,7 @@ from twoloop.kernels.common import (
 from twoloop.kernels.differences import gamma_by_differences
 from twoloop.kernels.factors import columns_of, rows_of, solve, solve_transposed
 from twoloop.kernels.finite import MASS, finite, not_finite, source_of_acceleration
+from twoloop.kernels.inner import tangents
 from twoloop.kernels.linalg import copy, copy_matrix, invert_definite, ldl_factor, ldl_solve
 
 
@@ -67,11 +74,11 @@ def factor_mass(f, w, t, q):
     """M(t, q), and what is needed of it: of a constant M its inverse, quicker to apply, else its factors."""
     mass_matrix(f, w, t, q)
     code = DONE
-    if f.flags[REDUCED] == 1:
+    if banded_mass(f):
+        code = factor_banded_mass(f, w)
+    elif f.flags[FORM] != MULTIPLIERS:
         if not finite(w.M):
             code = MASS_NOT_DEFINITE
-    elif banded_mass(f):
-        code = factor_banded_mass(f, w)
     else:
         copy_matrix(w.M, w.L)
         definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
@@ -238,19 +245,52 @@ def _on_null_space(f, w, a):
     return MASS_NOT_DEFINITE if finite(w.M) and finite(w.D) else NOT_FINITE
 
 
+@merged
+def _mass_there(f, w, t, q):
+    """A mass matrix that varies, and its factors where they are needed."""
+    w.notes[FACTORED] = 0.0
+    if f.flags[FORM] != MULTIPLIERS:
+        mass_matrix(f, w, t, q)
+        return DONE
+    w.counters[N_FACTORIZATIONS] += 1
+    return factor_mass(f, w, t, q)
+
+
+@compiled
+def _factor_augmented(f, w, t, q):
+    """The factors of augmented.py, or what the dense form needs where they are not sparse."""
+    code = factor_augmented(f, w, t, q)
+    if code == DONE and f.flags[FORM] != AUGMENTED:
+        if f.flags[FORM] == NULL_SPACE:
+            tangents(f, w, t, q)
+        code = factor_mass(f, w, t, q)
+    return code
+
+
+@merged
+def _by_form(f, w, a):
+    """Accelerations from w.Q and w.Gamma."""
+    if f.flags[FORM] == NULL_SPACE:
+        return _on_null_space(f, w, a)
+    if f.flags[FORM] == MULTIPLIERS:
+        return _by_multipliers(f, w, a)
+    solve_augmented(w, a)
+    return DONE
+
+
 @compiled
 def factor_for_projection(f, w, t, q):
     """M, and the factors of T^T M T or G M^-1 G^T, at a state whose rows, factors and w.D stand in w."""
     code = DONE
     if f.flags[CONSTANT_MASS] == 0:
-        if f.flags[REDUCED] == 1:
-            mass_matrix(f, w, t, q)
-        else:
-            w.counters[N_FACTORIZATIONS] += 1
-            code = factor_mass(f, w, t, q)
+        code = _mass_there(f, w, t, q)
+    if code == DONE and f.flags[FORM] == AUGMENTED:
+        code = _factor_augmented(f, w, t, q)
+        if f.flags[FORM] == AUGMENTED:
+            return code
     if code != DONE:
         return code
-    if f.flags[REDUCED] == 0:
+    if f.flags[FORM] == MULTIPLIERS:
         return _schur_complement(f, w)
     columns = columns_of(w.index_v)
     if f.flags[DIAGONAL_MASS] == 1:
@@ -267,18 +307,17 @@ def accelerate(f, w, t, q, v, a):
     w.counters[N_EVALUATIONS] += 1
     code = DONE
     if f.flags[CONSTANT_MASS] == 0:
-        if f.flags[REDUCED] == 1:
-            mass_matrix(f, w, t, q)
-        else:
-            w.counters[N_FACTORIZATIONS] += 1
-            code = factor_mass(f, w, t, q)
+        code = _mass_there(f, w, t, q)
     if code == DONE:
         code = acceleration_constraint(f, w, t, q, v)
     if code != DONE:
         return code
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
-    code = _on_null_space(f, w, a) if f.flags[REDUCED] == 1 else _by_multipliers(f, w, a)
+    if f.flags[FORM] == AUGMENTED:
+        code = _factor_augmented(f, w, t, q)
+    if code == DONE:
+        code = _by_form(f, w, a)
     if code != DONE and code != NOT_FINITE:
         return code
     for j in range(a.size):
@@ -295,8 +334,8 @@ def _note_scale(w, a):
     """The largest sum of terms in G a, by which Gamma by differences is judged."""
     for i in range(w.Rate.size):
         total = 0.0
-        for j in range(a.size):
-            total += abs(w.G[i, j] * a[j])
+        for p in range(w.places[i], w.places[i + 1]):
+            total += abs(w.G[i, w.places[p]] * a[w.places[p]])
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], total)
 
 
@@ -304,7 +343,7 @@ def _note_scale(w, a):
 def equilibrate(f, w, a, lam):
     """Multipliers of all rows: G^T lam = Q - M a, of least norm where rows are redundant."""
     lam[:] = 0.0
-    if f.flags[REDUCED] == 0:
+    if f.flags[FORM] != NULL_SPACE:
         for i in range(w.rows_v.size):
             lam[w.rows_v[i]] = w.z[i]
     else:

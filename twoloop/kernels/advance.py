@@ -14,9 +14,11 @@ from twoloop.kernels.calls import (
     take_midpoint,
 )
 from twoloop.kernels.common import (
+    AUGMENTED,
     DEPARTURE,
     DONE,
     FAULT_KIND,
+    FORM,
     GAMMA_GIVEN,
     INNER_DIVERGED,
     INTEGERS,
@@ -29,10 +31,10 @@ from twoloop.kernels.common import (
     N_REJECTED_ERROR,
     NEARLY_SINGULAR,
     NOT_FINITE,
+    NULL_SPACE,
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
-    REDUCED,
     SENSITIVITY,
     SINGULAR,
     STEP_FACTOR,
@@ -64,6 +66,7 @@ COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
 FADING = 0.98  # of the longest step, with each accepted one
 KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
+FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run
@@ -298,9 +301,10 @@ def advance(
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
         if control[SYMMETRIC] == 0.0:
-            if f.flags[REDUCED] == 0:
+            looked = f.flags[FORM] != AUGMENTED or w.counters[N_ACCEPTED] % (1 + w.independent_v.size // FEW) == 0
+            if f.flags[FORM] != NULL_SPACE and looked:
                 find_tangents(f, w, clock[T], state[:n])
-            if partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
+            if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
                 return RANK_LOST
             clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
             if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:

@@ -17,7 +17,7 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
-from twoloop.kernels.partition import note_pattern, partition_of_midpoint, renew, write_programs
+from twoloop.kernels.partition import note_entries, partition_of_midpoint, renew, write_programs
 from twoloop.kernels.projection import accelerate_there, to_constraints
 
 (
@@ -63,7 +63,7 @@ def _other_task(f, w, task, t, q, v):
 @merged
 def _verify_pattern(w):
     """Where the Jacobian has an entry for the first time, what was evaluated on the way is wrong."""
-    if not note_pattern(w.G, w.pattern):
+    if not note_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
 

@@ -29,8 +29,10 @@ INTEGERS = types.int64[::1]
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore[misc]
 
 
-# places in Functions.flags; BANDWIDTH is -1 where linear algebra is to be dense; REDUCED: accelerations from T^T M T
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, REDUCED, FIRST_GIVEN = range(5)
+# places in Functions.flags; BANDWIDTH is -1 where linear algebra is not banded; FORM: how accelerations
+# are found, see accelerations.py; DENSE_FORM: what it becomes where sparse factors have too many entries
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, FIRST_GIVEN = range(6)
+MULTIPLIERS, NULL_SPACE, AUGMENTED = range(3)  # forms
 GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
@@ -52,6 +54,7 @@ class Work(NamedTuple):
     L: Any  # (n_q, n_q) of a constant M the inverse, else its factors, see ldl_factor; or banded ones
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
     entries: Any  # the same numbers as a vector
+    augmented: Any  # the same, and those of M behind
     S: Any  # (r_v, r_v) G M^-1 G^T of the rows that count, and its factors
     W: Any  # (r_v, n_q) its rows G M^-1
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
@@ -60,6 +63,8 @@ class Work(NamedTuple):
     Gx: Any  # (n_c + n_a, n_q) rows at a displaced point (Q_d by differences); scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) the G that S and W belong to, where M is constant, not diagonal; NaN: none
     pattern: Any  # (n_c + n_a, n_q) 1 where G was ever seen to have an entry
+    mass_pattern: Any  # (n_q, n_q) the same of M; empty without the augmented form
+    places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
@@ -81,6 +86,9 @@ class Work(NamedTuple):
     independent_v: Any  # (n_dof)
     index_v: Any
     values_v: Any
+    index_a: Any  # program and factors of the augmented matrix; size 0: none yet. Empty without this form
+    values_a: Any
+    right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
     row_order: Any  # (n_c + n_a) scratch: row order
     counters: Any  # (N_COUNTERS) see below
@@ -94,9 +102,9 @@ class Work(NamedTuple):
 
 _INTEGER_FIELDS = {
     *("rows", "dependent", "independent", "index", "rows_v", "dependent_v", "independent_v", "index_v"),
-    *("order", "row_order", "counters", "lapack"),
+    *("index_a", "places", "order", "row_order", "counters", "lapack"),
 }
-_MATRIX_FIELDS = {"M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "Gamma_tried"}
+_MATRIX_FIELDS = {"M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried"}
 WORK = Reference(
     "Work",
     {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-2]},
@@ -143,9 +151,11 @@ def _type_of_work(value: Any, context: Any) -> Any:
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
     STEP_FACTOR,  # the step that a method asks for next, over this one; 0: advance() chooses it from the error
+    MASS_SCALE,  # s of the augmented matrix, see augmented.py
+    FACTORED,  # 1: its factors belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     N_NOTES,
-) = range(21)
+) = range(23)
 
 # what a kernel returns: DONE, or why it could not
 (

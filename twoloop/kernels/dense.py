@@ -10,12 +10,13 @@ from numba import types
 from twoloop.kernels.calls import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.common import (
     DONE,
+    FORM,
     GAMMA_INACCURATE,
     GAMMA_REQUIRED,
     INTEGERS,
     KIT,
     MATRIX,
-    REDUCED,
+    NULL_SPACE,
     SINGULAR,
     VECTOR,
     WORK,
@@ -105,7 +106,7 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
-    reduced = f.flags[REDUCED] == 1  # then w.D is known
+    reduced = f.flags[FORM] == NULL_SPACE  # then w.D is known
     failures = 0
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]

@@ -9,22 +9,31 @@ from twoloop.kernels.common import (
     CONSTRAINT_RATE_GIVEN,
     CONTRADICTION,
     DONE,
+    FACTORED,
+    FORM,
     INNER_DIVERGED,
     KINEMATICS_GIVEN,
     KNOWN,
     N_FACTORIZATIONS,
     N_INNER,
     NONHOLONOMIC_RATE_GIVEN,
-    REDUCED,
+    NULL_SPACE,
     ROWS_CONTRADICT,
     SINGULAR,
     compiled,
     merged,
 )
-from twoloop.kernels.constraints import constraint_rates, constraint_rows, gather_independent_columns, kinematics
+from twoloop.kernels.constraints import (
+    clear_rows,
+    constraint_rates,
+    constraint_rows,
+    gather_independent_columns,
+    kinematics,
+    row_residual,
+)
 from twoloop.kernels.factors import columns_of, factor, rows_of, solve, solve_rows
 from twoloop.kernels.finite import CONSTRAINT, JACOBIAN, finite, not_finite
-from twoloop.kernels.partition import RANK_TOLERANCE, note_pattern, write_programs
+from twoloop.kernels.partition import RANK_TOLERANCE, note_entries, write_programs
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
@@ -35,7 +44,7 @@ CONTRADICTS = 1e-7  # relative to the mechanism's size: what a redundant row may
 @compiled
 def _factor_anew(w, t, q):
     """The factors by another order of elimination, or why there are none."""
-    note_pattern(w.G, w.pattern)
+    note_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
     if not write_programs(w):
@@ -47,6 +56,7 @@ def _factor_anew(w, t, q):
 @merged
 def factor_rows(w, t, q):
     """The factors of the dependent columns of w.G."""
+    w.notes[FACTORED] = 0.0
     ratio = factor(w.entries, w.index, w.values)
     w.counters[N_FACTORIZATIONS] += 1
     if w.Rate.size > w.C.size:
@@ -60,7 +70,7 @@ def factor_rows(w, t, q):
 def factor_dependent(f, w, t, q):
     """C_q and A at (t, q), and the factors of the dependent columns."""
     w.notes[KNOWN] = 0.0
-    w.entries[:] = 0.0
+    clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
     return factor_rows(w, t, q)
 
@@ -132,7 +142,7 @@ def velocities(f, w, t, q, v, reuse):
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
     w.notes[KNOWN] = float(f.flags[KINEMATICS_GIVEN])
-    if f.flags[REDUCED] == 1:
+    if f.flags[FORM] == NULL_SPACE:
         tangents(f, w, t, q)
         for k in range(rows.size):
             w.z[k] = w.D[n_dof, k]
@@ -143,12 +153,10 @@ def velocities(f, w, t, q, v, reuse):
     else:
         if w.notes[KNOWN] == 0.0:
             constraint_rates(f, w, t, q, w.Rate)
-        for k in range(rows.size):
-            total = -w.Rate[rows[k]]
-            for j in w.independent_v:
-                total -= w.G[rows[k], j] * v[j]
-            w.z[k] = total
+        row_residual(w, v, rows)
         solve(w.index_v, w.values_v, w.z)
+        for k in range(rows.size):
+            w.z[k] = v[columns[k]] - w.z[k]
     change = 0.0
     for k in range(rows.size):
         change = max(change, abs(v[columns[k]] - w.z[k]))

@@ -5,12 +5,18 @@ from typing import Any
 import numpy as np
 
 from twoloop.kernels.common import N_COUNTERS, N_NOTES, WORK, Work
-from twoloop.kernels.factors import index_size
+from twoloop.kernels.elimination import index_size, values_size
 from twoloop.kernels.lapack import N_ROUTINES
 
 
 def make_work(
-    n_q: int, n_c: int, n_a: int = 0, rank: int | None = None, rank_v: int | None = None, reduced: bool = True
+    n_q: int,
+    n_c: int,
+    n_a: int = 0,
+    rank: int | None = None,
+    rank_v: int | None = None,
+    reduced: bool = True,
+    augmented: bool = False,
 ) -> Work:
     """Allocate the workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a."""
     n_rows = n_c + n_a
@@ -18,22 +24,25 @@ def make_work(
     r_v = min(n_rows, n_q) if rank_v is None else rank_v
     n_redundant = n_rows - r_v
     n_dof = n_q - r_v if reduced else 0
-    G = np.zeros((n_rows + 1, n_q))
+    size = n_q + r_v if augmented else 0
+    n_entries = (n_rows + 1) * n_q
+    everything = np.zeros(n_entries + n_q * n_q)
 
     def integers(n: int) -> Any:
         return np.zeros(n, dtype=np.int64)
 
     def sets(r: int) -> list[Any]:
-        return [integers(r), integers(r), integers(n_q - r), integers(index_size(r)), np.zeros(r * r + r)]
+        return [integers(r), integers(r), integers(n_q - r), integers(index_size(r)), np.zeros(values_size(r))]
 
     positions = sets(r)
     velocities = positions if n_a == 0 else sets(r_v)
     names = ("rows", "dependent", "independent", "index", "values")
     work = Work(
-        M=np.zeros((n_q, n_q)),
+        M=everything[n_entries:].reshape((n_q, n_q)),
         L=np.zeros((n_q, n_q)),
-        G=G,
-        entries=G.reshape(-1),
+        G=everything[:n_entries].reshape((n_rows + 1, n_q)),
+        entries=everything[:n_entries],
+        augmented=everything,
         S=np.zeros((r_v, r_v)),
         W=np.zeros((r_v, n_q)),
         A=np.zeros((n_dof, n_dof)),
@@ -42,6 +51,8 @@ def make_work(
         Gx=np.zeros((n_rows, n_q)),
         G_of_S=np.full((n_rows, n_q), np.nan),
         pattern=np.zeros((n_rows, n_q)),
+        mass_pattern=np.zeros((n_q, n_q) if augmented else (0, 0)),
+        places=integers(n_rows + 1 + n_rows * n_q),
         Gamma_tried=np.zeros((2, n_rows)),
         Q=np.zeros(n_q),
         x=np.zeros(n_q),
@@ -55,6 +66,9 @@ def make_work(
         minimum=np.zeros(n_redundant * (r_v + n_redundant + 1)),
         **dict(zip(names, positions, strict=True)),
         **{f"{name}_v": array for name, array in zip(names, velocities, strict=True)},
+        index_a=integers(index_size(size)),
+        values_a=np.zeros(values_size(size, may_be_dense=False)),
+        right=np.zeros(2 * size),
         order=integers(n_q),
         row_order=integers(n_rows),
         counters=integers(N_COUNTERS),

@@ -15,10 +15,10 @@ from twoloop.kernels.common import (
     SENSITIVITY,
     SINGULAR,
     compiled,
-    inlined,
     merged,
 )
 from twoloop.kernels.constraints import constraint_rows
+from twoloop.kernels.elimination import SIZE
 from twoloop.kernels.factors import factor, make_program, sign_of
 from twoloop.kernels.linalg import copy_matrix
 
@@ -40,29 +40,40 @@ def scale_rows(A):
                 A[i, j] *= scale
 
 
+@merged
+def _largest_from(row, first):
+    largest = 0.0
+    for j in range(first, row.size):
+        if abs(row[j]) > largest:
+            largest = abs(row[j])
+    return largest
+
+
 @compiled
-def full_pivoting(A, order, row_order, first, last, most):
+def full_pivoting(A, order, row_order, largest, first, last, most):
     """Gauss elimination of A with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
 
     At most until there are `most` pivots. `order` and `row_order` become the order of columns and rows. Returns the
-    number of pivots there are then, the numerical rank.
+    number of pivots there are then, the numerical rank. `largest` is scratch: the largest entry of each row, looked for
+    again where a row has changed.
     """
     n_q = A.shape[1]
     k = first
+    for i in range(k, last):
+        largest[i] = _largest_from(A[i], k)
     while k < min(last, n_q) and k < most:
-        top = 0.0
         r = k
-        s = k
-        for i in range(k, last):
-            for j in range(k, n_q):
-                if abs(A[i, j]) > top:
-                    top = abs(A[i, j])
-                    r = i
-                    s = j
-        if not top > RANK_TOLERANCE:
+        for i in range(k + 1, last):
+            if largest[i] > largest[r]:
+                r = i
+        if not largest[r] > RANK_TOLERANCE:
             return k
+        s = k
+        while abs(A[r, s]) != largest[r]:
+            s += 1
         if r != k:
             row_order[k], row_order[r] = row_order[r], row_order[k]
+            largest[r] = largest[k]
             for j in range(n_q):
                 A[k, j], A[r, j] = A[r, j], A[k, j]
         if s != k:
@@ -74,6 +85,8 @@ def full_pivoting(A, order, row_order, first, last, most):
             if factor != 0.0:
                 for j in range(k + 1, n_q):
                     A[i, j] -= factor * A[k, j]
+                if i < last:
+                    largest[i] = _largest_from(A[i], k + 1)
         k += 1
     return k
 
@@ -91,7 +104,7 @@ def _eliminate(w, most, most_v):
         order[j] = j
     for i in range(n_rows):
         row_order[i] = i
-    rank = full_pivoting(G, order, row_order, 0, n_c, most)
+    rank = full_pivoting(G, order, row_order, w.g, 0, n_c, most)
     w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
@@ -101,7 +114,7 @@ def _eliminate(w, most, most_v):
         for j in range(G.shape[1]):
             G[last, j], G[i, j] = G[i, j], G[last, j]
         last += 1
-    return rank, full_pivoting(G, order, row_order, rank, last, most_v)
+    return rank, full_pivoting(G, order, row_order, w.g, rank, last, most_v)
 
 
 @merged
@@ -131,25 +144,33 @@ def _take_order(w):
     w.notes[GENERATION] += 1.0
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
+    if rank_v < w.Rate.size:
+        w.index_a[SIZE] = 0  # there may be other rows that count
     return write_programs(w)
 
 
 @compiled
 def write_programs(w):
     """Choose the order of elimination for the numbers in w.G; False: singular."""
-    r = w.rows.size
-    A, used = _square(w.Gx, r), _square(w.S, r)
-    done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values, A, used)
+    _note_places(w)
+    done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
     if done and w.Rate.size > w.C.size:
-        r = w.rows_v.size
-        A, used = _square(w.Gx, r), _square(w.S, r)
-        done = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v, A, used)
+        done = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v)
     return done
 
 
-@inlined
-def _square(A, r):
-    return A.reshape(A.size)[: r * r].reshape((r, r))
+@compiled
+def _note_places(w):
+    """Where the entries of the rows are, see Work."""
+    n_rows = w.Rate.size
+    place = n_rows + 1
+    for i in range(n_rows):
+        w.places[i] = place
+        for j in range(w.pattern.shape[1]):
+            if w.pattern[i, j] != 0.0:
+                w.places[place] = j
+                place += 1
+    w.places[n_rows] = place
 
 
 @compiled
@@ -175,6 +196,15 @@ def note_pattern(G, pattern):
 
 
 @compiled
+def note_entries(w):
+    """Note the entries of w.G; whether there are new ones, so that its programs are to be written anew."""
+    if not note_pattern(w.G, w.pattern):
+        return False
+    w.index_a[SIZE] = 0
+    return True
+
+
+@compiled
 def partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q), and the rows that count.
 
@@ -183,7 +213,7 @@ def partition(f, w, t, q):
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
-    note_pattern(w.G, w.pattern)
+    note_entries(w)
     copy_matrix(w.G, w.Gx)
     w.counters[N_FACTORIZATIONS] += 1
     w.counters[N_PARTITIONS] += 1
@@ -214,7 +244,7 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
         w.x[j] = 0.5 * (state[j] + new_state[j])
     w.entries[:] = 0.0
     constraint_rows(f, w, t_mid, w.x, w.G)
-    note_pattern(w.G, w.pattern)
+    new = note_entries(w)
     copy_matrix(w.G, w.Gx)
     rank, rank_v = w.rows.size, w.rows_v.size
     w.counters[N_FACTORIZATIONS] += 1
@@ -222,7 +252,7 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     if found < rank or found_v < rank_v:
         return SINGULAR
     same = _same_set(w.independent, w.order[rank:])
-    if same and _same_set(w.independent_v, w.order[rank_v:]):
+    if same and not new and _same_set(w.independent_v, w.order[rank_v:]):
         return DONE
     w.counters[N_PARTITIONS] += 1
     return CHANGED if _take_order(w) else SINGULAR

@@ -9,14 +9,17 @@ accelerations to the correction itself: one that is not near rounding is followe
 import numpy as np
 
 from twoloop.kernels.accelerations import accelerate, equilibrate, factor_for_projection
+from twoloop.kernels.augmented import correct_augmented
 from twoloop.kernels.common import (
+    AUGMENTED,
     DIAGONAL_MASS,
     DONE,
+    FORM,
     INNER_DIVERGED,
     KINEMATICS_GIVEN,
     KNOWN,
     N_INNER,
-    REDUCED,
+    NULL_SPACE,
     ROUNDED,
     compiled,
     merged,
@@ -39,7 +42,7 @@ def _look(f, w, t, q, v):
         code = factor_rows(w, t, q)
     else:
         code = factor_dependent(f, w, t, q)
-    if code == DONE and f.flags[REDUCED] == 1:
+    if code == DONE and f.flags[FORM] == NULL_SPACE:
         tangents(f, w, t, q)
     return code
 
@@ -179,12 +182,15 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
-        if f.flags[REDUCED] == 1:
+        if f.flags[FORM] == NULL_SPACE:
             moved, faster = _to_constraints(f, w, q, v)
         else:
             if f.flags[KINEMATICS_GIVEN] == 0:
                 constraint_rates(f, w, t, q, w.Rate)
-            moved, faster = _by_multipliers(w, q, v)
+            if f.flags[FORM] == AUGMENTED:
+                moved, faster = correct_augmented(w, q, v)
+            else:
+                moved, faster = _by_multipliers(w, q, v)
         if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
         # where positions rest, the tangents are those of the pass before: velocities are then right after one more

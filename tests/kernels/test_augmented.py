@@ -1,0 +1,187 @@
+"""Accelerations and projection by the sparse augmented matrix, against the dense forms."""
+
+import numpy as np
+import pytest
+
+import twoloop.workspace as workspace_module
+from studies.scaling import chain
+from tests.general.mechanisms import mechanism
+from tests.general.runs import error
+from tests.problems import force_residual, violations, worst
+from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
+from twoloop.dop853 import DOP853
+from twoloop.kernels import common
+from twoloop.kernels.augmented import MANY, augmented_pays
+from twoloop.mechanisms import n_four_bar
+from twoloop.run import Run
+
+# every kind of row and of mass: redundant rows, driven ones, rows of velocities, a mass that varies and one without
+# inverse, Gamma by differences
+KINDS = (
+    "redundant slider-crank",
+    "top with its centre",
+    "top of Euler parameters",
+    "knife edge in space",
+    "wobbling disc, redundant",
+    "driven slider-crank, redundant",
+    "massless coordinate",
+    "pendulum on a driven crank",
+)
+
+
+@pytest.fixture
+def choose(monkeypatch):
+    """What makes every run take the form that is asked for."""
+    return lambda sparse: monkeypatch.setattr(workspace_module, "augmented_pays", lambda *sizes: sparse)
+
+
+def started(problem, method=DOP853()):  # noqa: B008
+    n = problem.system.n_q
+    plan = method.plan(n, 1e-8, 1e-8, False)
+    return Run(problem.system, plan, 0.0, problem.q0, problem.v0, 1e-8, np.full(n, 1e-8), None)
+
+
+def form(run):
+    return int(run.functions.flags[common.FORM])
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize("method", ["Gauss12", "DOP853", "Adams"])
+@pytest.mark.parametrize("name", KINDS)
+def test_known_motions(choose, name, method):
+    m, tolerance = mechanism(name), 1e-10
+    found = []
+    for sparse in (False, True):
+        choose(sparse)
+        found.append(solve_dae(m.system(), (0.0, 0.5 * m.end), *m.start, method, tolerance, tolerance))
+    dense, sparse = found
+    assert dense.success and sparse.success
+    assert worst(dense.a[:, 0], sparse.a[:, 0]) < 1e-9 * max(1.0, np.abs(dense.a[:, 0]).max())
+    assert worst(dense.lam[:, 0], sparse.lam[:, 0]) < 1e-9 * max(1.0, np.abs(dense.lam[:, 0]).max())
+    assert error(m, sparse) < max(3.0 * error(m, dense), 1e-8)
+    assert sparse.stats.n_evaluations < 1.2 * dense.stats.n_evaluations
+
+
+@pytest.mark.parametrize("method", ["Adams", "DOP853", "Gauss6", "RadauIIA5"])
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_chain_of_fourteen(choose, closed, method):
+    problem = chain(14, closed)
+    options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "t_eval": np.linspace(0.0, 0.05, 6)}
+    found = []
+    for sparse in (False, True):
+        choose(sparse)
+        found.append(solve_dae(problem.system, (0.0, 0.05), problem.q0, problem.v0, **options))
+    dense, sparse = found
+    assert worst(dense.q, sparse.q) < 1e-8 and worst(dense.v, sparse.v) < 1e-6
+    assert force_residual(problem.system, sparse) < 1e-8
+    assert max(violations(problem.system, sparse)) < 1e-9
+
+
+def test_chosen_where_rows_and_degrees_of_freedom_are_many():
+    assert augmented_pays(2 * MANY, MANY, True) and augmented_pays(500, 499, False)
+    assert not augmented_pays(500, MANY - 1, True) and not augmented_pays(500, 499, True)
+    assert form(started(chain(MANY, False))) == common.AUGMENTED
+    assert form(started(chain(MANY - 1, False))) == common.NULL_SPACE
+    assert form(started(n_four_bar(2))) == common.NULL_SPACE
+    assert form(started(n_four_bar(20))) == common.AUGMENTED
+
+
+def full_mass(n):
+    """The chain of n with a mass matrix without zeros."""
+    problem = chain(n, False)
+    system, weight = problem.system, np.random.default_rng(3).normal(size=(2 * n, 2 * n))
+    made = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        mass=np.eye(2 * n) + 0.1 * weight @ weight.T / n,
+        force=lambda t, q, v: system.force(t, q, v),
+        constraint=lambda t, q: system.constraint(t, q),
+        jacobian=lambda t, q: system.jacobian(t, q),
+        gamma=lambda t, q, v: system.gamma(t, q, v),
+    )
+    return made, problem
+
+
+def test_dense_where_the_factors_are_not_sparse(choose):
+    system, problem = full_mass(40)
+    choose(False)
+    dense = solve_dae(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
+    choose(True)
+    turned = solve_dae(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
+    assert worst(dense.q, turned.q) == 0.0 and worst(dense.lam, turned.lam) == 0.0
+    problem = type(problem)(**{**vars(problem), "system": system})
+    assert form(started(problem)) == common.NULL_SPACE
+
+
+def test_an_entry_that_comes_later_is_found(choose):
+    """The last mass is first tied by the ground, then from x = 0.05 on, by a row that begins to depend on y."""
+
+    def bent(q):
+        return max(q[0] - 0.05, 0.0)
+
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([1.0, 0.0]),
+        constraint=lambda t, q: np.array([q[1] - bent(q) ** 4]),
+        jacobian=lambda t, q: np.array([[-4.0 * bent(q) ** 3, 1.0]]),
+        gamma=lambda t, q, v: np.array([12.0 * bent(q) ** 2 * v[0] ** 2]),
+    )
+    ends = []
+    for sparse in (False, True):
+        choose(sparse)
+        ends.append(solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "Adams", 1e-9, 1e-9))
+    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-7
+    assert max(violations(system, ends[1])) < 1e-9
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_a_mass_that_turns_negative_ends_the_run(choose, heavy):
+    """The mass of the last of three links, or that of every one of them."""
+
+    def system(n=3):
+        problem = chain(n, False)
+        base = problem.system
+
+        def mass(t, q):
+            diagonal = np.full(2 * n, 1.0 - 4.0 * t if heavy else 1.0)
+            diagonal[-2:] = 1.0 - 4.0 * t
+            return np.diag(diagonal)
+
+        callbacks = {name: getattr(base, name) for name in ("force", "constraint", "jacobian", "gamma")}
+        return ConstrainedSystem.from_python(n_q=2 * n, n_c=n, mass=mass, **callbacks), problem
+
+    made, problem = system()
+    choose(True)
+    result = solve_dae(made, (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
+    assert not result.success and result.t[-1] <= 0.26
+    assert result.status is not Status.REACHED_END
+
+
+def test_a_mass_negative_at_the_start_is_refused(choose):
+    problem = chain(4, False)
+    base = problem.system
+    callbacks = {name: getattr(base, name) for name in ("force", "constraint", "jacobian", "gamma")}
+    system = ConstrainedSystem.from_python(n_q=8, n_c=4, mass=-np.eye(8), **callbacks)
+    choose(True)
+    with pytest.raises(ValueError, match="positive definite on the velocities"):
+        solve_dae(system, (0.0, 1.0), problem.q0, problem.v0)
+
+
+def test_a_program_outlasts_partitions(choose):
+    """Another partition of a chain has the same rows: the program of the augmented matrix stays."""
+    choose(True)
+    run = started(chain(12, False))
+    program = run.work.index_a.copy()
+    for _ in range(2):
+        assert run.a.start(run.kit, run.work, 0.0, run.state) == common.DONE
+    assert (run.work.index_a == program).all()
+
+
+def test_rows_of_rank_less_than_their_number_warn(choose):
+    choose(True)
+    m = mechanism("redundant slider-crank")
+    with pytest.warns(ConstraintWarning, match="rank"):
+        result = solve_dae(m.system(), (0.0, 0.01), *m.start, "Adams", 1e-8, 1e-8)
+    assert force_residual(m.system(), result) < 1e-8
