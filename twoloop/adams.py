@@ -6,6 +6,16 @@ import numpy as np
 
 from twoloop.plan import LARGEST_MOVE, Plan
 
+# h times the frequency of a vibration that grows by 1 % a step, and times a rate of decay, at orders 1 to 12; of decay
+# that of order 6 from there on, because the order does not stay above where decay limits the steps
+STABLE_TO = tuple(
+    zip(
+        (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),
+        (2.01, 2.41, 1.96, 1.43, 1.06, 0.79, 0.79, 0.79, 0.79, 0.79, 0.79, 0.79),
+        strict=True,
+    )
+)
+
 
 @dataclass(frozen=True)
 class Adams:
@@ -18,8 +28,8 @@ class Adams:
     independent coordinates. So the method departs from the paper, whose outer loop knows independent coordinates only,
     and a new partition does not interrupt it.
 
-    Starts by itself, with order 1 and a short step. Where it takes many steps that are rejected or tiny, a stiff force
-    or a discontinuity may be the reason: see `RungeKutta(..., outer="newton")`.
+    Starts by itself, with order 1 and a short step. Where stability rather than accuracy limited the steps, which is
+    measured at a few states when a run of many steps is over, `result.message` says so, and what to take.
 
     Notes
     -----
@@ -59,4 +69,5 @@ class Adams:
             safety=kernels.SAFETY,
             factor_min=0.1,
             factor_max=kernels.START_GROWTH,
+            stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
         )

@@ -32,6 +32,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
         memory=kernels.switching_memory(n_q, first.memory, second.memory),
         first=first.step,
         second=second.step,
+        stable_to=None,
     )
 
 

@@ -11,6 +11,7 @@ from twoloop.plan import INNER_TOL, LARGEST_MOVE, Plan, check_tolerances, least_
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
 LEAST_ERROR = 1e-6  # of the tolerance, in the trend: an error of order 8 falls a hundredfold with steps half as long
+STABLE_TO = (5.96, 6.39)  # h times the frequency of a vibration, and times a rate of decay
 SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
 
 
@@ -22,7 +23,7 @@ class DOP853:
     on the constraints. For smooth motion that is not stiff. Stability, not accuracy,
     limits h where the motion is slower than what could vibrate or decay: h w_max to 5.96 for undamped vibrations, and
     h times the largest rate of decay to 6.39. What little of a vibration such steps do not resolve they damp: of the
-    amplitude 0.15 % a step at h w_max = 3. Then take `RungeKutta(..., outer="newton")`.
+    amplitude 0.15 % a step at h w_max = 3. Where that limited many steps, `result.message` says so, and what to take.
 
     A step is accepted when the largest component of the estimated local error of q and v, dependents too, is within
     the tolerance. Fixed steps estimate nothing.
@@ -90,5 +91,6 @@ class DOP853:
             predictive=free,
             watchful=free,
             least_error=LEAST_ERROR,
+            stable_to=lambda memory: STABLE_TO,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )

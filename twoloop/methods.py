@@ -48,7 +48,8 @@ class RungeKutta:
         Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
         "richardson": its largest component counts, and the step continues from the extrapolated state, put back on
         the constraints, whose order is one higher. "richardson-paper": its root mean square (27) counts, and the step
-        continues from the two half steps. Fixed steps estimate nothing and are the tableau's own. Beside "richardson"
+        continues from the two half steps. Fixed steps estimate nothing and are the tableau's own, with sums from step
+        to step that make up for rounding (Kahan's). Beside "richardson"
         the accelerations at both ends of the step are compared with the polynomial through those of the stages: so a
         jump of the force between an end and the stage next to it, which no stage sees, is found.
     inner_tol : float, optional

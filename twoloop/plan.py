@@ -42,6 +42,7 @@ class Plan:
     watchful: bool = False  # whether short steps are a reason to look how near a singular position is
     lands: bool = False  # whether steps are shortened to end at output times
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
+    stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
 

@@ -15,6 +15,7 @@ from twoloop.kernels import common, intervals
 from twoloop.plan import Plan, least_tolerance
 from twoloop.recorder import Recorder, Wanted
 from twoloop.result import Result, Statistics, Status, explained
+from twoloop.stability import Looks, said_of_stiffness
 from twoloop.system import ConstrainedSystem
 from twoloop.workspace import kit_of, workspace
 
@@ -37,6 +38,8 @@ CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may dif
 BRIDGES = tuple(0.85**k for k in range(28))
 CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
+# ends of which it may be said that stability limited the steps
+EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
 
@@ -200,7 +203,7 @@ class Run:
         out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
         out_state = np.empty((BUFFER_ROWS, len(self.state)))
         filled = np.zeros(2, dtype=np.int64)
-        pace = _Pace(self.t0)
+        pace, looks = _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
         code = a.PAUSED
         plan, control, kit = self.plan, self.control, self.kit
@@ -236,6 +239,8 @@ class Run:
             cpu += time.process_time() - began
             if recorder.ended is not None:
                 break
+            if code == a.PAUSED and not across:
+                looks.take(float(self.clock[a.T]), self.state, system.n_q, step_parts[-1][:, a.H])
             if spent < CHUNK_TIME:
                 self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
             limited = self.control[a.MAX_STEPS] < np.inf
@@ -271,6 +276,8 @@ class Run:
         if check_derivatives and code != INTERRUPTED:
             last = (float(self.clock[a.T]), self.state) if recorder.ended is None else (float(t[-1]), table[-1])
             status, message = self._check_again(t, table, last, status, message)
+        if status in EXPLAINED_BY_STIFFNESS:
+            message += said_of_stiffness(looks, self.kit, self.work)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
         t_events, q_events, v_events = recorder.events()
         return Result(

@@ -9,7 +9,7 @@ augmented.py.
 
 import numpy as np
 
-from twoloop.kernels.augmented import factor_augmented, solve_augmented
+from twoloop.kernels.augmented import factor_augmented, solve_augmented, solve_augmented_for
 from twoloop.kernels.banded import banded_mass, factor_banded_mass, solve_banded_mass
 from twoloop.kernels.common import (
     AUGMENTED,
@@ -415,7 +415,10 @@ def solve_for_order(f, w, r, c, a, lam):
     Entries of lam that belong to rows that do not count are left as they are.
     """
     n = r.size
-    if f.flags[REDUCED] == 0:
+    if f.flags[FORM] == AUGMENTED:
+        solve_augmented_for(w, r, c, a, lam)
+        return
+    if f.flags[FORM] == MULTIPLIERS:
         rows_v = w.rows_v
         _times_inverse_mass(f, w, r, a)
         for i in range(rows_v.size):

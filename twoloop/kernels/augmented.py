@@ -128,18 +128,33 @@ def _solve(w):
 
 
 @compiled
-def solve_augmented(w, a):
-    """Accelerations from w.Q and w.Gamma; the multipliers stay in w.z."""
+def _solve_with(w, r, c, a):
+    """a of M a + G^T lam = r and G a = c; the multipliers, times the scale, stay behind the solution in w.right."""
     x, y = _right_side(w)
-    scale = w.notes[MASS_SCALE]
     for j in range(x.size):
-        x[j] = scale * w.Q[j]
+        x[j] = w.notes[MASS_SCALE] * r[j]
     for k in range(y.size):
-        y[k] = w.Gamma[w.rows_v[k]]
+        y[k] = c[w.rows_v[k]]
     _solve(w)
     copy(x, a)
+
+
+@compiled
+def solve_augmented(w, a):
+    """Accelerations from w.Q and w.Gamma; the multipliers stay in w.z."""
+    _solve_with(w, w.Q, w.Gamma, a)
+    _, y = _right_side(w)
     for k in range(y.size):
-        w.z[k] = y[k] / scale
+        w.z[k] = y[k] / w.notes[MASS_SCALE]
+
+
+@compiled
+def solve_augmented_for(w, r, c, a, lam):
+    """Accelerations and multipliers from other right-hand sides."""
+    _solve_with(w, r, c, a)
+    _, y = _right_side(w)
+    for k in range(y.size):
+        lam[w.rows_v[k]] = y[k] / w.notes[MASS_SCALE]
 
 
 @compiled

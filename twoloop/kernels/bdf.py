@@ -252,7 +252,20 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     for j in range(s):
         copy(state[2 * n : 3 * n], A_stage[j])
     code = iterate_accelerations(
-        f, w, options[N_SCALARS:], tolerances, t, h, state[:n], state[n : 2 * n], A_stage, Q_stage, V_stage, q1, v1
+        f,
+        w,
+        options[N_SCALARS:],
+        tolerances,
+        t,
+        h,
+        state[:n],
+        state[n : 2 * n],
+        A_stage,
+        Q_stage,
+        V_stage,
+        q1,
+        v1,
+        scratch[:0].reshape((0, n)),
     )
     if code == DONE:
         code = accelerations(f, w, t + h, q1, v1, new_state[2 * n : 3 * n], new_state[3 * n :])

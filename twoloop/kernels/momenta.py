@@ -34,13 +34,24 @@ from twoloop.kernels.differences import longest_difference
 from twoloop.kernels.factors import columns_of, rows_of, solve
 from twoloop.kernels.linalg import copy, ldl_factor, ldl_solve
 from twoloop.kernels.predictor import departure, keep_predicted
-from twoloop.kernels.runge_kutta import GROWTH, MAX_ITERATIONS, PATIENCE, conclude
+from twoloop.kernels.runge_kutta import (
+    GROWTH,
+    MAX_ITERATIONS,
+    N_RESTS,
+    PATIENCE,
+    compensated,
+    conclude,
+    forget,
+    keep_rest,
+    rests,
+)
 from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
 
 # places in `memory`: advance() sets the first after every attempt; then stage blocks (s, n), vectors (n), matrices
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, PARTITION_NUMBER, N_MEMORY_SCALARS = range(7)
 V_PREVIOUS, R_PREVIOUS, V_TRIAL, R_TRIAL, V_HALF, R_HALF, Q_STAGE, P_STAGE, N_BLOCKS = range(9)
-P_START, P_END, RATE, MV, V_NEW, SHIFTED, U, Q_FULL, V_FULL, Q_MID, V_MID, P_MID, N_VECTORS = range(13)
+P_START, P_END, RATE, MV, V_NEW, SHIFTED, U, Q_FULL, V_FULL, Q_MID, V_MID, P_MID, REST = range(13)
+N_VECTORS = REST + N_RESTS
 TANGENT, REDUCED_MASS, N_MATRICES = range(3)
 
 
@@ -186,11 +197,12 @@ def _momentum_rates(f, w, t, q, v, tangent, Mv, shifted, rate):
 
 
 @compiled
-def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, q1, p1, v1):
+def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage, q1, p1, v1, rest):
     """One step of size h from (q, p) by a fixed-point iteration.
 
     V_stage, R_stage hold predicted velocities and rates of p on entry.
-    On return they have converged, and q1, p1, v1 are the end of the step, on the constraints.
+    On return they have converged, and q1, p1, v1 are the end of the step, on the constraints; q1 and p1 are summed with
+    compensation if there are rows of `rest`.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -262,12 +274,19 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
         in_q = 0.0
         for k in range(s):
             in_q += b[k] * V_stage[k, m]
-        q1[m] = q[m] + h * in_q
+        if rest.shape[0] == 0:
+            q1[m] = q[m] + h * in_q
+        else:
+            q1[m], rest[2, m] = compensated(q[m], rest[0, m], h * in_q)
     for m in w.independent:
         in_p = 0.0
         for k in range(s):
             in_p += b[k] * R_stage[k, m]
-        p1[m] = p[m] + h * in_p
+        if rest.shape[0] == 0:
+            p1[m] = p[m] + h * in_p
+        else:
+            p1[m], rest[3, m] = compensated(p[m], rest[1, m], h * in_p)
+    forget(w.dependent, rest)
     keep_predicted(w, q1)
     code = dependent_positions(f, w, t + h, q1, v1, options[INNER_TOL])
     if code == DONE:
@@ -296,23 +315,30 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     tangent = _matrix(memory, s, n, n_dof, n, TANGENT)
     reduced = _matrix(memory, s, n, n_dof, n_dof, REDUCED_MASS)
     weights = memory[memory.size - s :]
-    code = _tangents(f, w, t, q, tangent, reduced, _vector(memory, s, n, U))
-    if code != DONE:
-        return code, np.inf
-    _momenta(w, tangent, v, Mv, p)
-    # rates belong to a partition: under another one they predict nothing
+    rest = rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
+    # momenta and their rates belong to a partition: under another one they predict nothing
     same = memory[PARTITION_NUMBER] == w.counters[N_PARTITIONS]
     memory[PARTITION_NUMBER] = w.counters[N_PARTITIONS]
-    if memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0:
+    goes_on = memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0
+    if goes_on:
         for j in range(s):
             copy(v_trial[j], v_previous[j])
             copy(r_trial[j], r_previous[j])
         memory[H_PREVIOUS] = memory[H_TRIAL]
         memory[HAS_PREVIOUS] = 1.0
+        keep_rest(rest)
     memory[HAS_TRIAL] = 0.0
     if not same:
         memory[HAS_PREVIOUS] = 0.0
     ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
+    if goes_on and tolerances[ESTIMATE] == 0.0 and ratio <= FARTHEST:
+        copy(p1, p)  # to find them from v, which is rounded, would let the energy drift
+    else:
+        rest[:, :] = 0.0
+        code = _tangents(f, w, t, q, tangent, reduced, _vector(memory, s, n, U))
+        if code != DONE:
+            return code, np.inf
+        _momenta(w, tangent, v, Mv, p)
     if ratio <= FARTHEST:
         for j in range(s):
             interpolate(c, 1.0 + ratio * c[j], v_previous, weights, v_trial[j])
@@ -324,7 +350,7 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         for j in range(s):
             copy(v, v_trial[j])
             copy(rate, r_trial[j])
-    code = _iterate(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1)
+    code = _iterate(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1, rest)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -335,14 +361,31 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 * c[j], r_trial, weights, r_half[j])
         w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
-        code = _iterate(f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid)
+        code = _iterate(
+            f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid, rest
+        )
         if code != DONE:
             return code, np.inf
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 + 0.5 * c[j], r_trial, weights, r_half[j])
         code = _iterate(
-            f, w, options, memory, tolerances, t + 0.5 * h, 0.5 * h, q_mid, v_mid, p_mid, v_half, r_half, q1, p1, v1
+            f,
+            w,
+            options,
+            memory,
+            tolerances,
+            t + 0.5 * h,
+            0.5 * h,
+            q_mid,
+            v_mid,
+            p_mid,
+            v_half,
+            r_half,
+            q1,
+            p1,
+            v1,
+            rest,
         )
         if code != DONE:
             return code, np.inf

@@ -17,6 +17,7 @@ from twoloop.kernels.common import (
     RTOL,
     STEP,
     compiled,
+    exact,
     inlined,
     kernel,
     merged,
@@ -42,8 +43,9 @@ PATIENCE = 8  # iterations after which a difference that grows again means diver
 
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
 LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
+N_RESTS = 4  # rows of REST: what rounding took from q and from v, at the last accepted step and in this attempt
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, N_VECTORS = range(8)
+Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
 
 
 def memory_size(s: int, n_q: int) -> int:
@@ -63,14 +65,45 @@ def _vector(memory, s, n, which):
     return memory[start : start + n]
 
 
+@inlined
+def rests(memory, n, tolerances):
+    """The rows of REST, with which `memory` begins; none with step-size control, whose errors exceed rounding."""
+    count = N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
+    return memory[: count * n].reshape((count, n))
+
+
+@exact
+def compensated(x, rest, increment):
+    """The sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    increment += rest
+    total = x + increment
+    return total, increment - (total - x)
+
+
+@merged
+def forget(coordinates, rest):
+    """Coordinates that the constraints give have no rest."""
+    for i in range(N_RESTS // 2, rest.shape[0]):
+        for m in coordinates:
+            rest[i, m] = 0.0
+
+
+@merged
+def keep_rest(rest):
+    """That of the last attempt, which was accepted, is what the next step begins with."""
+    for i in range(rest.shape[0] // 2):
+        copy(rest[rest.shape[0] // 2 + i], rest[i])
+
+
 @compiled
-def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1):
+def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
     """One step of size h from (q, v), a fixed-point iteration on the stage accelerations.
 
     A_stage holds their prediction on entry.
     Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
     undamped systems the iteration's rate is the square of the first-order one. On return A_stage has converged and
     (q1, v1) is the end of the step, on the constraints; w.notes[DEPARTURE] grows to how far its prediction was off.
+    The sums are compensated where `rest` has rows.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -128,8 +161,13 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
         for k in range(s):
             in_q += bA[k] * A_stage[k, m]
             in_v += b[k] * A_stage[k, m]
-        q1[m] = q[m] + h * v[m] + h * h * in_q
-        v1[m] = v[m] + h * in_v
+        if rest.shape[0] == 0:
+            q1[m] = q[m] + h * v[m] + h * h * in_q
+            v1[m] = v[m] + h * in_v
+        else:
+            q1[m], rest[2, m] = compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
+            v1[m], rest[3, m] = compensated(v[m], rest[1, m], h * in_v)
+    forget(w.dependent, rest)
     return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
@@ -257,11 +295,13 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
     q_mid, v_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID)
     weights = memory[memory.size - s :]
+    rest = rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
     if memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0:
         for j in range(s):
             copy(trial[j], previous[j])
         memory[H_PREVIOUS] = memory[H_TRIAL]
         memory[HAS_PREVIOUS] = 1.0
+        keep_rest(rest)
     memory[HAS_TRIAL] = 0.0
     ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
     for j in range(s):
@@ -269,7 +309,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1)
+    code = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
     if code != DONE:
         return code, np.inf
     error = 0.0
@@ -280,12 +320,14 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
         w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
         g = 0.5 * h
-        code = iterate_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid)
+        code = iterate_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rest)
         if code != DONE:
             return code, np.inf
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
-        code = iterate_accelerations(f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1)
+        code = iterate_accelerations(
+            f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rest
+        )
         if code != DONE:
             return code, np.inf
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)

@@ -1,0 +1,178 @@
+"""Runs whose steps stability limits say so; those whose steps accuracy limits do not."""
+
+import re
+from math import comb
+
+import numpy as np
+import pytest
+
+from twoloop import DOP853, ConstrainedSystem, Status, adams, dop853, solve_dae
+from twoloop.kernels import adams as kernels
+from twoloop.mechanisms import (
+    bricard,
+    closed_chain,
+    double_pendulum,
+    four_bar,
+    governor,
+    heavy_top,
+    moderately_stiff_beam,
+    pendulum,
+    rolling_disc,
+    spatial_four_bar,
+    spatial_slider_crank,
+)
+from twoloop.stability import Looks, said_of_stiffness
+
+STIFF = "The problem looks stiff"
+METHODS = pytest.mark.parametrize("method", ["Adams", "DOP853"])
+
+
+def never(t, q, v):
+    """An event that does not occur, but has Python look at a run every 16 attempts."""
+    return 1.0
+
+
+never.terminal = True
+
+
+def run(problem, end, method, tol, **options):
+    return solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tol, tol, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "end", "tol", "method", "what"),
+    [
+        (moderately_stiff_beam, 0.1, 1e-2, "Adams", "vibrations of 3.*e.04 rad/s"),
+        (moderately_stiff_beam, 0.1, 1e-4, "Adams", "vibrations of 3.*e.04 rad/s"),
+        (moderately_stiff_beam, 0.3, 1e-2, "DOP853", "vibrations of 3.*e.04 rad/s"),
+        (moderately_stiff_beam, 0.3, 1e-2, DOP853("restored"), "vibrations of 3.*e.04 rad/s"),
+        (governor, 2.0, 1e-4, "Adams", "a decay of .*e.03 1/s"),
+        (governor, 2.0, 1e-4, "DOP853", "a decay of .*e.03 1/s"),
+    ],
+)
+def test_steps_at_the_limit_of_stability_are_said_to_be(make, end, tol, method, what):
+    result = run(make(), end, method, tol)
+    assert result.success
+    assert result.message.count(STIFF) == 1
+    assert re.search(what, result.message), result.message
+    for name in ("'auto'", "'RadauIIA5'", "'TRBDF2'"):
+        assert name in result.message
+
+
+SMOOTH = [
+    (four_bar, 10.0),
+    (pendulum, 10.0),
+    (double_pendulum, 10.0),
+    (lambda: closed_chain(10), 2.0),
+    (heavy_top, 2.0),
+    (bricard, 10.0),
+    (rolling_disc, 5.0),
+    (spatial_four_bar, 5.0),
+    (spatial_slider_crank, 5.0),
+]
+
+
+@METHODS
+@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+@pytest.mark.parametrize(("make", "end"), SMOOTH)
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_smooth_motion_is_not_called_stiff(make, end, tol, method):
+    result = run(make(), end, method, tol, events=never)
+    assert result.success
+    assert STIFF not in result.message
+
+
+def test_tight_tolerances_limit_the_steps_of_the_beam_by_accuracy():
+    for method, tol in (("Adams", 1e-8), ("DOP853", 1e-6)):
+        assert STIFF not in run(moderately_stiff_beam(), 0.1, method, tol).message
+
+
+def test_methods_for_stiff_motion_and_the_default_say_nothing():
+    for method in ("auto", "TRBDF2", "RadauIIA5", "Gauss8"):
+        assert STIFF not in run(moderately_stiff_beam(), 0.1, method, 1e-3).message
+
+
+def test_a_run_that_stops_for_its_steps_says_it_too():
+    result = run(moderately_stiff_beam(), 1.0, "Adams", 1e-3, max_steps=3000)
+    assert result.status is Status.MAX_STEPS
+    assert STIFF in result.message and result.message.endswith("See docs/when_it_fails.md#max_steps.")
+
+
+@METHODS
+def test_a_stiff_spring_in_python_is_seen(method):
+    """A point on a circle, tied to its lowest position by a spring of 1e4 rad/s in which next to no motion is."""
+    stiff = ConstrainedSystem.from_python(
+        n_q=3,
+        n_c=1,
+        mass=np.eye(3),
+        force=lambda t, q, v: np.array([0.0, -9.81, -1e8 * (q[2] - np.sin(t)) - np.sin(t)]),
+        constraint=lambda t, q: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0]]),
+    )
+    start = ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    result = solve_dae(stiff, (0.0, 0.3), *start, method=method, rtol=1e-4, atol=1e-4)
+    found = re.search(r"vibrations of (\S+) rad/s", result.message)
+    assert result.success and found and float(found[1]) == pytest.approx(1e4, rel=0.05)
+
+
+def test_counts_are_those_of_the_run_alone():
+    problem = moderately_stiff_beam()
+    stats = run(problem, 0.1, "Adams", 1e-3).stats
+    attempts = stats.n_accepted + stats.n_rejected_error
+    assert stats.n_evaluations <= 2 * attempts + stats.n_rejected_convergence + 1
+
+
+def radius(order, squared, damping):
+    """Largest amplification of a step of 1 of Adams' method for q'' = -squared q - damping v, constant steps."""
+    nodes, weights = kernels.NODES, kernels.WEIGHTS
+    c, g, G = np.ones_like(nodes), [], []
+    for i in range(order + 1):
+        g.append(weights @ c)
+        G.append(kernels.REST @ c)
+        c = c * (nodes + i) / (i + 1)
+    speed, place = np.array(g), np.array(G)
+    backward = np.array([[(-1) ** j * comb(i, j) for j in range(order)] for i in range(order)])
+    matrix = []
+    for q, v, *a in np.eye(order + 2):
+        phi = backward @ a
+        q1, v1 = q + v + place[:-1] @ phi, v + speed[:-1] @ phi
+        d = -squared * q1 - damping * v1 - phi.sum()
+        q1, v1 = q1 + place[-1] * d, v1 + speed[-1] * d
+        matrix.append([q1, v1, -squared * q1 - damping * v1, *a[:-1]])
+    return np.abs(np.linalg.eigvals(np.array(matrix))).max()
+
+
+@pytest.mark.parametrize("order", range(1, 13))
+def test_limits_of_adams(order):
+    vibration, decay = adams.STABLE_TO[order - 1]
+    below, above = vibration - 0.02, vibration + 0.02
+    assert radius(order, below**2, 0.0) < 1.01 < radius(order, above**2, 0.0)
+    if order <= 6:
+        assert radius(order, 0.0, decay - 0.02) < 1.01 < radius(order, 0.0, decay + 0.02)
+    else:
+        assert decay == adams.STABLE_TO[5][1]
+
+
+def test_limits_of_dop853_are_those_of_its_docstring():
+    for limit in dop853.STABLE_TO:
+        assert str(limit) in DOP853.__doc__
+
+
+def test_a_callback_that_raises_beside_the_run_spoils_nothing():
+    class Kit:
+        def inner(self, *arguments):
+            raise ZeroDivisionError
+
+    looks = Looks(DOP853().plan(2, 1e-6, 1e-6, False))
+    looks.take(0.0, np.zeros(8), 2, np.full(1000, 1e-3))
+    assert len(looks.kept) == 1
+    assert said_of_stiffness(looks, Kit(), type("Work", (), {"Q": np.zeros(2), "x": None, "lam": None})) == ""
+
+
+def test_few_states_are_kept_of_many():
+    looks = Looks(DOP853().plan(2, 1e-6, 1e-6, False))
+    for k in range(1000):
+        looks.take(float(k), np.zeros(8), 2, np.full(16, 1e-3))
+    times = np.array([look.t for look in looks.kept])
+    assert 4 <= len(times) <= 8
+    assert np.ptp(np.diff(times)) == 0.0 and times[-1] > 800.0
