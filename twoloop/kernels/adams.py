@@ -72,7 +72,7 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """1 over the tolerances of velocities and of positions."""
+    """Two rows of velocities and of positions: means over the step, then 1 over the tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -126,8 +126,10 @@ def _coefficients(memory, h, k):
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
     beta[0] = 1.0
+    for i in range(k):  # all quotients first: none waits for the one before
+        beta[i + 1] = new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
     for i in range(k):
-        beta[i + 1] = beta[i] * new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
+        beta[i + 1] *= beta[i]
     for m in range(8):
         c[m] = 1.0
     before = 0.0  # psi_0
@@ -148,6 +150,7 @@ def _coefficients(memory, h, k):
 def _predict(memory, h, k, old, new, state, q1, v1, n):
     """The prediction (q1, v1), and what the differences would be if it were exact, into `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, SPEED), _row(memory, PLACE)
+    in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
         # what the acceptance of this step will add d to: phi_k+2 = d - beta_k+1 phi_k+1
@@ -185,21 +188,18 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
             new[i, m + 1] = e1
             new[i, m + 2] = e2
             new[i, m + 3] = e3
-        v0, q0 = state[n + m], state[m]
-        v1[m] = v0 + h * x0
-        q1[m] = q0 + h * (v0 + h * y0)
-        if m + 1 < n:
-            v0, q0 = state[n + m + 1], state[m + 1]
-            v1[m + 1] = v0 + h * x1
-            q1[m + 1] = q0 + h * (v0 + h * y1)
-        if m + 2 < n:
-            v0, q0 = state[n + m + 2], state[m + 2]
-            v1[m + 2] = v0 + h * x2
-            q1[m + 2] = q0 + h * (v0 + h * y2)
-        if m + 3 < n:
-            v0, q0 = state[n + m + 3], state[m + 3]
-            v1[m + 3] = v0 + h * x3
-            q1[m + 3] = q0 + h * (v0 + h * y3)
+        in_v[m] = x0
+        in_v[m + 1] = x1
+        in_v[m + 2] = x2
+        in_v[m + 3] = x3
+        in_q[m] = y0
+        in_q[m + 1] = y1
+        in_q[m + 2] = y2
+        in_q[m + 3] = y3
+    for m in range(n):
+        v0 = state[n + m]
+        v1[m] = v0 + h * in_v[m]
+        q1[m] = state[m] + h * (v0 + h * in_q[m])
 
 
 @merged
@@ -276,11 +276,13 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return code, np.inf
     per_v, per_q = _scratch(memory, n)
     d = new[N_TERMS]
+    rtol = tolerances[RTOL]
     for m in range(n):
         d[m] = a1[m] - new[0, m]
-        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
-        per_v[m] = STRICT / (atol + rtol * max(abs(v[m]), abs(v1[m])))
-        per_q[m] = STRICT / (atol + rtol * max(abs(q[m]), abs(q1[m])))
+    for m in range(n):
+        per_v[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
+    for m in range(n):
+        per_q[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
     error = _next(memory, h, k, new, d, n)
     if not error <= 1.0:
         return DONE, error

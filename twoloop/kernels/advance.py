@@ -246,7 +246,8 @@ def advance(
             continue
         factor = control[FACTOR_MAX]
         if error > 0.0:
-            factor = control[SAFETY] * error ** -control[EXPONENT]
+            power = 1.0 / error if control[EXPONENT] == 1.0 else error ** -control[EXPONENT]
+            factor = control[SAFETY] * power
             if accepted and control[PREDICTIVE] == 1.0 and clock[ERROR_BEFORE] > 0.0:
                 trend = size / clock[H_BEFORE] * (clock[ERROR_BEFORE] / error) ** control[EXPONENT]
                 factor = min(factor, factor * trend)

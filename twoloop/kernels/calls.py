@@ -17,7 +17,7 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
-from twoloop.kernels.partition import note_pattern, partition_of_midpoint, renew, write_programs
+from twoloop.kernels.partition import has_new_entries, note_pattern, partition_of_midpoint, renew, write_programs
 from twoloop.kernels.projection import accelerate_there, to_constraints
 
 (
@@ -34,11 +34,20 @@ from twoloop.kernels.projection import accelerate_there, to_constraints
     MASS,
     RENEW,
     MIDPOINT,
+    PATTERN,
     REDUNDANT,
-) = range(14)
+) = range(15)
 
 ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
 ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
+
+
+@merged
+def _verify_pattern(w):
+    """Where the Jacobian has an entry for the first time, what was evaluated on the way is wrong."""
+    if not note_pattern(w.G, w.pattern):
+        return DONE
+    return INNER_DIVERGED if write_programs(w) else SINGULAR
 
 
 @compiled
@@ -57,15 +66,9 @@ def _other_task(f, w, task, t, q, v):
         return renew(f, w, t, q)
     if task == MIDPOINT:
         return partition_of_midpoint(f, w, t, q, v)
+    if task == PATTERN:
+        return _verify_pattern(w)
     return redundant_rows_hold(f, w, t, q, v)
-
-
-@merged
-def _verify_pattern(w):
-    """Where the Jacobian has an entry for the first time, what was evaluated on the way is wrong."""
-    if not note_pattern(w.G, w.pattern):
-        return DONE
-    return INNER_DIVERGED if write_programs(w) else SINGULAR
 
 
 @merged
@@ -73,8 +76,7 @@ def _all_coordinates(f, w, task, t, q, v, tolerance, a, lam):
     """Tasks of methods that integrate all coordinates."""
     if task == EVALUATE_THERE:
         return accelerate_there(f, w, t, q, v, a)
-    code = to_constraints(f, w, t, q, v, tolerance, a, lam)
-    return _verify_pattern(w) if code == DONE else code
+    return to_constraints(f, w, t, q, v, tolerance, a, lam)
 
 
 @kernel(INNER)
@@ -131,7 +133,10 @@ def project(f, w, t, q, v, theta, a, lam):
     """
     if w.Rate.size > w.C.size:
         return evaluate_state(f, w, t, q, v, theta, a, lam)
-    return f.inner(f, w, PROJECT, t, q, v, theta, a, lam)
+    code = f.inner(f, w, PROJECT, t, q, v, theta, a, lam)
+    if code == DONE and has_new_entries(w.G, w.pattern):
+        code = f.inner(f, w, PATTERN, t, q, v, theta, a, lam)
+    return code
 
 
 @merged

@@ -152,18 +152,20 @@ def _square(A, r):
     return A.reshape(A.size)[: r * r].reshape((r, r))
 
 
+@merged
+def has_new_entries(G, pattern):
+    """Whether an entry of G is not zero for the first time."""
+    entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
+    unseen = 0.0  # a sum without a branch: there is nothing new at nearly every look
+    for i in range(seen.size):
+        unseen += abs(entries[i]) * (1.0 - seen[i])
+    return unseen != 0.0  # also true for NaN
+
+
 @compiled
 def note_pattern(G, pattern):
     """Note the entries of G that are not zero; whether there are new ones."""
-    unseen, odd = 0.0, 0.0  # two sums without a branch: there is nothing new at nearly every look
-    n = pattern.shape[1] // 2 * 2
-    for i in range(pattern.shape[0]):
-        for j in range(0, n, 2):
-            unseen += abs(G[i, j]) * (1.0 - pattern[i, j])
-            odd += abs(G[i, j + 1]) * (1.0 - pattern[i, j + 1])
-        if n < pattern.shape[1]:
-            unseen += abs(G[i, n]) * (1.0 - pattern[i, n])
-    if unseen + odd == 0.0:
+    if not has_new_entries(G, pattern):
         return False
     new = False
     for i in range(pattern.shape[0]):

@@ -44,7 +44,7 @@ def departure(w, tolerances, h, q, v, q1):
         distance = abs(w.predicted[k] - q1[m])
         if distance > 0.0:
             scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
-            largest = max(largest, distance / scale, distance / (share * motion + floor * scale))
+            largest = max(largest, distance / min(scale, share * motion + floor * scale))
     return largest
 
 

@@ -27,6 +27,7 @@ from twoloop.kernels.finite import CONSTRAINT, not_finite
 from twoloop.kernels.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_dependent, factor_rows, tangents
 from twoloop.kernels.linalg import ldl_solve
 
+AT_REST = 0.3  # of theta: velocities by the tangents of positions that moved by less are right after one pass
 ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
 
 
@@ -51,35 +52,40 @@ def accelerate_there(f, w, t, q, v, a):
     return accelerate(f, w, t, q, v, a) if code == DONE else code
 
 
-@compiled
-def _mass_times(f, w, x, y):
-    if f.flags[DIAGONAL_MASS] == 1:
-        for i in range(x.size):
-            y[i] = w.M[i, i] * x[i]
-        return
-    for i in range(x.size):
-        total = 0.0
-        for j in range(x.size):
-            total += w.M[i, j] * x[j]
-        y[i] = total
-
-
 @merged
-def _along_tangents(w, columns, y, x):
-    """x = (T^T M T)^-1 T^T y."""
-    for j in range(w.independent_v.size):
-        total = y[w.independent_v[j]]
+def _nearest(f, w, columns):
+    """x with (T^T M T) x = T^T M y, over the independents of y in the first places of w.x; w.z has y's dependents."""
+    independent, x, y = w.independent_v, w.x, w.y
+    n_dof = independent.size
+    if f.flags[DIAGONAL_MASS] == 1:
         for k in range(columns.size):
-            total += w.D[j, k] * y[columns[k]]
-        x[j] = total
-    ldl_solve(w.A, x)
+            y[k] = w.M[columns[k], columns[k]] * w.z[k]
+        for j in range(n_dof):
+            total = w.M[independent[j], independent[j]] * x[j]
+            for k in range(columns.size):
+                total += w.D[j, k] * y[k]
+            x[j] = total
+    else:
+        for i in range(y.size):
+            total = 0.0
+            for j in range(n_dof):
+                total += w.M[i, independent[j]] * x[j]
+            for k in range(columns.size):
+                total += w.M[i, columns[k]] * w.z[k]
+            y[i] = total
+        for j in range(n_dof):
+            total = y[independent[j]]
+            for k in range(columns.size):
+                total += w.D[j, k] * y[columns[k]]
+            x[j] = total
+    ldl_solve(w.A, x[:n_dof])
 
 
 @compiled
 def _to_constraints(f, w, q, v):
     """Correct q and v by T and the factors of T^T M T; the largest correction of a position, and of a velocity."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
-    n_dof, x, y = independent.size, w.x, w.y
+    n_dof, x = independent.size, w.x
     for k in range(rows.size):
         w.z[k] = w.C[rows[k]]
     solve(w.index_v, w.values_v, w.z)
@@ -87,11 +93,8 @@ def _to_constraints(f, w, q, v):
         if not np.isfinite(w.z[k]):
             return np.inf, np.inf
     for j in range(n_dof):
-        x[independent[j]] = 0.0
-    for k in range(rows.size):
-        x[columns[k]] = w.z[k]
-    _mass_times(f, w, x, y)
-    _along_tangents(w, columns, y, x)
+        x[j] = 0.0
+    _nearest(f, w, columns)
     largest = 0.0
     for j in range(n_dof):
         q[independent[j]] += x[j]
@@ -103,11 +106,10 @@ def _to_constraints(f, w, q, v):
         q[columns[k]] += change
         largest = max(largest, abs(change))
     for j in range(n_dof):
-        x[independent[j]] = v[independent[j]]
+        x[j] = v[independent[j]]
     for k in range(rows.size):
-        x[columns[k]] = v[columns[k]] - w.D[n_dof, k]
-    _mass_times(f, w, x, y)
-    _along_tangents(w, columns, y, x)
+        w.z[k] = v[columns[k]] - w.D[n_dof, k]
+    _nearest(f, w, columns)
     faster = 0.0
     for j in range(n_dof):
         faster = max(faster, abs(v[independent[j]] - x[j]))
@@ -167,7 +169,7 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
 
     Positions are corrected until a correction is at most theta, velocities alike, relative to the largest.
     """
-    before, at_rest = np.inf, False
+    before = np.inf
     theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
     for _ in range(MAX_INNER):
         code = _look(f, w, t, q, v)
@@ -187,10 +189,11 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
             moved, faster = _by_multipliers(w, q, v)
         if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
-        # where positions rest, the tangents are those of the pass before: velocities are then right after one more
-        if moved <= theta and (at_rest or faster <= theta * max(1.0, _largest(v))):
+        if moved <= theta and faster <= theta * max(1.0, _largest(v)):
             break
-        at_rest = moved <= theta
+        if moved <= AT_REST * theta:  # the tangents are those of the end, but Gamma is of the velocities before
+            w.notes[KNOWN] = 0.0
+            break
         if moved > CONTRACTION * before:
             if not moved <= ROUNDING * _largest(q):
                 return INNER_DIVERGED
