@@ -14,8 +14,8 @@ METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_five_digits_across_the_singular_positions(n, method="DOP853"):
-    """After 10 s, in which the cranks pass the ground line some ten times."""
-    m, (result, _) = mechanism(f"A02, N = {n}"), run(f"A02, N = {n}", method)
+    """After 10 s, in which the cranks pass the ground line some ten times. Near rounding not every run finds across."""
+    m, (result, _) = mechanism(f"A02, N = {n}"), run(f"A02, N = {n}", method, 1e-9)
     assert result.success, result.message
     assert error(m, result) < 1e-5
 
@@ -23,8 +23,8 @@ def test_five_digits_across_the_singular_positions(n, method="DOP853"):
 @pytest.mark.parametrize("method", ["SunRadau5", "RadauIIA5", "BDF"])
 @pytest.mark.parametrize("n", [1, 2])
 def test_every_method_crosses(n, method):
-    """Four digits at a tolerance of 1e-8: on another branch not one would be right."""
-    m, (result, _) = mechanism(f"A02, N = {n}"), run(f"A02, N = {n}", method, 1e-8)
+    """Four digits at a tolerance of 1e-7: on another branch not one would be right."""
+    m, (result, _) = mechanism(f"A02, N = {n}"), run(f"A02, N = {n}", method, 1e-7)
     assert result.success, result.message
     assert error(m, result) < 1e-4
 

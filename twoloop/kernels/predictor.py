@@ -13,6 +13,7 @@ from twoloop.kernels.factors import sign_of
 
 SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
 SHARE_THROUGH_ZERO = 1e-6  # ... and where the sign of det C_qd changes
+LEAST = 1e-300  # in place of a scale of zero, so that a distance of zero needs no branch
 FLOOR = 0.01  # of the tolerances, below which SHARE_OF_MOTION does not matter
 
 
@@ -41,10 +42,8 @@ def departure(w, tolerances, h, q, v, q1):
     largest = 0.0
     for k in range(w.dependent.size):
         m = w.dependent[k]
-        distance = abs(w.predicted[k] - q1[m])
-        if distance > 0.0:
-            scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
-            largest = max(largest, distance / min(scale, share * motion + floor * scale))
+        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
+        largest = max(largest, abs(w.predicted[k] - q1[m]) / max(min(scale, share * motion + floor * scale), LEAST))
     return largest
 
 

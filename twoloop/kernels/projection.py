@@ -16,6 +16,7 @@ from twoloop.kernels.common import (
     KINEMATICS_GIVEN,
     KNOWN,
     N_INNER,
+    PIVOT,
     REDUCED,
     ROUNDED,
     compiled,
@@ -27,7 +28,6 @@ from twoloop.kernels.finite import CONSTRAINT, not_finite
 from twoloop.kernels.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_dependent, factor_rows, tangents
 from twoloop.kernels.linalg import ldl_solve
 
-AT_REST = 0.3  # of theta: velocities by the tangents of positions that moved by less are right after one pass
 ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
 
 
@@ -167,7 +167,8 @@ def _largest(x):
 def to_constraints(f, w, t, q, v, theta, a, lam):
     """(q, v) put on the constraints, then accelerations and multipliers there; without rows of A only.
 
-    Positions are corrected until a correction is at most theta, velocities alike, relative to the largest.
+    Positions are corrected until a correction is at most theta, velocities alike, relative to the largest. Where it is
+    at most theta times the smallest pivot, by whose inverse tangents turn, velocities are right after the same pass.
     """
     before = np.inf
     theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
@@ -191,8 +192,8 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
             return not_finite(w.notes, CONSTRAINT, t, q)
         if moved <= theta and faster <= theta * max(1.0, _largest(v)):
             break
-        if moved <= AT_REST * theta:  # the tangents are those of the end, but Gamma is of the velocities before
-            w.notes[KNOWN] = 0.0
+        if moved <= w.notes[PIVOT] * theta:
+            w.notes[KNOWN] = 0.0  # the tangents are those of the end, but Gamma belongs to the velocities before
             break
         if moved > CONTRACTION * before:
             if not moved <= ROUNDING * _largest(q):
