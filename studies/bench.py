@@ -248,7 +248,7 @@ def _rows_of(
         for run, k in left:
             first = kept[run.key(0)] if k > 0 else {}
             if first.get("status") != "TIME_LIMIT" and (first.get("cpu_s") or 0.0) <= ONCE:
-                yield run, k, _row(run, k, measure, warm)
+                yield run, k, row_of(run, k, measure, warm)
         return
     _shared[:] = [(run, k, measure) for run, k in left]  # cases and solvers hold functions that cannot be sent
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("fork"), _end_with_parent)
@@ -265,7 +265,7 @@ _shared: list[tuple[Run, int, Measure | None]] = []  # as the workers inherit it
 
 def _shared_row(i: int) -> Row:
     run, k, measure = _shared[i]
-    return _row(run, k, measure, set())
+    return row_of(run, k, measure, set())
 
 
 def _end_with_parent() -> None:
@@ -281,7 +281,8 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
+def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
+    """Make a repetition of a run and measure it over the motion; `warm` is what `build` has compiled."""
     case, solver = run.case, run.solver
     row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
     row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
