@@ -27,7 +27,7 @@ from twoloop import ConstrainedSystem, Result, solve_dae
 
 Array = NDArray[np.float64]
 
-OWN = ("auto", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA_C = "IDA from C"
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)

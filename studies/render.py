@@ -71,7 +71,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def environment() -> jinja2.Environment:
-    """The environment of all templates: filters `num`, `power`, `pct`, `listed`, `code`, `brief`, and `table(header, rows)`."""
+    """The environment of all templates: `table(header, rows)`, and filters for numbers, lists, code and stamps."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,

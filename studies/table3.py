@@ -14,6 +14,7 @@ from studies.cli import StudyError
 from studies.metrics import ASTRAY, LOST
 from studies.render import number, power, render, table
 from studies.solvers import (
+    ADAMS,
     CATALOGUE,
     ERR_IN,
     IDA_C,
@@ -22,6 +23,7 @@ from studies.solvers import (
     NEWMARK,
     OWN_EXPLICIT,
     QUARTER,
+    TAYLOR,
     paper_irk_at,
     paper_newmark_at,
 )
@@ -33,13 +35,14 @@ from twoloop.tableaux import gauss
 TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
 OTHERS = (
-    *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, "Adams", IDA_C, "IDA, stabilised"),
+    *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C, "IDA, stabilised"),
     *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
 )
-DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", "Gauss12", OWN_EXPLICIT, "Adams", IDA_C)
+DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C)
 LISTED = (
     *DRAWN,
+    "Gauss12",
     QUARTER,
     "DOP853, projected",
     "LSODA, index 1",

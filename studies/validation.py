@@ -15,7 +15,7 @@ from studies import deceived, figures, study
 from studies.bench import Run, warm_up
 from studies.end_states import DECADES, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
 from studies.render import number, percent, power, render, table
-from studies.solvers import ADAMS, CATALOGUE, DEFAULT, EXUDYN, IDA_C, OWN_BDF, OWN_EXPLICIT
+from studies.solvers import ADAMS, CATALOGUE, DEFAULT, EXUDYN, IDA_C, OWN_BDF, OWN_EXPLICIT, TAYLOR
 from studies.store import Output
 from twoloop import mechanisms
 from twoloop.mechanisms import Problem
@@ -44,7 +44,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
     mechanisms.governor,
 )
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
-OWN = (DEFAULT, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
+OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (IDA_C, "LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1")
 QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)

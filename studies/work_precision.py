@@ -25,7 +25,7 @@ from studies.store import Output
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
-STIFF = ("TRBDF2", NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studies.beam` has the paper's procedures
+STIFF = ("TRBDF2", NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others

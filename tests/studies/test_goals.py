@@ -62,6 +62,13 @@ def test_what_stands_in_the_way_follows_steps_and_times():
     assert profile(float("nan"), 100.0, {})["in_the_way"] == "not told"
 
 
+def test_a_step_of_taylor_is_not_measured_in_evaluations():
+    table = compared(4.0, 2.0).assign(n_evaluations=100.0, n_steps=10.0)
+    table["solver"] = table["solver"].replace("Adams", "Taylor")
+    (line,) = behind.findings_of(rivals.findings_of(table), table, {"four-bar": 20.0}, 1e6)
+    assert line["evaluation_ns"] is None and line["without"] is None and line["in_the_way"] == "time per step"
+
+
 def test_profiles_are_of_the_worst_and_none_where_none_is_ahead():
     table = compared(1.0, 2.0).assign(n_steps=1.0)
     assert behind.findings_of(rivals.findings_of(table), table, {}, 1.0) == []

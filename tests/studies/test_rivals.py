@@ -134,6 +134,13 @@ def test_chains_start_on_their_constraints(closed):
     )
 
 
+def test_a_step_that_counts_no_evaluations_has_its_cost_all_the_same():
+    row = {"case": "open chain", "solver": "Taylor", "message": "", "evaluation_us": float("nan")}
+    made = pd.DataFrame([row | {"n": n, "step_us": float(n)} for n in (10, 100)])
+    (line,) = scaling.findings_of(made)
+    assert line["step_exponent"] == pytest.approx(1.0) and line["evaluation_exponent"] is None
+
+
 def test_a_failed_size_is_a_row_and_no_cost():
     row = scaling._row("open chain", scaling.chain(2, False), 2, "Unknown", 0)
     assert row["status"] == "FAILED" and row["step_us"] is None
