@@ -22,7 +22,7 @@ from studies.cases.four_bar import SECOND
 from studies.cli import StudyError
 from studies.end_states import case_of, row_of
 from studies.render import number, power
-from studies.solvers import CATALOGUE, HEYOKA, OWN, RIVALS
+from studies.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
 from studies.store import KeptRows, Row
 from studies.validation import MAKE
 from twoloop import mechanisms, solve_dae
@@ -41,7 +41,7 @@ GEOMETRIES: dict[str, Callable[[], Problem]] = {
     "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
 }
 QUICK = ("four-bar", "knife edge")
-QUICK_SOLVERS = ("Adams", "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
+QUICK_SOLVERS = (TAYLOR, "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
 BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
 STEPS = (100, 300, 1000)  # of those of fixed steps

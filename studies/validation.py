@@ -335,11 +335,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     stepped = [
         [
             line["solver"],
-            line["n"],
             percent(line["deceived"]),
             line["worst"],
             percent(line["first"]),
-            line["first_worst"],
         ]
         for line in found["steps"]
         if line["n"]
@@ -351,7 +349,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
             for line in found["models"]
         ],
     )
-    header = ("solver", "steps", "deceived", "worst", "first steps deceived", "worst first")
+    header = ("solver", "deceived", "worst", "first steps")
     ready["steps"] = table(header, stepped)
     output.write("validation.md", render("validation", found, ready, stamp=line, quick=output.call.quick))
 

@@ -103,7 +103,7 @@ class Kept(dict):
 
 
 def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
-    todo = [run for run in rivals.runs(True) if run.solver.name in ("Adams", "CVODE from C, Adams")]
+    todo = [run for run in rivals.runs(True) if run.solver.name in ("DOP853 (two-loop)", "CVODE from C, Adams")]
     pytest.importorskip("sksundae")
     kept = Kept()
     table = rivals.collect(todo, kept)

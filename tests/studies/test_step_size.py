@@ -70,7 +70,7 @@ def test_sentences_turn_with_the_rows(tmp_path):
     assert "As the paper says, they are longer than 0.02 s most of the time." in text
     assert "200 times as long as that of `PaperNewmark`" in text
     assert "Runge–Kutta has its attempts rejected more often." in text
-    assert "100 times, 2.2 times a period. In all 14 two-loop runs" in text
+    assert f"100 times, 2.2 times a period. In all {len(PRESETS) + 3} two-loop runs" in text
 
     made = rows()
     ours = made["group"] != "others"
