@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
 COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
-MOST_CALLS = 500
+MOST_CALLS = 20
 ONCE = 1.0  # s of CPU; the time of a run that takes longer hardly varies, and it is not repeated
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
 
@@ -73,8 +74,7 @@ class Case:
     time_limit : float
         CPU seconds that a run may use.
     timed : float
-        s of CPU time: a shorter run is timed by calling it again until it has used so much, because some systems count
-        CPU time in ticks of 4 ms.
+        s of CPU time: a shorter run is timed by calling it again until it has used so much.
     tags : tuple of str
         Class of the problem, "smooth", "stiff", "long", for tables over several cases.
     note : str
@@ -92,7 +92,7 @@ class Case:
     step_sizes: tuple[float, ...] | None = None
     tolerances: tuple[float, ...] | None = None
     time_limit: float = 60.0
-    timed: float = 0.1
+    timed: float = 0.02
     tags: tuple[str, ...] = ()
     note: str = ""
 
@@ -248,7 +248,7 @@ def _rows_of(
         for run, k in left:
             first = kept[run.key(0)] if k > 0 else {}
             if first.get("status") != "TIME_LIMIT" and (first.get("cpu_s") or 0.0) <= ONCE:
-                yield run, k, _row(run, k, measure, warm)
+                yield run, k, row_of(run, k, measure, warm)
         return
     _shared[:] = [(run, k, measure) for run, k in left]  # cases and solvers hold functions that cannot be sent
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("fork"), _end_with_parent)
@@ -265,7 +265,7 @@ _shared: list[tuple[Run, int, Measure | None]] = []  # as the workers inherit it
 
 def _shared_row(i: int) -> Row:
     run, k, measure = _shared[i]
-    return _row(run, k, measure, set())
+    return row_of(run, k, measure, set())
 
 
 def _end_with_parent() -> None:
@@ -281,7 +281,8 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _row(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
+def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
+    """Make a repetition of a run and measure it over the motion; `warm` is what `build` has compiled."""
     case, solver = run.case, run.solver
     row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
     row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
@@ -365,14 +366,18 @@ def _limited(seconds: float) -> Iterator[None]:
         yield
         return
 
-    def stop(*_: object) -> None:
-        raise TimeLimit
+    began = time.process_time()
 
-    before = signal.signal(signal.SIGPROF, stop)
-    # again every second: an exception raised in a callback of a foreign solver may be swallowed by it
-    signal.setitimer(signal.ITIMER_PROF, 1.1 * seconds, 1.0)  # a solver's own limit comes first
+    def stop(*_: object) -> None:
+        if time.process_time() - began >= seconds:
+            raise TimeLimit
+
+    # a timer of wall-clock time: one of CPU time makes the clocks of CPU time advance in ticks of 4 ms on Linux
+    before = signal.signal(signal.SIGALRM, stop)
+    # again and again: an exception raised in a callback of a foreign solver may be swallowed by it
+    signal.setitimer(signal.ITIMER_REAL, 1.1 * seconds, min(1.0, 0.5 * seconds))  # a solver's own limit comes first
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.signal(signal.SIGPROF, before)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

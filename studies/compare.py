@@ -104,7 +104,7 @@ def _work(words: Sequence[str] | None) -> None:
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
     if not t_end > 0.0:
         raise StudyError(f"--t-end must be positive; given {t_end:g}")
-    case = Case(problem.name, problem, t_end, note=problem.note, timed=0.02 if given.quick else 0.1)
+    case = Case(problem.name, problem, t_end, note=problem.note, timed=0.004 if given.quick else 0.02)
     call, errors = cli.call_of("compare", given, words), sorted(given.errors, reverse=True)
     with Output(call) as output:
         if call.redraw:

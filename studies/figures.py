@@ -40,11 +40,13 @@ mpl.rcParams.update(
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
+VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default and of Taylor alone
 
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "DOP853 (two-loop)": (RED, "o"),
     "Adams": (BLACK, "o"),
-    "auto": (PINK, "s"),
+    "auto": (VIOLET, "s"),
+    "Taylor": (MAGENTA, "D"),
     "TRBDF2": (GREEN, "v"),
     "ESDIRK4": (BROWN, "v"),
     "Gauss12": (BLUE, "s"),

@@ -27,7 +27,7 @@ from twoloop import ConstrainedSystem, Result, solve_dae
 
 Array = NDArray[np.float64]
 
-OWN = ("auto", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA_C = "IDA from C"
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
@@ -39,6 +39,7 @@ TRUTH_LIMIT = 10.0  # s that one of them may take
 AGREE = 1e-7  # how far the two may differ
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
 UNASKED = "wrong, never asked"
+SHORT = {HANG: "**hang**", SILENT: "**silent**", UNASKED: "**unasked**", SAID: "said", RIGHT: "right", NOT_RUN: "–"}
 ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
 UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
 
@@ -237,6 +238,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             these = rows[(rows["trap"] == trap) & (rows["solver"] == name)]["outcome"].tolist()
             line[name] = [what for what in ORDER if what in these]
         found["cells"].append(line)
+    for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
+        alike = [[outcome], [NOT_RUN]]
+        found[key] = [each["trap"] for each in found["cells"] if all(each[name] in alike for name in names)]
     found |= {"solvers": names, "looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
     ran = rows[rows["outcome"] != NOT_RUN]
     found["missed_by_all"] = [
@@ -260,14 +264,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     found = findings_of(rows)
     output.save_findings(found)
     cells = [
-        [
-            each["trap"],
-            *(
-                " / ".join(f"**{what.lower()}**" if what in (SILENT, HANG, UNASKED) else what for what in each[name])
-                for name in found["solvers"]
-            ),
-        ]
+        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in found["solvers"])]
         for each in found["cells"]
+        if each["trap"] not in (*found["all_say_so"], *found["all_right"])
     ]
     short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
     counts = [[name, *(each[what] for what in ORDER)] for name, each in found["counts"].items()]

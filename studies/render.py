@@ -43,6 +43,11 @@ def power(value: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def brief(stamp: str) -> str:
+    """Command, date, commit and machine of a stamp; the first line of the CSV has the versions, too."""
+    return "; ".join(stamp.split("; ")[:4])
+
+
 def percent(share: float) -> str:
     """A share as a percentage of two significant digits."""
     return f"{number(100.0 * share)} %"
@@ -66,7 +71,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def environment() -> jinja2.Environment:
-    """The environment of all templates: filters `num`, `power`, `pct`, `listed`, `code`, and `table(header, rows)`."""
+    """The environment of all templates: `table(header, rows)`, and filters for numbers, lists, code and stamps."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,
@@ -76,6 +81,7 @@ def environment() -> jinja2.Environment:
         autoescape=False,  # markdown, from our own data
     )
     made.filters |= {"code": "`{}`".format, "num": number, "power": power, "pct": percent, "listed": listed}
+    made.filters["brief"] = brief
     made.globals["table"] = table
     return made
 

@@ -16,13 +16,13 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
-from studies import figures, tables
-from studies.bench import MOST_CALLS, NOTHING_RUN, Run, attempt, build
+from studies import adaptive, figures, tables
+from studies.bench import MOST_CALLS, Run, attempt, build
 from studies.cases.four_bar import SECOND
 from studies.cli import StudyError
 from studies.end_states import case_of, row_of
 from studies.render import number, power
-from studies.solvers import CATALOGUE, HEYOKA, OWN, RIVALS
+from studies.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
 from studies.store import KeptRows, Row
 from studies.validation import MAKE
 from twoloop import mechanisms, solve_dae
@@ -30,25 +30,26 @@ from twoloop.mechanisms import Problem, Reference
 
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
-SHOWN = DECADES[::2]  # in the table
+SHOWN = DECADES[::2]  # at which the four-bars are judged
+IN_TABLE = DECADES[::3]
+DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
 TIED = 1.2  # times that differ by less are equal
+AHEAD = {"heyoka": 2.0, "python": 8.0, "compiled": 4.0}  # aimed at on the four-bars, by kind of rival
 HEADLINE = "four-bar"
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
     "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
 }
 QUICK = ("four-bar", "knife edge")
-QUICK_SOLVERS = ("Adams", "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
+QUICK_SOLVERS = (TAYLOR, "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
 BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
 STEPS = (100, 300, 1000)  # of those of fixed steps
 QUICK_TOLERANCES = (1e-3, 1e-5)
 REPEATS = 3
-ONCE = 0.1  # s of CPU; a run that takes longer is not repeated
-TIMED = 0.01  # s; a shorter run is called until it has used so much
-SLOW = 0.1  # s of CPU; after a run that takes longer its solver is not asked for more accuracy on that mechanism
+TIMED = 0.002  # s; a shorter run is called until it has used so much
 TIME_LIMIT = 1.0  # s of CPU of a run
-COMPILING = 60.0  # s of what is built before
+COMPILING = 30.0  # s of what is built before
 TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
 FAR = 1e-11  # ... to so much
 
@@ -100,36 +101,11 @@ def runs(quick: bool) -> list[Run]:
 
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
-    """Rows of all runs, the repetitions interleaved, each solver's from its loosest setting on.
-
-    Of what a solver cannot run at all there is the first row alone, and none after one of more than SLOW seconds: such
-    a solver is far from the fastest, and would take most of the study's time.
-    """
-    built: set[tuple[int, str, float]] = set()
-    ended: set[tuple[str, str]] = set()
-    for repeat in range(REPEATS):
-        for run in todo:
-            who = run.case.name, run.solver.name
-            if not _again(run, repeat, kept) if repeat > 0 else who in ended:
-                continue
-            if run.key(repeat) not in kept:
-                kept.add(run.key(repeat), _row(run, repeat, built))
-            row = kept[run.key(repeat)]
-            if row["status"] in (*NOTHING_RUN, "RAISED", "TIME_LIMIT") or (row["cpu_s"] or 0.0) > SLOW:
-                ended.add(who)
-    keys = [run.key(k) for run in todo for k in range(run.repeats)]
-    return pd.DataFrame([kept[key] for key in keys if key in kept])
+    """Rows of all runs that are of use; on the four-bars every solver is asked for all accuracies."""
+    return adaptive.collect(todo, kept, _row, lambda run: run.case.name in GEOMETRIES)
 
 
-def _again(run: Run, repeat: int, kept: KeptRows) -> bool:
-    """Whether a run is repeated: one that was made, ended and was short."""
-    if repeat >= run.repeats or run.key(0) not in kept:
-        return False
-    first = kept[run.key(0)]
-    return first["error_q"] is not None and (first["cpu_s"] or 0.0) <= ONCE
-
-
-def _row(run: Run, repeat: int, built: set[tuple[int, str, float]]) -> Row:
+def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
     seconds = build(run, repeat, built, COMPILING)
     row = row_of(run) | {"repeat": repeat, "build_s": seconds, "keeps_constraints": run.solver.keeps_constraints}
     spent = [float(row.pop("cpu_time") or 0.0)]
@@ -153,16 +129,17 @@ def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
 
 
 def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
-    """What a solver's column says: how many mechanisms, how long it builds, what one evaluation costs."""
+    """What a solver's line says: how many mechanisms, how long it builds, how far it leaves the constraints."""
     ran = rows[rows["error_q"].notna()]
-    found = {"solver": name, "family": rows["family"].iloc[0], "called_from": rows["called_from"].iloc[0]}
-    found |= {"mechanisms": int(ran["case"].nunique()), "build_s": None, "evaluation_us": None}
+    found = {
+        "solver": name,
+        "family": rows["family"].iloc[0],
+        "mechanisms": int(ran["case"].nunique()),
+        "build_s": None,
+    }
     seconds = rows[rows["case"].isin(ran["case"])]["build_s"].dropna().astype(float)
     if len(seconds):
         found["build_s"] = [float(seconds.median()), float(seconds.max())]
-    counted = ran[ran["n_evaluations"].notna() & ran["cpu_s"].notna() & (ran["case"] == HEADLINE)]
-    if len(counted):
-        found["evaluation_us"] = float((1e6 * counted["cpu_s"] / counted["n_evaluations"].astype(float)).median())
     drifts = ran["violation_q"].dropna().astype(float)
     return found | {"violation": float(drifts.max()) if len(drifts) else None}
 
@@ -180,9 +157,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["behind"] = dict(pd.Series([at["others"]["solver"] for at in behind], dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
     found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None
-    found["clear"] = [
-        each["case"] for each in made if all(at["ratio"] is None or at["ratio"] >= 1 / TIED for at in each["at"])
-    ]
+    found |= {"down_to": DOWN_TO, "n_behind_down_to": sum(at["error"] >= 0.5 * DOWN_TO for at in behind)}
+    found["n_clear"] = sum(
+        all(at["ratio"] is None or at["ratio"] >= 1 / TIED for at in each["at"] if at["error"] >= 0.5 * DOWN_TO)
+        for each in made
+    )
+    found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
     return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
 
@@ -208,16 +188,35 @@ def _four_bar(name: str, rows: pd.DataFrame) -> dict[str, Any]:
     return found
 
 
+def goal_lines(found: dict[str, Any]) -> Iterator[list[Any]]:
+    """Of the table of goals: kind of rival, how far ahead ours was to be, least and largest ratio on each four-bar."""
+    names = {"heyoka": "heyoka", "python": "called from Python", "compiled": "other compiled"}
+    for kind, wanted in AHEAD.items():
+        yield [names[kind], f"{wanted:g}", *(_goal(geometry[kind], wanted) for geometry in found["four_bar"])]
+
+
+def _goal(compared: list[dict[str, Any]], wanted: float) -> str:
+    if not compared:
+        return "–"
+    ratios = [at["ratio"] for at in compared]
+    missed = [power(at["error"]) for at in compared if at["ratio"] < wanted]
+    text = "–".join(dict.fromkeys((number(min(ratios)), number(max(ratios)))))
+    if not missed:
+        return text
+    return f"{text}, missed" + ("" if len(missed) == len(ratios) else f" at {', '.join(missed)}")
+
+
 def lines(found: dict[str, Any]) -> Iterator[list[Any]]:
-    """Of the table of ratios: mechanism, ratio at each error shown."""
+    """Of the table of ratios: mechanism, ratio at each error shown; those that ours alone reach are left out."""
     for each in found["mechanisms"]:
-        ratios = {at["error"]: at for at in each["at"]}
-        yield [each["case"], *(_cell(ratios[error]) for error in SHOWN)]
+        if each["case"] not in found["alone"]:
+            ratios = {at["error"]: at for at in each["at"]}
+            yield [each["case"], *(_cell(ratios[error]) for error in IN_TABLE)]
 
 
 def _cell(at: dict[str, Any]) -> str:
     if at["ratio"] is None:
-        return "only ours" if at["ours"] else "only others" if at["others"] else "–"
+        return "ours" if at["ours"] else "others" if at["others"] else "–"
     text = number(at["ratio"])
     return f"**{text}**" if at["ratio"] < 1.0 / TIED else text
 

@@ -20,7 +20,7 @@ from twoloop.mechanisms import Problem, four_bar
 
 Array = NDArray[np.float64]
 
-METHODS = ("auto", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+METHODS = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 QUICK_METHODS = ("DOP853", "Gauss12", "BDF")
 TOLERANCE = 1e-8  # rtol and atol of all runs
 LOOSENESS = 1e3  # an answer is right within so many tolerances, times the sensitivity of the end to the start

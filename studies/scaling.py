@@ -4,7 +4,7 @@ A part of `studies.work_precision`. What is timed are steps after the first `SKI
 up. The rival is SciPy's DOP853 on the accelerations, whose linear algebra is dense.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from references.index1 import solve_index1
+from studies.render import table
 from studies.store import KeptRows, Row
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, n_four_bar
@@ -20,7 +21,7 @@ from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 GROUP = "size"
 CHAINS, WINDOWS = (1, 2, 5, 10, 20, 50, 100, 200), (1, 2, 5, 10, 20, 40)
 QUICK, QUICK_METHODS = (2, 10, 20), ("Adams",)
-METHODS = ("Adams", "DOP853", "Gauss6")
+METHODS = ("Taylor", "Adams", "DOP853", "Gauss6")
 RIVAL = "DOP853, index 1"
 LARGEST = {"Adams": 200}  # of the others:
 LARGEST_ELSE = 100
@@ -31,6 +32,7 @@ ONCE = 50  # bodies, from which on a run is made once
 FITTED = 10  # bodies, from which on the exponent is fitted
 GRAVITY = 9.81
 SPAN = (0.0, 100.0)  # s: longer than any run here
+RIVAL_LIMIT = 1.0  # s of CPU, after which the rival's steps are counted
 
 
 def chain(n: int, closed: bool) -> Problem:
@@ -87,7 +89,7 @@ def _row(family: str, problem: Problem, n: int, method: str, repeat: int) -> Row
     try:
         timed = max(FEWEST, MANY // n)
         cpu, steps, evaluations = _rival(problem, timed) if method == RIVAL else _own(problem, method, timed)
-        row |= {"step_us": 1e6 * cpu / steps, "evaluation_us": 1e6 * cpu / evaluations}
+        row |= {"step_us": 1e6 * cpu / steps, "evaluation_us": 1e6 * cpu / evaluations if evaluations else None}
     except (RuntimeError, ValueError) as error:  # a row that says so, and no point of the fit
         row |= {"status": "FAILED", "message": str(error)}
     return row
@@ -110,11 +112,13 @@ def _rival(problem: Problem, timed: int) -> tuple[float, int, int]:
     """CPU seconds, steps and evaluations of a run as long as a third as many steps of our DOP853."""
     steps = SKIPPED + max(timed // 3, FEWEST)
     span = solve_dae(problem.system, SPAN, problem.q0, problem.v0, method="DOP853", max_steps=steps)
-    tolerances = (TOLERANCE, TOLERANCE)
-    result = solve_index1(problem.system, (0.0, float(span.t[-1])), problem.q0, problem.v0, "DOP853", *tolerances)
-    if not result.success or not result.stats.n_accepted or not result.stats.n_evaluations:
+    span_of_steps = (0.0, float(span.t[-1]))
+    options: dict[str, Any] = {"method": "DOP853", "rtol": TOLERANCE, "atol": TOLERANCE, "time_limit": RIVAL_LIMIT}
+    result = solve_index1(problem.system, span_of_steps, problem.q0, problem.v0, **options)
+    stats, limited = result.stats, "time_limit" in result.message  # the steps up to the limit are enough
+    if not (result.success or limited) or not stats.n_accepted or not stats.n_evaluations:
         raise RuntimeError(result.message)
-    return result.stats.cpu_time, result.stats.n_accepted, result.stats.n_evaluations
+    return stats.cpu_time, stats.n_accepted, stats.n_evaluations
 
 
 def exponent(n: Any, cost: Any) -> float | None:
@@ -130,7 +134,7 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """By family and method: cost of a step and an evaluation at the smallest and the largest size, the exponents."""
     found = []
     for (family, method), own in rows.groupby(["case", "solver"], sort=False):
-        middle = own.groupby("n")[["step_us", "evaluation_us"]].median().dropna()
+        middle = own.groupby("n")[["step_us", "evaluation_us"]].median().dropna(subset=["step_us"])
         if middle.empty:
             found.append({"family": family, "method": method, "sizes": [], "failed": str(own["message"].iloc[0])})
             continue
@@ -143,11 +147,9 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     return found
 
 
-def lines(found: list[dict[str, Any]]) -> Iterator[list[Any]]:
-    """Of the table: family, method, sizes, cost of a step and an evaluation at the ends, exponent."""
-    for line in found:
-        if not line["sizes"]:
-            yield [line["family"], line["method"], "–", "failed", "failed", "–"]
-            continue
-        sizes = "–".join(str(n) for n in line["sizes"])
-        yield [line["family"], line["method"], sizes, line["step"][1], line["evaluation"][1], line["step_exponent"]]
+def pivot(found: list[dict[str, Any]]) -> str:
+    """A table: by mechanism and method the exponent of a step."""
+    methods, families = (list(dict.fromkeys(line[key] for line in found)) for key in ("method", "family"))
+    cells = {(line["family"], line["method"]): line["step_exponent"] if line["sizes"] else "failed" for line in found}
+    lines = [[family, *(cells.get((family, method), "–") for method in methods)] for family in families]
+    return table(["mechanism", *methods], lines)

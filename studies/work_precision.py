@@ -1,7 +1,8 @@
 """Every mechanism with every solver, ours and others': what each accuracy costs, and which solver to take.
 
-Four cases are run at length, over their whole motion; all others, with more rivals, by `studies.rivals`. How cost grows
-with size is in `studies.scaling`, how far it is from what the machine can do in `studies.limit`.
+Four cases are run at length, over their whole motion; all others, with more rivals, by `studies.rivals`. What was aimed
+at is judged in `studies.goals`, where a rival is ahead in `studies.behind`; how cost grows with size is in
+`studies.scaling`, how far it is from what the machine can do in `studies.limit`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,8 +14,8 @@ from typing import Any
 
 import pandas as pd
 
-from studies import cases, figures, limit, rivals, scaling, study, tables
-from studies.bench import Case, Run, collect
+from studies import adaptive, behind, cases, figures, goals, limit, rivals, scaling, study, tables
+from studies.bench import Case, Run, row_of
 from studies.cli import StudyError
 from studies.compare import runs_of
 from studies.render import number, power, render, table
@@ -24,13 +25,13 @@ from studies.store import Output
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
-STIFF = (NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases, where `studies.beam` has the paper's procedures
-QUICK = (*COMPARED[:6], "DOP853, projected")  # others take seconds to compile or to run
+STIFF = ("TRBDF2", NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
+QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
+QUICK_CASES = ("four-bar",)  # the beams' references take seconds
+TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 SETTINGS = ("tol", "h", "err_out")
-PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP)  # groups of rows that are not of the four cases
-IN_TABLE = 3  # solvers of a case in the report; the figure has more, the rows have all
-SLOW = 0.2  # s to build: quicker ones are not listed
-STEEP = 2.0  # exponent of a cost that grows faster than with the square of the size
+PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP, behind.GROUP)  # groups of rows that are not of the four cases
+SLOW = 1.0  # s to build: quicker ones are not listed
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
@@ -38,8 +39,7 @@ def runs(case: Case, quick: bool) -> list[Run]:
     """The runs of a case; of those called from Python on stiff ones, which take seconds, fewer and once."""
     stiff = "stiff" in case.tags
     if quick:
-        made = runs_of(case, QUICK, quick)
-        return [run for run in made if not stiff or run.solver.called_from == "compiled"]
+        return runs_of(case, QUICK, quick)
     made = runs_of(case, (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
     if not stiff:
         return made
@@ -133,12 +133,18 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
     return found | {"drift": None if pd.isna(drifting) else float(drifting)}
 
 
+def known_cases(quick: bool) -> list[Case]:
+    """The cases at length."""
+    return [replace(case, time_limit=TIME_LIMIT) for case in cases.load(quick) if not quick or case.name in QUICK_CASES]
+
+
 def make(output: Output) -> pd.DataFrame:
     """Make all rows."""
     quick = output.call.quick
+    at_length = [run for case in known_cases(quick) for run in runs(case, quick)]
     with output.kept() as kept:
-        made = [collect([run for case in cases.load(quick) for run in runs(case, quick)], kept)]
-        made.append(rivals.collect(rivals.runs(quick), kept))
+        made = [adaptive.collect(at_length, kept, lambda run, k, built: row_of(run, k, None, built), lambda run: True)]
+        made += [rivals.collect(rivals.runs(quick), kept), behind.collect(kept, quick)]
         made += [scaling.collect(quick, kept), limit.collect(kept, quick)]
     return pd.concat(made, ignore_index=True)
 
@@ -161,42 +167,70 @@ def versions() -> dict[str, str]:
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report; the findings."""
     everywhere = tables.medians(part(rows, rivals.GROUP))
-    known, medians = cases.load(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
-    findings = findings_of(medians, known) | {"rivals": rivals.findings_of(everywhere)}
+    known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
+    found, machine = rivals.findings_of(everywhere), limit.findings_of(part(rows, limit.GROUP))
+    operations = part(rows, behind.GROUP).set_index("case").get("operations", pd.Series(dtype=float))
+    operation_ns = machine["straight_ns"] / machine["operations"]
+    findings = findings_of(medians, known) | {"rivals": found, "machine": machine}
+    findings["behind"] = behind.findings_of(found, everywhere, operations.to_dict(), operation_ns)
+    findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    steep = [line for line in findings["scaling"] if (line.get("step_exponent") or 0.0) > STEEP]
-    findings |= {"steep": [f"{line['method']}, {line['family']}" for line in steep], "fitted": scaling.FITTED}
-    findings |= {"machine": limit.findings_of(part(rows, limit.GROUP)), "slow": SLOW}
+    findings |= {"fitted": scaling.FITTED, "slow": SLOW}
     output.save_findings(findings)
-    ready = {}
-    for case, found in zip(known, findings["cases"], strict=True):
-        own = medians[medians["case"] == case.name]
-        lines = figures.cheapest_lines(own, ERRORS)
-        header = ["solver", "called from", *(power(error) for error in ERRORS)]
-        ready[case.name] = table(
-            header, tables.work_precision(own, ERRORS, figures.cheapest_lines(own, ERRORS, IN_TABLE))
-        )
-        plot = figures.work_precision(own, lines, f"{case.name}, {number(case.t_end)} s")
-        figures.save(plot, output, found["figure"].removesuffix(".png"))
-    ratios = ["mechanism", *(power(error) for error in rivals.SHOWN)]
-    ready["ratios"] = table(ratios, rivals.lines(findings["rivals"]))
-    ready["solvers"] = table(
-        ["solver", "called from", "build (s)", "most", "max abs C"], built(findings["rivals"]["solvers"])
-    )
-    sizes = ["mechanism", "method", "n", "step at largest n (µs)", "evaluation (µs)", "exponent"]
-    ready["scaling"] = table(sizes, scaling.lines(findings["scaling"]))
-    figures.save(rivals.headline(everywhere), output, "work_precision")
-    figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")
-    text = render("work_precision", findings, ready, stamp=line, quick=output.call.quick)
+    draw(output, findings, everywhere, medians)
+    text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
 
 
-def built(solvers: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
-    """Of the table of solvers: what it takes to compile or to build each, and how far it leaves the constraints."""
-    for line in solvers:
-        if line["build_s"] and line["build_s"][1] > SLOW:
-            yield [line["solver"], line["called_from"], *line["build_s"], line["violation"]]
+def asked(rows: pd.DataFrame) -> dict[str, Any]:
+    """How many pairs of solver and mechanism were not asked for all accuracies, and the rule."""
+    made = rows[rows["repeat"] == 0].groupby(["solver", "case"]).size()
+    fewer = int((made < made.groupby("solver").transform("max")).sum())
+    return {
+        "n": len(made),
+        "fewer": fewer,
+        "far": adaptive.FAR,
+        "running": adaptive.RUNNING,
+        "limit": rivals.TIME_LIMIT,
+    }
+
+
+def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, medians: pd.DataFrame) -> None:
+    """Write all figures."""
+    for case in findings["cases"]:
+        own = medians[medians["case"] == case["name"]]
+        lines = figures.cheapest_lines(own, ERRORS)
+        plot = figures.work_precision(own, lines, f"{case['name']}, {number(case['t_end'])} s")
+        figures.save(plot, output, case["figure"].removesuffix(".png"))
+    figures.save(rivals.headline(everywhere), output, "work_precision")
+    figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")
+
+
+def ready(findings: dict[str, Any]) -> dict[str, str]:
+    """The tables of the report."""
+    geometries = [geometry["case"] for geometry in findings["rivals"]["four_bar"]]
+    profile = ["worst", "ours", "steps × ns", "rival", "steps × ns", "evaluation (ns)", "without", "in the way"]
+    return {
+        "goals": table(["rival", "wanted", *geometries], rivals.goal_lines(findings["rivals"])),
+        "ratios": table(["mechanism", *(power(e) for e in rivals.IN_TABLE)], rivals.lines(findings["rivals"])),
+        "behind": table(profile, behind.lines(findings["behind"])),
+        "scaling": scaling.pivot(findings["scaling"]),
+        "cases": table(["motion", *(power(error) for error in ERRORS)], case_lines(findings["cases"])),
+    }
+
+
+def case_lines(listed: Sequence[dict[str, Any]]) -> Iterator[list[str]]:
+    """Of the table of cases: seconds of the cheapest of ours, how many times those of others and of the default."""
+    for case in listed:
+        cells = []
+        for at in case["at"]:
+            if not at["ours"]:
+                cells.append("–")
+                continue
+            over = number(at["others"]["cpu_s"] / at["ours"]["cpu_s"]) if at["others"] else "–"
+            cells.append(f"{number(at['ours']['cpu_s'])}; {over}; {number(at['default_over'])}")
+        yield [f"{case['name']}, {number(case['t_end'])} s", *cells]
 
 
 def main(words: Sequence[str] | None = None) -> None:

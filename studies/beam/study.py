@@ -49,14 +49,13 @@ def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
         {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
         for name in names
     ]
-    nothing = ["", *["not run"] * len(TARGETS)]
+    nothing = ["", *["–"] * len(TARGETS)]
     lines = []
     for solver in LISTED:
-        called = [cost[solver][0] for cost in costs if solver in cost]
         cells = [cell for cost in costs for cell in cost.get(solver, nothing)[1:]]
-        lines += [[solver, called[0], *cells]] if called else []
+        lines += [[solver, *cells]] if any(solver in cost for cost in costs) else []
     errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
-    return table(["solver", "called from", *errors], lines)
+    return table(["solver", *errors], lines)
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:

@@ -113,6 +113,17 @@ def test_a_run_past_its_limit_is_a_row(kept):
     assert rows["status"].tolist() == ["TIME_LIMIT"] and "0.05 s" in rows["message"][0]
 
 
+def test_the_time_limit_sets_no_timer_of_cpu_time(kept):
+    set_ = []
+
+    def run(case, value, repeat):  # such a timer makes Linux's clocks of CPU time advance in ticks of 4 ms
+        set_.append([signal.getitimer(kind)[0] > 0.0 for kind in (signal.ITIMER_PROF, signal.ITIMER_REAL)])
+        return ours(case, value, repeat)
+
+    assert row(kept, run, case(time_limit=60.0))["status"] == "REACHED_END"
+    assert set_ == [[False, True]] * 2 and signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
 def test_the_warm_up_may_take_longer_than_a_run(kept):
     limits = []
 

@@ -185,7 +185,7 @@ def test_failed_and_lost_runs_are_shown(rows, text_of):
     rows = changed(rows, f"{ON_ONE}'{RADAU}'", energy=math.nan, swing=math.nan, **gone)
     text = text_of(changed(rows, "solver == 'LSODA, index 1'", lost=True))
     assert "not converged at 0.1 s |" in text and "## Runs that did not reach the end" in text
-    assert "| `LSODA, index 1, tol 1e-10` | Python | lost |" in text
+    assert "| `LSODA, index 1, tol 1e-10` (Python) | lost |" in text
 
 
 def test_the_run_of_least_error_stands_for_a_solver(rows):

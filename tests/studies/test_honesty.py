@@ -108,8 +108,9 @@ def test_sentences_turn_with_the_rows():
         tables = {"cells": "", "counts": ""}
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
-    assert "None of ours is wrong and silent" in text(rows)
+    assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
     rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
     told = text(rows)
     assert "Runs of ours that are wrong and silent, or hang: 1." in told
+    assert "All that are run are right: a." in told and "All that are run say so" not in told
     assert "No solver notices: b" in told

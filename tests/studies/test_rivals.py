@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from references.straight_line import program_of
-from studies import limit, rivals, scaling
+from studies import behind, goals, limit, rivals, scaling, work_precision
 from studies.render import number, render
 from studies.solvers import CATALOGUE, OWN, RIVALS
 from twoloop import solve_dae
@@ -40,7 +40,7 @@ def test_ahead_and_behind_follow_the_rows(own, behind):
     found = rivals.findings_of(compared(own, 2.0))
     assert found["n_behind"] == behind and found["n"] == len(rivals.DECADES)
     assert found["n_ahead"] == (len(rivals.DECADES) if own == 1.0 else 0)
-    assert found["clear"] == ([] if behind else ["four-bar"])
+    assert found["n_clear"] == (0 if behind else 1) and found["n_behind_down_to"] == max(0, behind - 1)
     assert found["behind"] == ({"heyoka": behind} if behind else {})
     assert found["worst"]["ratio"] == pytest.approx(2.0 / own)
 
@@ -57,7 +57,20 @@ def test_where_one_side_does_not_come_there_is_no_ratio():
     assert at[3]["ratio"] == 2.0 and at[4]["ratio"] == 2.0
     assert at[5]["ratio"] is None and at[5]["ours"] is None and at[5]["others"]["solver"] == "heyoka"
     (cells,) = rivals.lines(rivals.findings_of(table))
-    assert cells == ["four-bar", "2.0", *["only others"] * 5]
+    assert cells == ["four-bar", "2.0", *["others"] * 3]
+
+
+def test_what_ours_alone_reaches_is_named_apart():
+    alone = rows(("Adams", "two-loop", "compiled", 1e-14, 1.0), case="knife edge")
+    found = rivals.findings_of(pd.concat([compared(1.0, 2.0), alone], ignore_index=True))
+    assert found["alone"] == ["knife edge"] and [cells[0] for cells in rivals.lines(found)] == ["four-bar"]
+
+
+def test_a_goal_missed_everywhere_says_so_without_a_list():
+    at = [{"error": error, "ratio": ratio} for error, ratio in ((1e-3, 1.0), (1e-5, 3.0))]
+    found = {"four_bar": [{"heyoka": at, "python": at, "compiled": at[1:] * 2}]}
+    cells = [line[2] for line in rivals.goal_lines(found)]
+    assert cells == ["1.0–3.0, missed at 1e-3", "1.0–3.0, missed", "3.0, missed"]
 
 
 def test_a_ratio_that_we_lose_is_bold():
@@ -90,7 +103,7 @@ class Kept(dict):
 
 
 def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
-    todo = [run for run in rivals.runs(True) if run.solver.name in ("Adams", "CVODE from C, Adams")]
+    todo = [run for run in rivals.runs(True) if run.solver.name in ("DOP853 (two-loop)", "CVODE from C, Adams")]
     pytest.importorskip("sksundae")
     kept = Kept()
     table = rivals.collect(todo, kept)
@@ -121,11 +134,18 @@ def test_chains_start_on_their_constraints(closed):
     )
 
 
+def test_a_step_that_counts_no_evaluations_has_its_cost_all_the_same():
+    row = {"case": "open chain", "solver": "Taylor", "message": "", "evaluation_us": float("nan")}
+    made = pd.DataFrame([row | {"n": n, "step_us": float(n)} for n in (10, 100)])
+    (line,) = scaling.findings_of(made)
+    assert line["step_exponent"] == pytest.approx(1.0) and line["evaluation_exponent"] is None
+
+
 def test_a_failed_size_is_a_row_and_no_cost():
     row = scaling._row("open chain", scaling.chain(2, False), 2, "Unknown", 0)
     assert row["status"] == "FAILED" and row["step_us"] is None
     (line,) = scaling.findings_of(pd.DataFrame([row]))
-    assert line["failed"] and next(scaling.lines([line]))[2:] == ["–", "failed", "failed", "–"]
+    assert line["failed"] and "| open chain | failed |" in scaling.pivot([line])
 
 
 def test_the_limit_is_counted_and_shared():
@@ -139,22 +159,56 @@ def test_the_limit_is_counted_and_shared():
     assert number(found["memory_share"]) == "0.014"
 
 
-@pytest.mark.parametrize(
-    ("own", "said", "not_said"),
-    [
-        (0.5, ["No rival is ahead anywhere.", "at least the 2 aimed at"], ["the worst is"]),
-        (1.5, ["No rival is ahead anywhere.", "the goal of 2 is missed at 1e-3"], ["the worst is"]),
-        (4.0, ["the worst is four-bar at 1e-3, where `heyoka` takes 0.50 of the time of `Adams`"], ["No rival"]),
-    ],
-)
-def test_sentences_follow_the_rows(own, said, not_said):
+def stated(own, heyoka=2.0, python=9.0, **changed):
+    """The text of the report, of rows of the four-bar."""
     machine = {"operations": 700.0, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "straight_ns": 50.0, "repeat": 0}
     machine |= {"callbacks_ns": 40.0, "divisions": 8.0, "functions": 6.0}
     machine |= {f"{method}_evaluation_ns": 200.0 for method in limit.METHODS}
-    found = {"cases": [], "drift": None, "scaling": [], "steep": [], "fitted": 10, "versions": {}, "slow": 0.2}
-    found |= {"rivals": rivals.findings_of(compared(own, 2.0, python=9.0))}
+    table = compared(own, heyoka, python=python).assign(n_steps=100.0)
+    found = {
+        "cases": [],
+        "scaling": [],
+        "fitted": 10,
+        "slow": 0.2,
+        "default": "auto",
+        "rivals": rivals.findings_of(table),
+    }
     found |= {"machine": limit.findings_of(pd.DataFrame([machine]))}
-    ready = dict.fromkeys(("ratios", "solvers", "scaling"), "")
-    text = render("work_precision", found, ready, stamp="", quick=False)
+    found |= {"goals": goals.findings_of([], table.assign(case="other"), table)}
+    found |= {"asked": {"n": 4, "fewer": 0, "far": 20.0, "running": 2, "limit": 1.0}}
+    found["behind"] = behind.findings_of(found["rivals"], table, {"four-bar": 700.0}, 0.5)
+    return render("work_precision", found | changed, work_precision.ready(found | changed), stamp="", quick=False)
+
+
+@pytest.mark.parametrize(
+    ("own", "said", "not_said"),
+    [
+        (0.5, ["**Reached**: no rival ahead", "ahead in 11, behind in 0,", "| heyoka | 2 | 4.0 |"], ["in the way"]),
+        (1.5, ["**Reached**: no rival ahead", "| heyoka | 2 | 1.3, missed |"], ["in the way"]),
+        (
+            4.0,
+            ["**Missed**: no rival ahead", "behind in 11 (in 11 behind `heyoka`)", "in the way"],
+            ["**Reached**: no"],
+        ),
+    ],
+)
+def test_sentences_follow_the_rows(own, said, not_said):
+    text = stated(own)
     assert all(words in text for words in said) and not any(words in text for words in not_said)
-    assert "4.0 times faster" in text
+    assert "4.0 times less" in text and "pairs of solver and mechanism" not in text
+
+
+def test_sentences_of_the_goals_follow_the_findings():
+    long = {"case": "four-bar", "t_end": 100.0, "error": 1e-6, "limit": 0.01, "solver": "Adams", "cpu_s": 0.009}
+    beam = {"case": "beam", "errors": [1e-2], "ratios": [1.5], "compared": [1.5], "ahead": True}
+    default = {"limit": 1.3, "n": 5, "n_unreached": 0, "n_within": 5}
+    default["worst"] = {"case": "crank", "error": 1e-3, "over": 1.2, "best": "Adams"}
+    made = {"long": long, "stiff": [beam], "violation": {"limit": 1e-12, "largest": 1e-15}, "default": default}
+    text = stated(1.0, goals=made)
+    assert text.count("**Reached**") == 5 and "**Missed**" not in text and "crank" not in text
+    worse = {"long": long | {"cpu_s": 0.011}, "stiff": [beam | {"ahead": False}]}
+    worse |= {"violation": {"limit": 1e-12, "largest": 1e-11}, "default": default | {"n_within": 4}}
+    worse["default"]["worst"]["over"] = 1.4
+    text = stated(1.0, goals=worse)
+    assert text.count("**Missed**") == 4 and "up to 1.4 times (crank, 1e-3, beside `Adams`)" in text
+    assert "none of ours gets there" in stated(1.0, goals=made | {"long": long | {"cpu_s": None}})

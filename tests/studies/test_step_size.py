@@ -70,7 +70,7 @@ def test_sentences_turn_with_the_rows(tmp_path):
     assert "As the paper says, they are longer than 0.02 s most of the time." in text
     assert "200 times as long as that of `PaperNewmark`" in text
     assert "Runge–Kutta has its attempts rejected more often." in text
-    assert "100 times, 2.2 times a period. In all 14 two-loop runs" in text
+    assert f"100 times, 2.2 times a period. In all {len(PRESETS) + 3} two-loop runs" in text
 
     made = rows()
     ours = made["group"] != "others"
@@ -79,10 +79,10 @@ def test_sentences_turn_with_the_rows(tmp_path):
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
     text = text_of(tmp_path, made)
     assert "that does not hold here" in text and "contrary to the paper" in text
-    assert "rejected no more often" in text and "In none of the 14 two-loop runs" in text
+    assert "rejected no more often" in text and f"In none of the {len(PRESETS) + 3} two-loop runs" in text
     assert "| solver failed |" in text
     made.loc[made["solver"] == "Gauss6", "retried_switch"] = 0.9
-    assert "In 1 of the 14 two-loop runs" in text_of(tmp_path, made)
+    assert f"In 1 of the {len(PRESETS) + 3} two-loop runs" in text_of(tmp_path, made)
     made["retried_switch"] = np.nan
     assert "No run says how often" in text_of(tmp_path, made)
 

@@ -1,0 +1,79 @@
+"""What was aimed at is judged by the rows."""
+
+import pandas as pd
+import pytest
+
+from studies import behind, goals, rivals
+from studies.bench import Case
+from tests.studies.test_rivals import Kept, compared, rows
+
+
+def test_the_default_is_compared_with_the_best_of_ours_wherever_one_gets():
+    pair = ("auto", "two-loop", "compiled", 1e-3, 2.0), ("Adams", "two-loop", "compiled", 1e-4, 1.0)
+    found = goals.of_default(rows(*pair))
+    assert (found["n"], found["n_within"], found["n_unreached"]) == (2, 0, 1)
+    assert found["worst"] == {"case": "four-bar", "error": 1e-3, "over": 2.0, "best": "Adams"}
+    assert goals.of_default(rows(("auto", "two-loop", "compiled", 1e-3, 2.0)))["n_within"] == 1
+
+
+def test_the_long_motion_is_judged_at_its_full_length_only():
+    table = rows(("Adams", "two-loop", "compiled", 1e-7, 0.02), ("LSODA", "SciPy", "Python", 1e-7, 0.001))
+    long, short = (Case("four-bar", None, t_end) for t_end in (100.0, 10.0))
+    found = goals.findings_of([long], table, table)["long"]
+    assert (found["solver"], found["cpu_s"]) == ("Adams", pytest.approx(0.02))
+    assert goals.findings_of([short], table, table)["long"] is None
+    assert goals.findings_of([long], table[1:], table)["long"]["cpu_s"] is None
+
+
+@pytest.mark.parametrize(("ida", "ahead"), [(1.5, True), (0.9, False)])
+def test_the_stiff_beam_is_compared_with_ida_from_c(ida, ahead):
+    case = Case("beam", None, 2.0, tags=("stiff", "vibrations irrelevant"))
+    table = rows(
+        ("TRBDF2", "two-loop", "compiled", 1e-3, 1.0),
+        ("IDA from C, stabilised", "SUNDIALS", "compiled", 1e-3, 3.0),
+        ("IDA from C, order 2, positions tested", "SUNDIALS", "compiled", 1e-3, ida),
+        case="beam",
+    )
+    (found,) = goals.findings_of([case], table, table)["stiff"]
+    assert found["ratios"] == [ida, ida, None] and found["ahead"] is ahead
+
+
+def test_violations_are_those_of_ours_on_the_four_bars():
+    table = pd.concat([compared(1.0, 2.0), rows(("Adams", "two-loop", "compiled", 1e-3, 1.0), case="beam")])
+    table["violation_q"] = [3e-15, 1.0, 1.0, 1.0]
+    assert goals.findings_of([], table, table)["violation"]["largest"] == 3e-15
+
+
+def profile(ours, others, operations, evaluations=100.0):
+    table = compared(4.0, 2.0).assign(n_evaluations=evaluations)
+    table["n_steps"] = [ours, others, 1.0]
+    (line,) = behind.findings_of(rivals.findings_of(table), table, operations, 1e6)
+    return line
+
+
+def test_what_stands_in_the_way_follows_steps_and_times():
+    assert profile(100.0, 10.0, {})["in_the_way"] == "steps"
+    assert profile(10.0, 100.0, {})["in_the_way"] == "time per step"
+    quick = profile(10.0, 100.0, {"four-bar": 20.0})  # 20 ms an evaluation where it takes 40
+    assert quick["without"] == pytest.approx(1.0) and quick["in_the_way"] == "overhead"
+    slow = profile(10.0, 100.0, {"four-bar": 40.0})
+    assert slow["without"] == pytest.approx(0.5) and slow["in_the_way"] == "time per step"
+    assert profile(10.0, 100.0, {"four-bar": 20.0}, float("nan"))["in_the_way"] == "time per step"
+    assert profile(float("nan"), 100.0, {})["in_the_way"] == "not told"
+
+
+def test_a_step_of_taylor_is_not_measured_in_evaluations():
+    table = compared(4.0, 2.0).assign(n_evaluations=100.0, n_steps=10.0)
+    table["solver"] = table["solver"].replace("Adams", "Taylor")
+    (line,) = behind.findings_of(rivals.findings_of(table), table, {"four-bar": 20.0}, 1e6)
+    assert line["evaluation_ns"] is None and line["without"] is None and line["in_the_way"] == "time per step"
+
+
+def test_profiles_are_of_the_worst_and_none_where_none_is_ahead():
+    table = compared(1.0, 2.0).assign(n_steps=1.0)
+    assert behind.findings_of(rivals.findings_of(table), table, {}, 1.0) == []
+
+
+def test_operations_are_counted_where_there_are_expressions():
+    counted = behind.collect(Kept(), True).set_index("case")["operations"]
+    assert counted["four-bar"] > 500
