@@ -47,6 +47,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Adams": (BLACK, "o"),
     "auto": (VIOLET, "s"),
     "Taylor": (MAGENTA, "D"),
+    "Taylor, compiled": (MAGENTA, "*"),
     "TRBDF2": (GREEN, "v"),
     "ESDIRK4": (BROWN, "v"),
     "Gauss12": (BLUE, "s"),

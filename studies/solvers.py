@@ -14,7 +14,7 @@ import numpy as np
 
 from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
-from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop import Result, RungeKutta, Taylor, paper_irk, paper_newmark, solve_dae
 from twoloop.plan import Method
 from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
@@ -29,22 +29,13 @@ IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, 
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
 CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
-ADAMS, TAYLOR = "Adams", "Taylor"
+ADAMS, TAYLOR, COMPILED = "Adams", "Taylor", "Taylor, compiled"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 DEFAULT = "auto"  # of solve_dae
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
 PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
-OWN = (
-    DEFAULT,
-    TAYLOR,
-    ADAMS,
-    OWN_EXPLICIT,
-    "Gauss12",
-    "Gauss16",
-    "RadauIIA5",
-    "TRBDF2",
-    OWN_BDF,
-)  # of ours, beside the rivals
+# of ours, beside the rivals
+OWN = (DEFAULT, TAYLOR, COMPILED, ADAMS, OWN_EXPLICIT, "Gauss12", "Gauss16", "RadauIIA5", "TRBDF2", OWN_BDF)
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
@@ -74,10 +65,10 @@ def _preset(method: str | Method, case: Case, tolerance: float, repeat: int) -> 
     return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance, time_limit=case.time_limit)
 
 
-def _taylor(case: Case, tolerance: float, repeat: int) -> Result:
-    """`NotApplicable` where the callbacks cannot be traced, which `solve_dae` says by a ValueError."""
+def _taylor(compiled: bool, case: Case, tolerance: float, repeat: int) -> Result:
+    """`NotApplicable` where the callbacks cannot be traced or compiled, which is a ValueError of `solve_dae`."""
     try:
-        return _preset(TAYLOR, case, tolerance, repeat)
+        return _preset(Taylor(compiled=compiled), case, tolerance, repeat)
     except ValueError as why:
         raise NotApplicable(str(why)) from None
 
@@ -242,7 +233,9 @@ def _all() -> Iterator[Solver]:
     yield paper_newmark_at(ERR_IN)
     yield paper_newmark_at(ERR_IN, 0.25)
     for preset in dict.fromkeys((*PRESETS, *OWN)):
-        run = _taylor if preset == TAYLOR else partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
+        run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
+        if preset in (TAYLOR, COMPILED):
+            run = partial(_taylor, preset == COMPILED)
         yield _solver(preset, "two-loop", "compiled", "tol", run)
     newton = RungeKutta(radau_iia(4), "newton")
     yield _solver(NEWTON_4, "two-loop", "compiled", "tol", partial(_preset, newton))

@@ -35,7 +35,7 @@ START = ([1.0, 0.0, 2.0, 0.0], np.zeros(4))
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
 def test_where_nothing_is_stiff_the_steps_are_those_of_the_explicit_method(tol):
-    for problem, explicit in ((four_bar(), "DOP853"), (closed_chain(20), "Adams")):
+    for problem, explicit in ((four_bar(), "DOP853" if tol >= 1e-6 else "Taylor"), (closed_chain(20), "Taylor")):
         one, other = (
             solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tol, tol)
             for method in ("auto", explicit)

@@ -183,16 +183,6 @@ def has_new_entries(G, pattern):
     return unseen != 0.0  # also true for NaN
 
 
-@merged
-def has_new_entries(G, pattern):
-    """Whether an entry of G is not zero for the first time."""
-    entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
-    unseen = 0.0  # a sum without a branch: there is nothing new at nearly every look
-    for i in range(seen.size):
-        unseen += abs(entries[i]) * (1.0 - seen[i])
-    return unseen != 0.0  # also true for NaN
-
-
 @compiled
 def note_pattern(G, pattern):
     """Note the entries of G that are not zero; whether there are new ones."""

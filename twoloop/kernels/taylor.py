@@ -66,10 +66,12 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TRIED,  # 1: the last attempt left a series that takes over if it was accepted
     PASSED,  # with KEEP: time since the state of the series, s
     TARGET,  # which of the two series is to be found
+    SHORTER,  # of LENGTH, what the distance of its end from the constraints allowed of the step before; 0: not known
     N_MEMORY_SCALARS,
-) = range(11)
+) = range(12)
 
 ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
+ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
 
 
@@ -378,7 +380,7 @@ def _evaluate(series, unit, order, x, q, v):
         v[j] /= unit
 
 
-@kernel(STEP, vectorized=True)
+@kernel(STEP)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
@@ -417,7 +419,10 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[PASSED] += h
         return DONE, 0.0
     w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
+    if w.notes[DEPARTURE] > 0.0:
+        memory[SHORTER] = min(1.0, x / memory[LENGTH] * (ALLOWED / w.notes[DEPARTURE]) ** (1.0 / order))
     if w.notes[DEPARTURE] > 1.0:
+        w.notes[STEP_FACTOR] = memory[SHORTER] * memory[LENGTH] / x
         return DONE, w.notes[DEPARTURE]
     series = series_of(memory, order, n, 1.0 - memory[WHICH])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
@@ -427,5 +432,6 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
     if estimated:
         memory[NEXT_LENGTH] = _length(tolerances, series, unit, order, n)
-        w.notes[STEP_FACTOR] = min(memory[NEXT_LENGTH] * unit / h, GROWTH)
+        shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
+        w.notes[STEP_FACTOR] = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
     return DONE, max(error, w.notes[DEPARTURE])
