@@ -83,7 +83,8 @@ def test_order_between_the_steps(default_four_bar, exact, method, order, h):
         (_, in_q), (_, in_v) = errors(result, exact)
         found.append((in_q, in_v))
     rates = np.log2(np.array(found[0]) / np.array(found[1]))
-    assert (rates > order - 0.5).all(), rates
+    rounded = np.array(found[1]) < 2e-11  # slopes of polynomials between steps: some hundred roundings of q over h
+    assert ((rates > order - 0.5) | rounded).all(), rates
 
 
 def test_on_the_constraints_at_ten_thousand_times(default_four_bar):
