@@ -7,7 +7,9 @@ from twoloop.system import ConstrainedSystem
 from twoloop.taylor import Taylor
 
 MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method
-SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853, for few coordinates
+SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
+INVOLVED = 12  # ... up to so many operations a coordinate ...
+SIMPLE = 8  # ... or, with many coordinates, at any tolerance up to so many
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
 LIMIT_FEW, LIMIT_MANY = 2.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
@@ -40,8 +42,9 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
 class Auto:
     """Explicit steps where nothing is stiff, Newton's method where stiffness is measured; both ways during a run.
 
-    A run begins with `series` where the operations of the callbacks can be seen, and the tolerance is below 1e-6 or
-    there are 16 coordinates or more; else with `few`, or with `many` for as many coordinates. Every
+    A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
+    coordinate at tolerances below 1e-6, at most 8 at others if there are 16 coordinates or more. Else with `few`, or
+    with `many` for as many coordinates. Every
     600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where the
     steps have come near the limit of stability that it sets, the implicit method is tried for 15 steps and kept if a
     second of motion costs it less, counted in evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, else
@@ -87,13 +90,20 @@ class Auto:
         except ValueError:
             return replace(self, series=None)
 
+    def _series_pays(self, n_q: int, tolerance: float) -> bool:
+        """Whether a step of the series costs less than the steps of the others that it replaces."""
+        if self.series is None or self.series.program is None:
+            return False
+        operations = self.series.program.n_operations / n_q
+        return operations <= INVOLVED if tolerance < SERIES else operations <= SIMPLE and n_q >= MANY
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
         tolerance = least_tolerance(rtol, atol)
         second = (self.loose if tolerance >= LOOSE else self.tight).plan(n_q, rtol, atol, False)
-        if self.series is not None and (n_q >= MANY or tolerance < SERIES):
+        if self.series is not None and self._series_pays(n_q, tolerance):
             return switching(self.series.plan(n_q, rtol, atol, False), second, LIMIT_FEW, n_q)
         explicit, limit = (self.few, LIMIT_FEW) if n_q < MANY else (self.many, LIMIT_MANY)
         return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q)

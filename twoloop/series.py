@@ -79,9 +79,14 @@ class SeriesProgram:
     balance_places: Integers
 
     @property
+    def n_operations(self) -> int:
+        """Number of operations, products of G v and G^T lam + M a among them."""
+        return len(self.early.first.column) + len(self.late.first.column)
+
+    @property
     def n_nodes(self) -> int:
         """Number of quantities."""
-        return 1 + 3 * self.n_q + self.n_rows + len(self.early.first.column) + len(self.late.first.column)
+        return 1 + 3 * self.n_q + self.n_rows + self.n_operations
 
 
 def series_program(system: ConstrainedSystem) -> SeriesProgram:

@@ -78,7 +78,7 @@ def source_of(program: SeriesProgram) -> str:
     ValueError
         If it would be too long to compile.
     """
-    size = len(program.early.first.column) + len(program.late.first.column)
+    size = program.n_operations
     if size > LARGEST:
         raise ValueError(
             f"compiled=True is for equations of at most {LARGEST} operations; these are {size}. Leave it out"
