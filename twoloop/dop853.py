@@ -55,6 +55,7 @@ class DOP853:
 
     stages: Literal["free", "restored"] = "free"
     inner_tol: float | None = None
+    compiled: bool = False
 
     def __post_init__(self) -> None:
         check_choice("stages", self.stages, ("free", "restored"))
@@ -92,5 +93,6 @@ class DOP853:
             watchful=free,
             least_error=LEAST_ERROR,
             stable_to=lambda memory: STABLE_TO,
+            straight=self.compiled,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )

@@ -70,7 +70,7 @@ class Run:
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interior = rtol, plan.reuse, interior
-        self.kit = kit_of(system, t0, q0, plan.step, plan.first, plan.second)
+        self.kit = kit_of(system, t0, q0, plan.step, plan.first, plan.second, straight=plan.straight)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
@@ -250,7 +250,7 @@ class Run:
                 code = OUT_OF_TIME
             if code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
-                kit = common.Kit(self.functions, self.kit.inner, plan.step)
+                kit = common.Kit(self.functions, self.kit.general, plan.step)
                 code = a.PAUSED
             elif plan is not self.plan and code != a.ALL_OUTPUT_DONE:
                 plan, control, code = self._beyond(plan, control, code, int(filled[1]))

@@ -112,7 +112,7 @@ def series_program(system: ConstrainedSystem) -> SeriesProgram:
         ("nonholonomic", (system.n_a, n), (q,)),
         ("nonholonomic_rate", (system.n_a,), (q,)),
     ):
-        made[kind] = _made(system, graph, kind, shape, t, *state)
+        made[kind] = on_symbols(system, graph, kind, shape, t, *state)
     G = np.vstack([made["jacobian"], made["nonholonomic"]])
     rates = [*made["constraint_rate"], *made["nonholonomic_rate"]]
     row_products: dict[Any, Any] = {}
@@ -126,7 +126,16 @@ def series_program(system: ConstrainedSystem) -> SeriesProgram:
     return _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
 
 
-def _made(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any) -> Any:
+def on_symbols(
+    system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any
+) -> Any:
+    """What a callback makes of symbols, as an array of forms.
+
+    Raises
+    ------
+    Untraceable
+        If it does not run on them.
+    """
     out = np.full(shape, 0.0, dtype=object)
     arguments = (t, *map(symbols, state))
     if 0 not in shape:

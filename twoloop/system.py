@@ -126,7 +126,7 @@ class ConstrainedSystem:
         self._returning: dict[str, Any] = {}
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
-        self.series: Any = None  # the program of its Taylor series, when it was first needed
+        self.made: dict[Any, Any] = {}  # of its equations, by what of them and by the parameters: see `remembered`
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
@@ -220,6 +220,15 @@ class ConstrainedSystem:
     def called_in_python(self) -> bool:
         """Whether the callbacks are plain Python functions."""
         return self._python is not None
+
+    def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
+        """What `make` makes of the equations with the parameters as they are now, once; functions may do otherwise."""
+        if self.called_in_python:  # what such functions find in their surroundings may change
+            return make()
+        key = (what, self.parameters.tobytes())
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
 
     def arrays_of(self, kind: str) -> list[Array]:
         """Zeros for a kind of callback to fill."""

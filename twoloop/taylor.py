@@ -85,16 +85,12 @@ class Taylor:
         ValueError
             If its callbacks do not run on symbols.
         """
-        program = system.series
-        if program is None:
-            try:
-                program = series_program(system)
-            except Untraceable as error:
-                raise ValueError(
-                    f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
-                ) from error
-        if not system.called_in_python:  # what such functions find in their surroundings may change
-            system.series = program
+        try:
+            program = system.remembered("series", lambda: series_program(system))
+        except Untraceable as error:
+            raise ValueError(
+                f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
+            ) from error
         return replace(self, program=program)
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:

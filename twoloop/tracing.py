@@ -14,8 +14,8 @@ from numba.core.dispatcher import Dispatcher
 
 from twoloop.bounds import Rewritten
 
-# kinds of operation; the second form of the last two is what the derivative of the first is divided by
-PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING = range(9)
+# kinds of operation; the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
+PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM = range(10)
 LARGEST_POWER = 64  # that is made of products
 
 
@@ -179,6 +179,13 @@ class Form:
         """cos x."""
         self._function(SINE, math.sin)
         return self._function(COSINE, math.cos)
+
+    def value(self) -> "Form":
+        """The same as a multiple of one quantity, or as a number."""
+        if len(self.terms) + (self.constant != 0.0) < 2:
+            return self
+        scale, form = self.normalised()
+        return self.graph.operation(SUM, form).times(scale)
 
     def logarithm(self) -> "Form":
         """log x, whose derivative is x' / x."""

@@ -11,6 +11,7 @@ from twoloop.kernels.augmented import augmented_pays
 from twoloop.kernels.banded import banded_pays
 from twoloop.kernels.lapack import addresses
 from twoloop.kernels.layout import make_work
+from twoloop.straight_code import straight_inner
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -20,8 +21,11 @@ SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M m
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
-def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any) -> common.Kit:
-    """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and steps."""
+def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any, straight: bool = False) -> common.Kit:
+    """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and steps.
+
+    `straight`: the inner loop is code made for the system.
+    """
     from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
 
     flags = system.functions.flags.copy()
@@ -38,7 +42,11 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any) -> comm
     sparse = augmented_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
-    return common.Kit(system.functions._replace(flags=flags), inner_loop, *steps)
+    inner = inner_loop
+    if straight:
+        inner, flags[common.STRAIGHT] = straight_inner(system, t0, q0), 1
+    steps = (*steps, *[None] * (3 - len(steps)))
+    return common.Kit(system.functions._replace(flags=flags), inner, *steps, inner_loop)
 
 
 def workspace(

@@ -38,6 +38,7 @@ from twoloop.kernels.common import (
     SENSITIVITY,
     SINGULAR,
     STEP_FACTOR,
+    STRAIGHT,
     VECTOR,
     WORK,
     f8,
@@ -66,6 +67,7 @@ COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
 FADING = 0.98  # of the longest step, with each accepted one
 KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
+RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
@@ -302,8 +304,14 @@ def advance(
                 return ALL_OUTPUT_DONE
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
         if control[SYMMETRIC] == 0.0:
-            looked = f.flags[FORM] != AUGMENTED or w.counters[N_ACCEPTED] % (1 + w.independent_v.size // FEW) == 0
-            if f.flags[FORM] != NULL_SPACE and looked:
+            straight = f.flags[STRAIGHT] == 1
+            every = 1
+            if f.flags[FORM] == AUGMENTED:
+                every += w.independent_v.size // FEW
+            if straight:
+                every = RARELY
+            looked = w.counters[N_ACCEPTED] % every == 0
+            if looked and (straight or f.flags[FORM] != NULL_SPACE):
                 find_tangents(f, w, clock[T], state[:n])
             if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
                 return RANK_LOST

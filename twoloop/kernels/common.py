@@ -30,8 +30,9 @@ Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is not banded; FORM: how accelerations
-# are found, see accelerations.py; DENSE_FORM: what it becomes where sparse factors have too many entries
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, FIRST_GIVEN = range(6)
+# are found, see accelerations.py; DENSE_FORM: what it becomes where sparse factors have too many entries;
+# STRAIGHT: 1 where the inner loop is code made for the mechanism, see straight_code.py
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED = range(3)  # forms
 GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
@@ -175,11 +176,21 @@ class Kit:
     """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
-    chooses between two others has these as `first` and `second`.
+    chooses between two others has these as `first` and `second`. An inner loop made for the mechanism leaves to
+    `general` what it does not do itself.
     """
 
-    def __init__(self, functions: Any, inner: Any = None, step: Any = None, first: Any = None, second: Any = None):
+    def __init__(
+        self,
+        functions: Any,
+        inner: Any = None,
+        step: Any = None,
+        first: Any = None,
+        second: Any = None,
+        general: Any = None,
+    ):
         self.functions, self.inner, self.step, self.first, self.second = functions, inner, step, first, second
+        self.general = general
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -192,7 +203,8 @@ for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)
 # (kit, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
 INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
-KIT.add_function("inner", INNER)
+for _name in ("inner", "general"):
+    KIT.add_function(_name, INNER)
 # (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
 STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
 for _name in ("step", "first", "second"):

@@ -28,8 +28,10 @@ from twoloop.kernels.predictor import departure, keep_predicted
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
-# vectors (2 n_q) in `memory` after memory[0], which is advance()'s; then the slopes of the stages, (s, 2 n_q)
-STAGE, ESTIMATED, N_VECTORS = range(3)
+# vectors in `memory` after memory[0], which is advance()'s; then the slopes of the stages. Each has 2 n_q numbers, and
+# zeros up to a multiple of BLOCK
+STAGE, FINE, COARSE, N_VECTORS = range(4)
+BLOCK = 8
 
 
 def options_array(
@@ -55,7 +57,12 @@ def options_array(
 
 def memory_size(s: int, n_q: int) -> int:
     """Length of `memory` for s stages and n_q coordinates."""
-    return 1 + (N_VECTORS + s) * 2 * n_q
+    return 1 + (N_VECTORS + s) * (-(-2 * n_q // BLOCK) * BLOCK)
+
+
+@inlined
+def _width(n):
+    return (2 * n + BLOCK - 1) // BLOCK * BLOCK
 
 
 @inlined
@@ -70,58 +77,65 @@ def _tableau(options):
 
 @inlined
 def _vector(memory, n, which):
-    return memory[1 + which * 2 * n : 1 + (which + 1) * 2 * n]
+    return memory[1 + which * _width(n) : 1 + (which + 1) * _width(n)]
 
 
 @inlined
 def _slopes(memory, s, n):
     """Velocities and accelerations of the stages, side by side."""
-    o = 1 + N_VECTORS * 2 * n
-    return memory[o:].reshape((s, 2 * n))
+    return memory[1 + N_VECTORS * _width(n) :].reshape((s, _width(n)))
 
 
 @compiled
 def _weighted(weights, slopes, total):
-    """The sum of weights[k] slopes[k]; the innermost loop runs over what lies side by side."""
-    for m in range(total.size):
-        total[m] = 0.0
-    for k in range(weights.size):
-        weight = weights[k]
-        if weight != 0.0:
-            for m in range(total.size):
-                total[m] += weight * slopes[k, m]
+    """The sum of weights[k] slopes[k], block by block, each in registers."""
+    for m in range(0, total.size, BLOCK):
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
+        for k in range(weights.size):
+            weight = weights[k]
+            s0 += weight * slopes[k, m]
+            s1 += weight * slopes[k, m + 1]
+            s2 += weight * slopes[k, m + 2]
+            s3 += weight * slopes[k, m + 3]
+            s4 += weight * slopes[k, m + 4]
+            s5 += weight * slopes[k, m + 5]
+            s6 += weight * slopes[k, m + 6]
+            s7 += weight * slopes[k, m + 7]
+        total[m] = s0
+        total[m + 1] = s1
+        total[m + 2] = s2
+        total[m + 3] = s3
+        total[m + 4] = s4
+        total[m + 5] = s5
+        total[m + 6] = s6
+        total[m + 7] = s7
 
 
 @compiled
-def _move(y, h, weights, slopes, y1):
+def _move(y, h, weights, slopes, total, y1):
     """y1 = y + h times the weighted sum: added at last, so that not every stage rounds y."""
-    _weighted(weights, slopes, y1)
+    _weighted(weights, slopes, total)
     for m in range(y.size):
-        y1[m] = y[m] + h * y1[m]
+        y1[m] = y[m] + h * total[m]
 
 
 @compiled
-def _largest(tolerances, h, weights, y, y1, slopes, estimate):
-    """Largest component of h times the weighted sum of the slopes over atol + rtol |y|."""
-    _weighted(weights, slopes, estimate)
-    n = estimate.size // 2
-    largest = 0.0
-    for m in range(n):
-        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
-        largest = max(largest, abs(h * estimate[m]) / (atol + rtol * max(abs(y[m]), abs(y1[m]))))
-        k = n + m
-        largest = max(largest, abs(h * estimate[k]) / (atol + rtol * max(abs(y[k]), abs(y1[k]))))
-    return largest
-
-
-@compiled
-def _error(tolerances, h, fine, coarse, y, y1, slopes, estimate):
+def _error(tolerances, h, y, y1, fine, coarse):
     """e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
 
-    Taken component by component it would be e, of low order, where d passes through zero: up to 30 % more evaluations.
+    Each is h times an estimate over atol + rtol |y|. Taken component by component e^2 / sqrt(e^2 + d^2) would be e, of
+    low order, where d passes through zero: up to 30 % more evaluations.
     """
-    e = _largest(tolerances, h, fine, y, y1, slopes, estimate)
-    d = _largest(tolerances, h, coarse, y, y1, slopes, estimate)
+    n = y.size // 2
+    rtol = tolerances[RTOL]
+    e = e_v = d = d_v = 0.0
+    for m in range(n):
+        k, atol = n + m, tolerances[ATOL + m]
+        share = h / (atol + rtol * max(abs(y[m]), abs(y1[m])))
+        share_v = h / (atol + rtol * max(abs(y[k]), abs(y1[k])))
+        e, e_v = max(e, abs(fine[m] * share)), max(e_v, abs(fine[k] * share_v))
+        d, d_v = max(d, abs(coarse[m] * share)), max(d_v, abs(coarse[k] * share_v))
+    e, d = max(e, e_v), max(d, d_v)
     return e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
 
@@ -132,26 +146,28 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    stage, estimate = _vector(memory, n, STAGE), _vector(memory, n, ESTIMATED)
+    stage, first, second = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
     # near a singular position it matters on which side of it a stage is, and how well velocities keep to the rows
     free = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] == 0.0
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _move(y, h, A[j, :j], slopes, stage)  # dependents too: where Newton starts
-        v_stage, a_stage = slopes[j, :n], slopes[j, n:]
-        copy(stage[n:], v_stage)
+        _move(y, h, A[j, :j], slopes, stage, stage)  # dependents too: where Newton starts
+        v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
+        copy(stage[n : 2 * n], v_stage)
         if free:
             code = evaluate_there(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
         else:
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:
             return code, np.inf
-    _move(y, h, b, slopes, y1)
+    _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, estimate)
+        _weighted(fine, slopes, first)
+        _weighted(coarse, slopes, second)
+        error = _error(tolerances, h, y, y1, first, second)
         if not error <= 1.0:
             return DONE, error
     keep_predicted(w, q1)

@@ -1,0 +1,221 @@
+"""Machine code for the equations of one mechanism: the tasks of the inner loop that explicit methods call at each stage.
+
+The operations of `twoloop.straight_line` become LLVM's instructions one by one, without numba's front end, which would
+take seconds for some hundred of them. The code is kept on disk as that of the kernels.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.dispatcher import Dispatcher
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
+from numpy.typing import NDArray
+
+from twoloop.caches import compile_kept
+from twoloop.callbacks import VECTOR
+from twoloop.straight_line import Outputs, StraightLine, rows_for_mass
+from twoloop.system import ConstrainedSystem
+from twoloop.tracing import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    LOGARITHM,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+    SUM,
+    Form,
+    Untraceable,
+)
+
+Array = NDArray[np.float64]
+
+DOUBLE = ir.DoubleType()
+FLAGS = ("contract", "reassoc", "nsz", "arcp")  # those of the kernels
+FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", SINE: "sin", COSINE: "cos", LOGARITHM: "log"}
+
+
+class Emitter:
+    """Instructions for quantities of a graph, each computed once."""
+
+    def __init__(self, builder: Any):
+        self.builder = builder
+        self._values: dict[int, Any] = {}
+        self._forms: dict[Any, Any] = {}
+
+    def set_value(self, quantity: int, value: Any) -> None:
+        """What a quantity is."""
+        self._values[quantity] = value
+
+    def form(self, form: Form) -> Any:
+        """The value of a form."""
+        key = form.key
+        if key not in self._forms:
+            self._forms[key] = self._sum(form)
+        return self._forms[key]
+
+    def _sum(self, form: Form) -> Any:
+        b = self.builder
+        total = None if form.constant == 0.0 else ir.Constant(DOUBLE, form.constant)
+        for i, c in form.terms.items():
+            x = self._values[i]
+            if total is None:
+                total = x if c == 1.0 else b.fmul(ir.Constant(DOUBLE, c), x, flags=FLAGS)
+            elif c == 1.0:
+                total = b.fadd(total, x, flags=FLAGS)
+            elif c == -1.0:
+                total = b.fsub(total, x, flags=FLAGS)
+            else:
+                total = b.fadd(total, b.fmul(ir.Constant(DOUBLE, c), x, flags=FLAGS), flags=FLAGS)
+        return ir.Constant(DOUBLE, 0.0) if total is None else total
+
+    def operation(self, quantity: int, kind: int, first: Form, second: Form | None) -> None:
+        """Compute a quantity."""
+        b, x = self.builder, self.form(first)
+        if kind == PRODUCT:
+            assert second is not None
+            value = b.fmul(x, self.form(second), flags=FLAGS)
+        elif kind == SUM:
+            value = x
+        elif kind == RECIPROCAL:
+            value = b.fdiv(ir.Constant(DOUBLE, 1.0), x, flags=FLAGS)
+        elif kind == ARCTANGENT:
+            kind_of_function = ir.FunctionType(DOUBLE, [DOUBLE])
+            value = b.call(cgutils.get_or_insert_function(b.module, kind_of_function, "atan"), [x])
+        else:
+            value = b.call(b.module.declare_intrinsic(f"llvm.{FUNCTIONS[kind]}", [DOUBLE]), [x])
+        self._values[quantity] = value
+
+
+def _pointer(context: Any, builder: Any, value: Any) -> Any:
+    return make_array(VECTOR)(context, builder, value).data
+
+
+def _place(builder: Any, pointer: Any, i: int) -> Any:
+    return builder.gep(pointer, [ir.Constant(ir.IntType(64), i)], inbounds=True)
+
+
+def _code(equations: StraightLine, outputs: Outputs) -> Any:
+    """A function of t, q, v and a tuple of arrays to fill, for code that numba compiles.
+
+    It returns whether the conditions hold and what it computes is finite, and fills the arrays only then.
+    """
+
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        t, q, v, filled = arguments
+        emitter = Emitter(builder)
+        n = equations.system.n_q
+        emitter.set_value(0, t)
+        for first, array in ((1, q), (1 + n, v)):
+            pointer = _pointer(context, builder, array)
+            for j in range(n):
+                emitter.set_value(first + j, builder.load(_place(builder, pointer, j)))
+        for i in outputs.quantities(equations.graph):
+            operation = equations.graph.operations[i]
+            assert operation is not None
+            emitter.operation(i, *operation)
+        zero: Any = ir.Constant(DOUBLE, 0.0)
+        total, holds = zero, ir.Constant(ir.IntType(1), 1)
+        results = {name: [emitter.form(form) for form in forms] for name, forms in outputs.arrays.items()}
+        for value in results["a"]:  # what is not finite becomes NaN
+            total = builder.fadd(total, builder.fmul(value, zero, flags=FLAGS), flags=FLAGS)
+        holds = builder.fcmp_ordered("==", total, zero)
+        for one, other in outputs.conditions:
+            holds = builder.and_(holds, builder.fcmp_ordered(">", emitter.form(one), emitter.form(other)))
+        with builder.if_then(holds):
+            for k, values in enumerate(results.values()):
+                pointer = _pointer(context, builder, builder.extract_value(filled, k))
+                for j, value in enumerate(values):
+                    builder.store(value, _place(builder, pointer, j))
+        return holds
+
+    @intrinsic
+    def straight(typing: Any, t: Any, q: Any, v: Any, arrays: Any) -> Any:
+        return types.boolean(t, q, v, arrays), emit
+
+    return straight
+
+
+def straight_inner(system: ConstrainedSystem, t0: float, q0: Array) -> Dispatcher:
+    """The inner loop for a system, compiled for its equations.
+
+    Raises
+    ------
+    ValueError
+        If they cannot be had.
+    """
+    try:
+        added = rows_for_mass(system.mass(t0, q0), system.jacobian(t0, q0), system.name)
+        return system.remembered(("inner", added), lambda: _compiled(StraightLine(system, *added)))  # type: ignore[no-any-return]
+    except Untraceable as error:
+        raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
+
+
+def _compiled(equations: StraightLine) -> Dispatcher:
+    from twoloop.kernels import common
+
+    digest = hashlib.sha256(repr(("inner", *_described(equations))).encode() + Path(__file__).read_bytes()).hexdigest()
+    return _inner(equations, (common.stamp("calls"), digest))
+
+
+def _described(equations: StraightLine) -> Iterable[Any]:
+    """All that the code depends on."""
+    yield equations.system.n_q, equations.system.n_c
+    for outputs in (equations.there, equations.nearer):
+        yield {name: [form.key for form in forms] for name, forms in outputs.arrays.items()}
+        yield [(one.key, other.key) for one, other in outputs.conditions]
+    for operation in equations.graph.operations:
+        yield None if operation is None else tuple(x.key if isinstance(x, Form) else x for x in operation)
+
+
+def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
+    from twoloop.kernels import calls
+    from twoloop.kernels.common import (
+        DONE,
+        INNER,
+        N_EVALUATIONS,
+        N_FACTORIZATIONS,
+        N_INNER,
+        OPTIONS,
+        ROUNDED,
+    )
+    from twoloop.kernels.inner import CONTRACTION, MAX_INNER
+    from twoloop.kernels.projection import ABOVE_ROUNDING
+    from twoloop.linking import KernelCompiler
+
+    there, nearer = _code(equations, equations.there), _code(equations, equations.nearer)
+    EVALUATE_THERE, PROJECT = calls.EVALUATE_THERE, calls.PROJECT
+
+    def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
+        if task == EVALUATE_THERE:
+            w.counters[N_EVALUATIONS] += 1
+            w.counters[N_FACTORIZATIONS] += 1
+            if there(t, q, v, (a,)):
+                return DONE
+        elif task == PROJECT:
+            least, before = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED]), np.inf
+            for _ in range(MAX_INNER):
+                w.counters[N_INNER] += 1
+                w.counters[N_FACTORIZATIONS] += 1
+                if not nearer(t, q, v, (q, v, a, lam, w.x)):
+                    break
+                moved = 0.0
+                for j in range(q.size):
+                    moved = max(moved, abs(w.x[j]))
+                if moved <= least:
+                    w.counters[N_EVALUATIONS] += 1
+                    return DONE
+                if moved > CONTRACTION * before:
+                    break
+                before = moved
+        return f.general(f, w, task, t, q, v, theta, a, lam)
+
+    return compile_kept(inner, INNER, watched, pipeline_class=KernelCompiler, **OPTIONS)
