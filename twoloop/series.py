@@ -126,9 +126,7 @@ def series_program(system: ConstrainedSystem) -> SeriesProgram:
     return _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
 
 
-def on_symbols(
-    system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any
-) -> Any:
+def on_symbols(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any) -> Any:
     """What a callback makes of symbols, as an array of forms.
 
     Raises

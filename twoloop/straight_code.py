@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from twoloop.caches import compile_kept
 from twoloop.callbacks import VECTOR
-from twoloop.straight_line import Outputs, StraightLine, rows_for_mass
+from twoloop.straight_line import Choice, Outputs, StraightLine
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import (
     ARCTANGENT,
@@ -125,7 +125,7 @@ def _code(equations: StraightLine, outputs: Outputs) -> Any:
         zero: Any = ir.Constant(DOUBLE, 0.0)
         total, holds = zero, ir.Constant(ir.IntType(1), 1)
         results = {name: [emitter.form(form) for form in forms] for name, forms in outputs.arrays.items()}
-        for value in results["a"]:  # what is not finite becomes NaN
+        for value in results.get("a") or results["moved"]:  # what is not finite becomes NaN
             total = builder.fadd(total, builder.fmul(value, zero, flags=FLAGS), flags=FLAGS)
         holds = builder.fcmp_ordered("==", total, zero)
         for one, other in outputs.conditions:
@@ -153,8 +153,8 @@ def straight_inner(system: ConstrainedSystem, t0: float, q0: Array) -> Dispatche
         If they cannot be had.
     """
     try:
-        added = rows_for_mass(system.mass(t0, q0), system.jacobian(t0, q0), system.name)
-        return system.remembered(("inner", added), lambda: _compiled(StraightLine(system, *added)))  # type: ignore[no-any-return]
+        choice = Choice.at(system, t0, q0)
+        return system.remembered(("inner", choice), lambda: _compiled(StraightLine(system, choice)))
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
 
@@ -169,7 +169,9 @@ def _compiled(equations: StraightLine) -> Dispatcher:
 def _described(equations: StraightLine) -> Iterable[Any]:
     """All that the code depends on."""
     yield equations.system.n_q, equations.system.n_c
-    for outputs in (equations.there, equations.nearer):
+    for outputs in (equations.there, equations.closer, equations.nearer):
+        if outputs is None:
+            continue
         yield {name: [form.key for form in forms] for name, forms in outputs.arrays.items()}
         yield [(one.key, other.key) for one, other in outputs.conditions]
     for operation in equations.graph.operations:
@@ -179,6 +181,7 @@ def _described(equations: StraightLine) -> Iterable[Any]:
 def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
     from twoloop.kernels import calls
     from twoloop.kernels.common import (
+        BY_GENERAL,
         DONE,
         INNER,
         N_EVALUATIONS,
@@ -191,8 +194,20 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
     from twoloop.kernels.projection import ABOVE_ROUNDING
     from twoloop.linking import KernelCompiler
 
-    there, nearer = _code(equations, equations.there), _code(equations, equations.nearer)
-    EVALUATE_THERE, PROJECT = calls.EVALUATE_THERE, calls.PROJECT
+    there, EVALUATE_THERE, PROJECT = _code(equations, equations.there), calls.EVALUATE_THERE, calls.PROJECT
+    if equations.closer is None or equations.nearer is None:
+
+        def evaluating(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
+            if task == EVALUATE_THERE:
+                w.counters[N_EVALUATIONS] += 1
+                w.counters[N_FACTORIZATIONS] += 1
+                if there(t, q, v, (a,)):
+                    return DONE
+            return f.general(f, w, task, t, q, v, theta, a, lam)
+
+        return compile_kept(evaluating, INNER, watched, pipeline_class=KernelCompiler, **OPTIONS)
+
+    closer, nearer = _code(equations, equations.closer), _code(equations, equations.nearer)
 
     def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
         if task == EVALUATE_THERE:
@@ -202,20 +217,23 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
                 return DONE
         elif task == PROJECT:
             least, before = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED]), np.inf
-            for _ in range(MAX_INNER):
+            for k in range(MAX_INNER):
                 w.counters[N_INNER] += 1
                 w.counters[N_FACTORIZATIONS] += 1
-                if not nearer(t, q, v, (q, v, a, lam, w.x)):
+                fine = closer(t, q, v, (q, w.x)) if k == 0 else nearer(t, q, v, (q, w.x, v, a, lam))
+                if not fine:
                     break
                 moved = 0.0
                 for j in range(q.size):
                     moved = max(moved, abs(w.x[j]))
-                if moved <= least:
+                if moved <= least and k > 0:
                     w.counters[N_EVALUATIONS] += 1
+                    w.notes[BY_GENERAL] = 0.0
                     return DONE
                 if moved > CONTRACTION * before:
                     break
-                before = moved
+                before = max(moved, least)
+            w.notes[BY_GENERAL] = 1.0
         return f.general(f, w, task, t, q, v, theta, a, lam)
 
     return compile_kept(inner, INNER, watched, pipeline_class=KernelCompiler, **OPTIONS)

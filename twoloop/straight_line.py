@@ -5,11 +5,11 @@ The callbacks run once in Python on symbols (`twoloop.tracing`). The matrix of
     [M  G^T] [a  ]   [Q    ]
     [G  0  ] [lam] = [Gamma]
 
-with G = C_q is eliminated symbolically, without what is zero by its structure, in an order found once: a row of G after
-all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search. A row of G
-is small against the rows before it where its pivot is small against the one it has without them: then the code says
-that it is not to be used. The same factors give the nearest position and velocity on the constraints, in the metric of
-M. Where M is singular, rows g of G are added, M + g^T g, which changes neither.
+with G = [C_q; A] is eliminated symbolically, without what is zero by its structure, in an order found once: a row of G
+after all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search. A
+row is nearly a combination of others where its pivot is small against the one that it has without them; there the code
+is not to be used. The same factors give the nearest position and velocity on the constraints, in the metric of M. Where
+M is singular, rows g of G are added, M + g^T g, which changes neither. Of redundant rows those that count are kept.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.common import GAMMA_GIVEN, GIVEN
+from twoloop.kernels.common import GIVEN
 from twoloop.series import on_symbols
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import (
@@ -40,8 +40,9 @@ from twoloop.tracing import (
 Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
-RANK = 1e-8  # the same of the rows of G at the start
-SMALLEST_PIVOT = 1e-7  # of a row of G, of what it is without the others: the square of the sine of its angle to them
+RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
+NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
+ROUNDING = 1e-10  # of a pivot
 MOST = 20_000  # operations
 
 
@@ -63,7 +64,8 @@ class Outputs:
     def quantities(self, graph: Graph) -> list[int]:
         """What all of this is made of, inputs apart, in an order in which it can be computed."""
         found: set[int] = set()
-        forms = [*(form for array in self.arrays.values() for form in array), *(each for c in self.conditions for each in c)]
+        forms = [*(form for array in self.arrays.values() for form in array)]
+        forms += [form for condition in self.conditions for form in condition]
         ahead = [i for form in forms for i in form.terms]
         while ahead:
             i = ahead.pop()
@@ -139,24 +141,25 @@ def _order(rows: list[dict[int, Form]], n: int) -> list[int]:
 
 
 class StraightLine:
-    """The equations of a system whose rows of C_q are independent.
+    """The equations of a system, with rows G = [C_q; A].
 
     Parameters
     ----------
     system : ConstrainedSystem
-    added, scale : sequence of int, float
-        Rows of G that make M definite, and their factor, see `rows_for_mass`.
+    choice : Choice
+        What numbers decide.
 
     Attributes
     ----------
     graph : Graph
-    inputs : list of Form
-        t, q and v.
+        Its first quantities are t, q and v.
     there : Outputs
         "a" (n_q,), the accelerations at (q, v) as they stand.
-    nearer : Outputs
-        "q", "v" (n_q,), moved by Newton's method towards the constraints, and "a" (n_q,), "lam" (n_c,) for the
-        velocities after the move and the position before it; "moved" (n_q,), the move of the position.
+    closer : Outputs or None
+        "q" (n_q,), moved by a step of Newton's method towards the constraints, and "moved" (n_q,), by how much. None:
+        there are rows of A, which leave positions free.
+    nearer : Outputs or None
+        The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c,) for these.
 
     Raises
     ------
@@ -164,29 +167,30 @@ class StraightLine:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, added: Sequence[int], scale: float):
-        if system.n_a:
-            raise Untraceable(f"{system.name!r} has nonholonomic rows")
-        if system.n_c and not system.functions.flags[GIVEN["jacobian"]]:
-            raise Untraceable(f"{system.name!r} does not give jacobian, which is needed")
-        self.system, self.graph = system, Graph()
+    def __init__(self, system: ConstrainedSystem, choice: "Choice"):
+        given = system.functions.flags
+        for kind, size in (("jacobian", system.n_c), ("nonholonomic", system.n_a)):
+            if size and not given[GIVEN[kind]]:
+                raise Untraceable(f"{system.name!r} does not give {kind}, which is needed")
+        self.system, self.choice, self.graph = system, choice, Graph()
+        self.nothing = Form(self.graph, 0.0, {})
+        n, n_c, n_a = system.n_q, system.n_c, system.n_a
         (self.t,) = self.graph.inputs(1, False)
-        self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
-        self.inputs = [self.t, *self.q, *self.v]
-        n, m = system.n_q, system.n_c
+        self.q, self.v = self.graph.inputs(n, False), self.graph.inputs(n, True)
         self.mass = self._made("mass", (n, n), self.q)
-        self.rows = self._made("jacobian", (m, n), self.q)
-        self.rates = self._made("constraint_rate", (m,), self.q)
-        self.added, self.scale = added, scale
-        self.factors = Factors(self._matrix(), n + m, n)
-        self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions())
-        self.nearer = self._nearer()
+        rows = [self._made("jacobian", (n_c, n), self.q), self._made("nonholonomic", (n_a, n), self.q)]
+        rates = [self._made("constraint_rate", (n_c,), self.q), self._made("nonholonomic_rate", (n_a,), self.q)]
+        self.all_rows, counting = np.vstack(rows), list(choice.rows)
+        self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
+        self.factors = Factors(self._matrix(), n + len(self.rows), n)
+        self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.pivots]
+        self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions)
+        self.closer: Outputs | None = None
+        self.nearer: Outputs | None = None
+        if n_a == 0:
+            self._add_projection()
         if len(self.graph.operations) > MOST:
             raise Untraceable(f"its equations are more than {MOST} operations")
-
-    def conditions(self) -> list[tuple[Form, Form]]:
-        """That no row is nearly a combination of others."""
-        return [(pivot, alone.times(SMALLEST_PIVOT)) for pivot, alone in self.factors.pivots]
 
     def _made(self, kind: str, shape: tuple[int, ...], *state: Sequence[Form]) -> Any:
         made = on_symbols(self.system, self.graph, kind, shape, self.t, *state)
@@ -195,62 +199,135 @@ class StraightLine:
         return made
 
     def _matrix(self) -> dict[tuple[int, int], Form]:
-        n, m = self.system.n_q, self.system.n_c
+        n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not _is_zero(self.mass[i, j])}
-        for k in self.added:
-            places = [i for i in range(n) if not _is_zero(self.rows[k, i])]
+        for k in self.choice.added:
+            places = [i for i in range(n) if not _is_zero(self.all_rows[k, i])]
             for i in places:
                 for j in places:
-                    term = (self.rows[k, i] * self.rows[k, j]).times(self.scale)
+                    term = (self.all_rows[k, i] * self.all_rows[k, j]).times(self.choice.scale)
                     matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
-        for k in range(m):
+        for k, row in enumerate(self.rows):
             for i in range(n):
-                if not _is_zero(self.rows[k, i]):
-                    matrix[n + k, i] = matrix[i, n + k] = self.rows[k, i]
+                if not _is_zero(row[i]):
+                    matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
     def _accelerations(self, v: Sequence[Form]) -> list[Form]:
-        """a and lam at velocities v."""
-        n, m = self.system.n_q, self.system.n_c
-        force = self._made("force", (n,), self.q, v)
-        if self.system.functions.flags[GAMMA_GIVEN]:
-            gamma = self._made("gamma", (m,), self.q, v)
-        else:
-            gamma = self._gamma(v)
-        right = list(force)
-        for k in self.added:
-            for i in range(n):
-                right[i] = right[i] + (self.rows[k, i] * gamma[k]).times(self.scale)
-        return self.factors.solve([*right, *gamma])
+        """a and the multipliers of the rows that count, at velocities v."""
+        gamma = self._gamma(v)
+        right = list(self._made("force", (self.system.n_q,), self.q, v))
+        for k in self.choice.added:
+            for i, entry in enumerate(self.all_rows[k]):
+                right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
+        return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
     def _gamma(self, v: Sequence[Form]) -> list[Form]:
-        """-(dG/dt v + dG_t/dt) along the motion, by the rules of differentiation."""
-        derivative = Derivative(self.graph, {_only(self.t): 1.0, **{_only(q): u for q, u in zip(self.q, v, strict=True)}})
-        gamma = []
-        for row, rate in zip(self.rows, self.rates, strict=True):
+        """The right-hand side of the constraints on accelerations: as given, else -(dG/dt v + dG_t/dt) by the rules."""
+        n_c, n_a, gamma = self.system.n_c, self.system.n_a, []
+        for kind, size, first in (("gamma", n_c, 0), ("nonholonomic_gamma", n_a, n_c)):
+            if self.system.functions.flags[GIVEN[kind]]:
+                gamma += [*self._made(kind, (size,), self.q, v)]
+            elif size:
+                rate = "constraint_rate" if first == 0 else "nonholonomic_rate"
+                rates = self._made(rate, (size,), self.q)
+                gamma += self._differentiated(self.all_rows[first : first + size], rates, v)
+        return gamma
+
+    def _differentiated(self, rows: Any, rates: Any, v: Sequence[Form]) -> list[Form]:
+        along = {_only(self.t): Form(self.graph, 1.0, {}), **{_only(q): u for q, u in zip(self.q, v, strict=True)}}
+        derivative, made = Derivative(self.graph, along), []
+        for row, rate in zip(rows, rates, strict=True):
             total = derivative.of(rate)
             for entry, u in zip(row, v, strict=True):
                 total = total + derivative.of(entry) * u
-            gamma.append((-total).value())
-        return gamma
+            made.append((-total).value())
+        return made
 
-    def _nearer(self) -> Outputs:
-        n, m = self.system.n_q, self.system.n_c
-        nothing = Form(self.graph, 0.0, {})
-        off = self._made("constraint", (m,), self.q)
-        moved = self.factors.solve([*([nothing] * n), *(-each for each in off)])[:n]
+    def _add_projection(self) -> None:
+        n = self.system.n_q
+        off = self._made("constraint", (self.system.n_c,), self.q)[list(self.choice.rows)]
+        moved = self.factors.solve([*([self.nothing] * n), *(-each for each in off)])[:n]
         faster = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
             for entry, u in zip(row, self.v, strict=True):
                 total = total + entry * u
             faster.append(-total)
-        change = self.factors.solve([*([nothing] * n), *faster])[:n]
+        change = self.factors.solve([*([self.nothing] * n), *faster])[:n]
         v = [(one + other).value() for one, other in zip(self.v, change, strict=True)]
         solution = self._accelerations(v)
-        q = [one + other for one, other in zip(self.q, moved, strict=True)]
-        arrays = {"q": q, "v": v, "a": solution[:n], "lam": solution[n:], "moved": moved}
-        return Outputs(arrays, self.conditions())
+        position = {"q": [one + other for one, other in zip(self.q, moved, strict=True)], "moved": moved}
+        self.closer = Outputs(position, self.conditions)
+        lam = self._of_least_norm(solution[n:])
+        self.nearer = Outputs({**position, "v": v, "a": solution[:n], "lam": lam}, self.conditions)
+
+    def _of_least_norm(self, known: Sequence[Form]) -> list[Form]:
+        """Multipliers of all rows from those of the rows that count.
+
+        A row that does not is a combination of these, by the numbers Z; less its part in the null space of G^T, spanned
+        by e_i - sum_k Z_ik e_k, lam has least norm.
+        """
+        n, rows = self.system.n_q, self.choice.rows
+        lam = [self.nothing] * len(self.all_rows)
+        for k, value in zip(rows, known, strict=True):
+            lam[k] = value
+        others = [k for k in range(len(lam)) if k not in rows]
+        Z = [self.factors.solve([*self.all_rows[k], *([self.nothing] * len(rows))])[n:] for k in others]
+        gram = {
+            (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Form(self.graph, float(i == j), {}))
+            for i, one in enumerate(Z)
+            for j, other in enumerate(Z)
+        }
+        parts = [sum((-(x * y) for x, y in zip(one, known, strict=True)), self.nothing) for one in Z]
+        for row, one, part in zip(others, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
+            lam[row] = lam[row] - part
+            for k, x in zip(rows, one, strict=True):
+                lam[k] = lam[k] + part * x
+        return lam
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is decided by numbers at a position.
+
+    Attributes
+    ----------
+    rows : tuple of int
+        Rows of G of full rank.
+    added, scale : tuple of int, float
+        Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
+    least : float
+        What the pivot of a row must be, of what it is without the others, a power of ten.
+    """
+
+    rows: tuple[int, ...]
+    added: tuple[int, ...]
+    scale: float
+    least: float
+
+    @classmethod
+    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
+        """The choice at a position.
+
+        Raises
+        ------
+        Untraceable
+            If M is singular on velocities that the constraints allow.
+        """
+        mass, G = system.mass(t, q), system.rows(t, q)
+        rows = _independent(G)
+        if not rows:
+            return cls((), (), 1.0, 0.0)
+        scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
+        added = _rows_for_mass(mass, G, scale, system.name)
+        mass = mass + scale * G[list(added)].T @ G[list(added)]
+        S = G[rows] @ np.linalg.solve(mass, G[rows].T)
+        size = np.sqrt(np.diag(S))
+        smallest = float(np.linalg.eigvalsh(S / np.outer(size, size))[0])  # no pivot is smaller, in any order
+        return cls(
+            tuple(rows), added, scale if added else 1.0, 10.0 ** np.floor(np.log10(max(NEAR * smallest, ROUNDING)))
+        )
 
 
 def _is_zero(form: Form) -> bool:
@@ -262,52 +339,54 @@ def _only(form: Form) -> int:
     return quantity
 
 
-def rows_for_mass(mass: Array, rows: Array, name: str) -> tuple[tuple[int, ...], float]:
-    """Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
+def _independent(G: Array) -> list[int]:
+    """The first rows that no rows before add up to."""
+    kept: list[int] = []
+    basis = np.zeros((0, G.shape[1]))
+    for k, row in enumerate(G):
+        rest = row - (basis @ row) @ basis
+        rest -= (basis @ rest) @ basis
+        if np.linalg.norm(rest) > RANK * np.linalg.norm(row):
+            kept.append(k)
+            basis = np.vstack([basis, rest / np.linalg.norm(rest)])
+    return kept
 
-    Raises
-    ------
-    Untraceable
-        If there are none, or rows depend on one another.
-    """
-    if rows.size and np.linalg.svd(rows, compute_uv=False)[-1] < RANK * np.abs(rows).max():
-        raise Untraceable(f"the constraints of {name!r} depend on one another")
-    chosen: list[int] = []
-    scale = 1.0
-    if rows.size:
-        scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(rows).max() ** 2)))
-    sizes = np.count_nonzero(rows, axis=1)
+
+def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int, ...]:
+    """Rows of G with which M is definite, those of few entries first."""
+    added: list[int] = []
     while True:
         values, vectors = np.linalg.eigh(mass)
-        if values[0] > SINGULAR_MASS * values[-1]:
-            return tuple(chosen), scale
-        weak = vectors[:, values < SINGULAR_MASS * values[-1]]
-        helps = np.linalg.norm(rows @ weak, axis=1) > SINGULAR_MASS ** 0.5 * np.abs(rows).max(axis=1, initial=0.0)
-        free = [k for k in np.argsort(sizes, kind="stable").tolist() if helps[k] and k not in chosen]
+        weak = values < SINGULAR_MASS * values[-1]
+        if not weak.any():
+            return tuple(added)
+        helps = np.linalg.norm(G @ vectors[:, weak], axis=1) > SINGULAR_MASS**0.5 * np.linalg.norm(G, axis=1)
+        free = [k for k in np.argsort(np.count_nonzero(G, axis=1), kind="stable") if helps[k] and k not in added]
         if not free:
-            raise Untraceable(f"the mass matrix of {name!r} stays singular with constraints added")
-        chosen.append(free[0])
-        mass = mass + scale * np.outer(rows[free[0]], rows[free[0]])
+            raise Untraceable(f"the mass of {name!r} stays singular with constraints added")
+        added.append(int(free[0]))
+        mass = mass + scale * np.outer(G[free[0]], G[free[0]])
 
 
 class Derivative:
     """Derivatives of quantities along a direction in which the inputs change, by the rules of differentiation."""
 
-    def __init__(self, graph: Graph, direction: dict[int, Any]):
+    def __init__(self, graph: Graph, direction: dict[int, Form]):
         self.graph = graph
-        self._known: dict[int, Any] = dict(direction)
+        self._known = dict(direction)
 
     def of(self, form: Form) -> Form:
         """The derivative of a form."""
         total = Form(self.graph, 0.0, {})
         for i, c in form.terms.items():
-            total = total + self._of_quantity(i) * c
+            total = total + self._of_quantity(i).times(c)
         return total
 
-    def _of_quantity(self, i: int) -> Any:
+    def _of_quantity(self, i: int) -> Form:
         if i not in self._known:
             operation = self.graph.operations[i]
-            self._known[i] = 0.0 if operation is None else self._of_operation(i, *operation).value()
+            change = Form(self.graph, 0.0, {}) if operation is None else self._of_operation(i, *operation)
+            self._known[i] = change.value()
         return self._known[i]
 
     def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:

@@ -21,7 +21,15 @@ SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M m
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
-def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any, straight: bool = False) -> common.Kit:
+def kit_of(
+    system: ConstrainedSystem,
+    t0: float,
+    q0: Array,
+    step: Any = None,
+    first: Any = None,
+    second: Any = None,
+    straight: bool = False,
+) -> common.Kit:
     """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and steps.
 
     `straight`: the inner loop is code made for the system.
@@ -45,8 +53,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, *steps: Any, straigh
     inner = inner_loop
     if straight:
         inner, flags[common.STRAIGHT] = straight_inner(system, t0, q0), 1
-    steps = (*steps, *[None] * (3 - len(steps)))
-    return common.Kit(system.functions._replace(flags=flags), inner, *steps, inner_loop)
+    return common.Kit(system.functions._replace(flags=flags), inner, step, first, second, inner_loop)
 
 
 def workspace(

@@ -22,7 +22,7 @@ from twoloop.kernels.common import (
     STEP,
     kernel,
 )
-from twoloop.kernels.explicit import ESTIMATED, INNER_TOL, STAGE, _error, _move, _slopes, _tableau, _vector
+from twoloop.kernels.explicit import COARSE, FINE, INNER_TOL, STAGE, _error, _move, _slopes, _tableau, _vector
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import keep_predicted
 
@@ -36,26 +36,26 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, y, y1 = state[:n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    stage, estimate = _vector(memory, n, STAGE), _vector(memory, n, ESTIMATED)
+    stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes, q_stage = _slopes(memory, s, n), stage[:n]
     w.counters[N_OUTER] += 1
     code = renew_partition(f, w, t, q)
     pivot = w.notes[PIVOT] if code == DONE else 0.0
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _move(y, h, A[j, :j], slopes, stage)
-        copy(stage[n:], slopes[j, :n])
+        _move(y, h, A[j, :j], slopes, stage, stage)
+        copy(stage[n : 2 * n], slopes[j, :n])
         code = renew_partition(f, w, t + c[j] * h, q_stage)
         if code == DONE:
             code = find_tangents(f, w, t + c[j] * h, q_stage)
         if code == DONE:
-            code = accelerations(f, w, t + c[j] * h, q_stage, slopes[j, :n], slopes[j, n:], w.lam)
+            code = accelerations(f, w, t + c[j] * h, q_stage, slopes[j, :n], slopes[j, n : 2 * n], w.lam)
         if code != DONE:
             return code, np.inf
-    _move(y, h, b, slopes, y1)
+    _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, estimate)
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other)
         if not error <= 1.0:
             return DONE, error
     code = renew_partition(f, w, t + h, q1)

@@ -155,8 +155,9 @@ def _type_of_work(value: Any, context: Any) -> Any:
     MASS_SCALE,  # s of the augmented matrix, see augmented.py
     FACTORED,  # 1: its factors belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
+    BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
     N_NOTES,
-) = range(23)
+) = range(24)
 
 # what a kernel returns: DONE, or why it could not
 (

@@ -120,12 +120,14 @@ def _move(y, h, weights, slopes, total, y1):
 
 
 @compiled
-def _error(tolerances, h, y, y1, fine, coarse):
+def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other):
     """e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
 
     Each is h times an estimate over atol + rtol |y|. Taken component by component e^2 / sqrt(e^2 + d^2) would be e, of
     low order, where d passes through zero: up to 30 % more evaluations.
     """
+    _weighted(fine, slopes, one)
+    _weighted(coarse, slopes, other)
     n = y.size // 2
     rtol = tolerances[RTOL]
     e = e_v = d = d_v = 0.0
@@ -133,8 +135,8 @@ def _error(tolerances, h, y, y1, fine, coarse):
         k, atol = n + m, tolerances[ATOL + m]
         share = h / (atol + rtol * max(abs(y[m]), abs(y1[m])))
         share_v = h / (atol + rtol * max(abs(y[k]), abs(y1[k])))
-        e, e_v = max(e, abs(fine[m] * share)), max(e_v, abs(fine[k] * share_v))
-        d, d_v = max(d, abs(coarse[m] * share)), max(d_v, abs(coarse[k] * share_v))
+        e, e_v = max(e, abs(one[m] * share)), max(e_v, abs(one[k] * share_v))
+        d, d_v = max(d, abs(other[m] * share)), max(d_v, abs(other[k] * share_v))
     e, d = max(e, e_v), max(d, d_v)
     return e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
@@ -146,7 +148,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    stage, first, second = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
+    stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
     # near a singular position it matters on which side of it a stage is, and how well velocities keep to the rows
     free = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] == 0.0
@@ -165,9 +167,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        _weighted(fine, slopes, first)
-        _weighted(coarse, slopes, second)
-        error = _error(tolerances, h, y, y1, first, second)
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other)
         if not error <= 1.0:
             return DONE, error
     keep_predicted(w, q1)
