@@ -41,8 +41,6 @@ class Adams:
     of the polynomials are found by Gauss quadrature with eight nodes, which is exact for them.
     """
 
-    compiled: bool = False
-
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
@@ -72,5 +70,5 @@ class Adams:
             factor_min=0.1,
             factor_max=kernels.START_GROWTH,
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
-            straight=self.compiled,
+            compilable=True,
         )

@@ -55,7 +55,6 @@ class DOP853:
 
     stages: Literal["free", "restored"] = "free"
     inner_tol: float | None = None
-    compiled: bool = False
 
     def __post_init__(self) -> None:
         check_choice("stages", self.stages, ("free", "restored"))
@@ -93,6 +92,6 @@ class DOP853:
             watchful=free,
             least_error=LEAST_ERROR,
             stable_to=lambda memory: STABLE_TO,
-            straight=self.compiled,
+            compilable=free,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )

@@ -44,7 +44,8 @@ class Plan:
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
-    straight: bool = False  # whether the inner loop is to be code made for the mechanism
+    compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism ...
+    compiled: bool = False  # ... and whether it is to be
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
 
 

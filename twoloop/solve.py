@@ -54,6 +54,7 @@ def solve_dae(
     progress: bool | None = None,
     time_limit: float | None = None,
     check_derivatives: bool = True,
+    compiled: bool = False,
 ) -> Result:
     """Integrate a constrained mechanical system by a two-loop procedure.
 
@@ -112,6 +113,11 @@ def solve_dae(
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences, at the first start of a system and at a few
         states of every run, outside the time that `stats.cpu_time` counts.
+    compiled : bool
+        Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
+        "DOP853" and "Adams": two to eight times as fast, after 0.1 to 0.5 s (spatial mechanisms: 1 to 5 s), once for
+        the same equations and parameters, as the code is kept on disk. It takes compiled callbacks that do not branch on
+        t, q or v; what near a singular position cannot be trusted to it is computed as without.
 
     Returns
     -------
@@ -129,6 +135,7 @@ def solve_dae(
     event_functions = None if events is None else check_events(events)
     if progress is not None:
         check_flag("progress", progress)
+    check_flag("compiled", compiled)
     check_flag("check_derivatives", check_derivatives)
     chosen = check_method(method)
     t0, t1 = check_span(t_span)
@@ -165,7 +172,9 @@ def solve_dae(
     if hasattr(chosen, "for_system"):
         chosen = chosen.for_system(system)
     plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-    interior = plan.interior
+    if compiled and not plan.compilable:
+        raise ValueError(f"compiled=True goes with 'auto', 'Taylor', 'DOP853' and 'Adams'; given method {chosen.name}")
+    plan, interior = replace(plan, compiled=compiled), plan.interior
     if plan.parts > 1 and interior is None:
         interior = chosen.plan(system.n_q, float(rtol), float(atol.min()), True)
     run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interior)

@@ -33,6 +33,7 @@ from twoloop.tracing import (
     SQUARE_ROOT,
     SUM,
     Form,
+    Graph,
     Untraceable,
 )
 
@@ -103,29 +104,29 @@ def _place(builder: Any, pointer: Any, i: int) -> Any:
     return builder.gep(pointer, [ir.Constant(ir.IntType(64), i)], inbounds=True)
 
 
-def _code(equations: StraightLine, outputs: Outputs) -> Any:
-    """A function of t, q, v and a tuple of arrays to fill, for code that numba compiles.
+def function_of(graph: Graph, outputs: Outputs) -> Any:
+    """A function of the inputs, a tuple of numbers and vectors, and of vectors to fill, for code that numba compiles.
 
-    It returns whether the conditions hold and what it computes is finite, and fills the arrays only then.
+    It returns whether the conditions hold and what it computes is finite, and fills the vectors only then.
     """
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        t, q, v, filled = arguments
-        emitter = Emitter(builder)
-        n = equations.system.n_q
-        emitter.set_value(0, t)
-        for first, array in ((1, q), (1 + n, v)):
-            pointer = _pointer(context, builder, array)
-            for j in range(n):
-                emitter.set_value(first + j, builder.load(_place(builder, pointer, j)))
-        for i in outputs.quantities(equations.graph):
-            operation = equations.graph.operations[i]
+        given, filled = arguments
+        emitter, first = Emitter(builder), 0
+        for k, (kind, size) in enumerate(zip(signature.args[0], graph.sizes, strict=True)):
+            value = builder.extract_value(given, k)
+            for j in range(size):
+                place = _place(builder, _pointer(context, builder, value), j) if kind == VECTOR else None
+                emitter.set_value(first + j, value if place is None else builder.load(place))
+            first += size
+        for i in outputs.quantities(graph):
+            operation = graph.operations[i]
             assert operation is not None
             emitter.operation(i, *operation)
         zero: Any = ir.Constant(DOUBLE, 0.0)
         total, holds = zero, ir.Constant(ir.IntType(1), 1)
         results = {name: [emitter.form(form) for form in forms] for name, forms in outputs.arrays.items()}
-        for value in results.get("a") or results["moved"]:  # what is not finite becomes NaN
+        for value in next(iter(results.values())):  # what is not finite becomes NaN
             total = builder.fadd(total, builder.fmul(value, zero, flags=FLAGS), flags=FLAGS)
         holds = builder.fcmp_ordered("==", total, zero)
         for one, other in outputs.conditions:
@@ -138,10 +139,10 @@ def _code(equations: StraightLine, outputs: Outputs) -> Any:
         return holds
 
     @intrinsic
-    def straight(typing: Any, t: Any, q: Any, v: Any, arrays: Any) -> Any:
-        return types.boolean(t, q, v, arrays), emit
+    def function(typing: Any, given: Any, filled: Any) -> Any:
+        return types.boolean(given, filled), emit
 
-    return straight
+    return function
 
 
 def straight_inner(system: ConstrainedSystem, t0: float, q0: Array) -> Dispatcher:
@@ -194,33 +195,35 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
     from twoloop.kernels.projection import ABOVE_ROUNDING
     from twoloop.linking import KernelCompiler
 
-    there, EVALUATE_THERE, PROJECT = _code(equations, equations.there), calls.EVALUATE_THERE, calls.PROJECT
+    there = function_of(equations.graph, equations.there)
+    EVALUATE_THERE, PROJECT = calls.EVALUATE_THERE, calls.PROJECT
     if equations.closer is None or equations.nearer is None:
 
         def evaluating(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
             if task == EVALUATE_THERE:
                 w.counters[N_EVALUATIONS] += 1
                 w.counters[N_FACTORIZATIONS] += 1
-                if there(t, q, v, (a,)):
+                if there((t, q, v), (a,)):
                     return DONE
+            w.notes[BY_GENERAL] = 1.0
             return f.general(f, w, task, t, q, v, theta, a, lam)
 
         return compile_kept(evaluating, INNER, watched, pipeline_class=KernelCompiler, **OPTIONS)
 
-    closer, nearer = _code(equations, equations.closer), _code(equations, equations.nearer)
+    closer, nearer = (function_of(equations.graph, each) for each in (equations.closer, equations.nearer))
 
     def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
         if task == EVALUATE_THERE:
             w.counters[N_EVALUATIONS] += 1
             w.counters[N_FACTORIZATIONS] += 1
-            if there(t, q, v, (a,)):
+            if there((t, q, v), (a,)):
                 return DONE
         elif task == PROJECT:
             least, before = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED]), np.inf
             for k in range(MAX_INNER):
                 w.counters[N_INNER] += 1
                 w.counters[N_FACTORIZATIONS] += 1
-                fine = closer(t, q, v, (q, w.x)) if k == 0 else nearer(t, q, v, (q, w.x, v, a, lam))
+                fine = closer((t, q, v), (w.x, q)) if k == 0 else nearer((t, q, v), (a, w.x, q, v, lam))
                 if not fine:
                     break
                 moved = 0.0

@@ -76,13 +76,17 @@ class Outputs:
         return sorted(found)
 
 
+# the place, the reciprocal of the pivot, and the entries of L below it
+Column = tuple[int, Form, list[tuple[int, Form]]]
+
+
 class Factors:
     """L D L^T of a symmetric matrix of forms, by an order that a definite matrix of this pattern allows.
 
     Attributes
     ----------
-    columns : list of (int, Form, list of (int, Form))
-        In the order of elimination: the place, the reciprocal of its pivot, and the entries of L below it.
+    columns : list of Column
+        In the order of elimination.
     pivots : list of (Form, Form)
         Of the last rows, from `n` on: the pivot, and what it is without those among them, both as positive numbers.
     """
@@ -91,7 +95,7 @@ class Factors:
         rows: list[dict[int, Form]] = [{} for _ in range(size)]
         for (i, j), value in matrix.items():
             rows[i][j] = value
-        self.columns: list[tuple[int, Form, list[tuple[int, Form]]]] = []
+        self.columns: list[Column] = []
         self.pivots: list[tuple[Form, Form]] = []
         alone: dict[int, Any] = {}
         for i in _order(rows, n):
@@ -112,17 +116,22 @@ class Factors:
 
     def solve(self, right: Sequence[Form]) -> list[Form]:
         """The solution for a right-hand side."""
-        solution = list(right)
-        for i, _, column in self.columns:
-            solution[i] = solution[i].value()
-            for j, multiple in column:
-                solution[j] = solution[j] - multiple * solution[i]
-        for i, inverse, column in reversed(self.columns):
-            total = solution[i] * inverse
-            for j, multiple in column:
-                total = total - multiple * solution[j]
-            solution[i] = total.value()
-        return solution
+        return solve(self.columns, right)
+
+
+def solve(columns: Sequence[Column], right: Sequence[Form]) -> list[Form]:
+    """The solution for a right-hand side, by the columns of the factors."""
+    solution = list(right)
+    for i, _, column in columns:
+        solution[i] = solution[i].value()
+        for j, multiple in column:
+            solution[j] = solution[j] - multiple * solution[i]
+    for i, inverse, column in reversed(columns):
+        total = solution[i] * inverse
+        for j, multiple in column:
+            total = total - multiple * solution[j]
+        solution[i] = total.value()
+    return solution
 
 
 def _order(rows: list[dict[int, Form]], n: int) -> list[int]:
@@ -257,10 +266,10 @@ class StraightLine:
         change = self.factors.solve([*([self.nothing] * n), *faster])[:n]
         v = [(one + other).value() for one, other in zip(self.v, change, strict=True)]
         solution = self._accelerations(v)
-        position = {"q": [one + other for one, other in zip(self.q, moved, strict=True)], "moved": moved}
+        position = {"moved": moved, "q": [one + other for one, other in zip(self.q, moved, strict=True)]}
         self.closer = Outputs(position, self.conditions)
         lam = self._of_least_norm(solution[n:])
-        self.nearer = Outputs({**position, "v": v, "a": solution[:n], "lam": lam}, self.conditions)
+        self.nearer = Outputs({"a": solution[:n], **position, "v": v, "lam": lam}, self.conditions)
 
     def _of_least_norm(self, known: Sequence[Form]) -> list[Form]:
         """Multipliers of all rows from those of the rows that count.
@@ -285,6 +294,45 @@ class StraightLine:
             for k, x in zip(rows, one, strict=True):
                 lam[k] = lam[k] + part * x
         return lam
+
+
+class Solution:
+    """M a + G^T lam = r with G a = c, by the factors of a position that are kept.
+
+    Attributes
+    ----------
+    kept : Outputs
+        Of the equations: what is to be kept.
+    graph : Graph
+        Its inputs are r (n_q,), c (n_c + n_a,) and what was kept.
+    solved : Outputs
+        "a" (n_q,) and "lam" (n_c + n_a,); 0 for rows that do not count.
+    """
+
+    def __init__(self, equations: StraightLine):
+        factors, choice = equations.factors, equations.choice
+        added = [form for k in choice.added for form in equations.all_rows[k]]
+        forms = [
+            *added,
+            *(form for _, inverse, column in factors.columns for form in (inverse, *(x for _, x in column))),
+        ]
+        known = sorted({i for form in forms for i in form.terms})
+        self.kept = Outputs({"kept": [Form(equations.graph, 0.0, {i: 1.0}) for i in known]}, equations.conditions)
+        self.graph, n = Graph(), equations.system.n_q
+        r, c = self.graph.inputs(n, False), self.graph.inputs(len(equations.all_rows), False)
+        places = dict(zip(known, (_only(form) for form in self.graph.inputs(len(known), False)), strict=True))
+
+        def here(form: Form) -> Form:
+            return Form(self.graph, form.constant, {places[i]: x for i, x in form.terms.items()})
+
+        for k in choice.added:
+            r = [one + (here(x) * c[k]).times(choice.scale) for one, x in zip(r, equations.all_rows[k], strict=True)]
+        columns = [(i, here(inverse), [(j, here(x)) for j, x in column]) for i, inverse, column in factors.columns]
+        solution = solve(columns, [*r, *(c[k] for k in choice.rows)])
+        lam = [Form(self.graph, 0.0, {})] * len(c)
+        for k, value in zip(choice.rows, solution[n:], strict=True):
+            lam[k] = value
+        self.solved = Outputs({"a": solution[:n], "lam": lam}, [])
 
 
 @dataclass(frozen=True)

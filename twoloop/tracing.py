@@ -24,9 +24,13 @@ class Untraceable(ValueError):
 
 
 class Graph:
-    """Quantities, numbered from 0; `operations[i]` is None for an input, else (kind, first form, second form)."""
+    """Quantities, numbered from 0; `operations[i]` is None for an input, else (kind, first form, second form).
+
+    `sizes`: how many inputs were made at a time.
+    """
 
     def __init__(self) -> None:
+        self.sizes: list[int] = []
         self.operations: list[tuple[int, Form, Form | None] | None] = []
         self.late: list[bool] = []  # whether a quantity depends on more than time and coordinates
         self._known: dict[Any, int] = {}
@@ -34,6 +38,7 @@ class Graph:
     def inputs(self, n: int, late: bool) -> list["Form"]:
         """New quantities that are given, as forms."""
         first = len(self.operations)
+        self.sizes.append(n)
         self.operations += [None] * n
         self.late += [late] * n
         return [Form(self, 0.0, {first + i: 1.0}) for i in range(n)]

@@ -28,11 +28,11 @@ def kit_of(
     step: Any = None,
     first: Any = None,
     second: Any = None,
-    straight: bool = False,
+    compiled: bool = False,
 ) -> common.Kit:
     """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and steps.
 
-    `straight`: the inner loop is code made for the system.
+    `compiled`: the inner loop is code made for the system.
     """
     from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
 
@@ -51,7 +51,7 @@ def kit_of(
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
     inner = inner_loop
-    if straight:
+    if compiled:
         inner, flags[common.STRAIGHT] = straight_inner(system, t0, q0), 1
     return common.Kit(system.functions._replace(flags=flags), inner, step, first, second, inner_loop)
 
