@@ -14,7 +14,7 @@ M is singular, rows g of G are added, M + g^T g, which changes neither. Of redun
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +76,12 @@ class Outputs:
         return sorted(found)
 
 
-# the place, the reciprocal of the pivot, and the entries of L below it
-Column = tuple[int, Form, list[tuple[int, Form]]]
+class Block(NamedTuple):
+    """One or two places that are eliminated together, which takes one division."""
+
+    places: tuple[int, ...]
+    inverse: list[list[Form]]  # of the pivots
+    below: list[tuple[int, list[Form]]]  # rows of L
 
 
 class Factors:
@@ -85,67 +89,97 @@ class Factors:
 
     Attributes
     ----------
-    columns : list of Column
+    blocks : list of Block
         In the order of elimination.
-    pivots : list of (Form, Form)
-        Of the last rows, from `n` on: the pivot, and what it is without those among them, both as positive numbers.
+    conditions : list of (Form, Form)
+        Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Form], size: int, n: int):
         rows: list[dict[int, Form]] = [{} for _ in range(size)]
         for (i, j), value in matrix.items():
             rows[i][j] = value
-        self.columns: list[Column] = []
-        self.pivots: list[tuple[Form, Form]] = []
+        self.blocks: list[Block] = []
+        self.conditions: list[tuple[Form, Form]] = []
         alone: dict[int, Any] = {}
-        for i in _order(rows, n):
-            pivot = rows[i].pop(i).value()
-            if i >= n:
-                self.pivots.append((-pivot, -alone[i].value()))
-            inverse = pivot.reciprocal()
-            entries = [(j, value.value()) for j, value in rows[i].items()]
-            column = [(j, (value * inverse).value()) for j, value in entries]
-            for j, multiple in column:
-                for k, value in entries:
-                    change = multiple * value
-                    if i < n <= j == k:
+        for places in _order(rows, n):
+            pivots = [[rows[i].pop(j).value() for j in places] for i in places]
+            inverse = self._inverse(pivots, [alone.get(i) for i in places])
+            entries = [(j, [rows[i][j].value() for i in places]) for j in rows[places[0]]]
+            below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
+            for j, multiples in below:
+                for k, values in entries:
+                    change = _dot(multiples, values)
+                    if j == k >= n > places[0]:
                         alone[j] = alone.get(j, 0.0) - change
                     rows[j][k] = rows[j][k] - change if k in rows[j] else -change
-                del rows[j][i]
-            self.columns.append((i, inverse, column))
+                for i in places:
+                    del rows[j][i]
+            self.blocks.append(Block(places, inverse, below))
+
+    def _inverse(self, pivots: list[list[Form]], alone: list[Any]) -> list[list[Form]]:
+        """The inverse of one or two pivots; of rows of G, conditions too."""
+        own = [None if each is None else each.value() for each in alone]
+        a = pivots[0][0]
+        if own[0] is not None:
+            self.conditions.append((-a, -own[0]))
+        if len(pivots) == 1:
+            return [[a.reciprocal()]]
+        b, c = pivots[0][1], pivots[1][1]
+        determinant = (a * c - b * b).value()
+        if own[1] is not None:
+            self.conditions.append((determinant, (a * own[1]).value()))
+        inverse = determinant.reciprocal()
+        return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
     def solve(self, right: Sequence[Form]) -> list[Form]:
         """The solution for a right-hand side."""
-        return solve(self.columns, right)
+        return solve(self.blocks, right)
 
 
-def solve(columns: Sequence[Column], right: Sequence[Form]) -> list[Form]:
-    """The solution for a right-hand side, by the columns of the factors."""
+def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
+    total = one[0] * other[0]
+    for x, y in zip(one[1:], other[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def solve(blocks: Sequence[Block], right: Sequence[Form]) -> list[Form]:
+    """The solution for a right-hand side."""
     solution = list(right)
-    for i, _, column in columns:
-        solution[i] = solution[i].value()
-        for j, multiple in column:
-            solution[j] = solution[j] - multiple * solution[i]
-    for i, inverse, column in reversed(columns):
-        total = solution[i] * inverse
-        for j, multiple in column:
-            total = total - multiple * solution[j]
-        solution[i] = total.value()
+    for places, _, below in blocks:
+        for i in places:
+            solution[i] = solution[i].value()
+        for j, multiples in below:
+            solution[j] = solution[j] - _dot(multiples, [solution[i] for i in places])
+    for places, inverse, below in reversed(blocks):
+        known = [solution[i] for i in places]
+        for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
+            total = _dot(row, known)
+            for j, multiples in below:
+                total = total - multiples[place] * solution[j]
+            solution[i] = total.value()
     return solution
 
 
-def _order(rows: list[dict[int, Form]], n: int) -> list[int]:
-    """Least degree first; a row from n on only after all that it has below n."""
+def _order(rows: list[dict[int, Form]], n: int) -> list[tuple[int, ...]]:
+    """Least degree first; a row from n on only after all that it has below n; in pairs where their neighbours agree.
+
+    Among equals those first that wait for the fewest divisions: what does not depend on one another runs side by side.
+    """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
-    left, order = set(range(len(rows))), []
+    left, order, depth = set(range(len(rows))), [], [0] * len(rows)
     while left:
-        i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), j))
-        left.remove(i)
-        order.append(i)
-        for j in neighbours[i]:
-            neighbours[j] = (neighbours[j] | neighbours[i]) - {i, j}
-            waits[j].discard(i)
+        i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
+        alike = [j for j in neighbours[i] if neighbours[j] | {j} == neighbours[i] | {i} and (j < n) == (i < n)]
+        places = (i, *sorted(alike)[:1])
+        order.append(places)
+        left -= set(places)
+        for j in neighbours[i] - set(places):
+            neighbours[j] = (neighbours[j] | neighbours[i]) - {*places, j}
+            waits[j] -= set(places)
+            depth[j] = max(depth[j], depth[i] + 1)
     return order
 
 
@@ -192,7 +226,7 @@ class StraightLine:
         self.all_rows, counting = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
-        self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.pivots]
+        self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
         self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions)
         self.closer: Outputs | None = None
         self.nearer: Outputs | None = None
@@ -312,10 +346,8 @@ class Solution:
     def __init__(self, equations: StraightLine):
         factors, choice = equations.factors, equations.choice
         added = [form for k in choice.added for form in equations.all_rows[k]]
-        forms = [
-            *added,
-            *(form for _, inverse, column in factors.columns for form in (inverse, *(x for _, x in column))),
-        ]
+        forms = [*added, *(form for block in factors.blocks for row in block.inverse for form in row)]
+        forms += [form for block in factors.blocks for _, row in block.below for form in row]
         known = sorted({i for form in forms for i in form.terms})
         self.kept = Outputs({"kept": [Form(equations.graph, 0.0, {i: 1.0}) for i in known]}, equations.conditions)
         self.graph, n = Graph(), equations.system.n_q
@@ -327,8 +359,13 @@ class Solution:
 
         for k in choice.added:
             r = [one + (here(x) * c[k]).times(choice.scale) for one, x in zip(r, equations.all_rows[k], strict=True)]
-        columns = [(i, here(inverse), [(j, here(x)) for j, x in column]) for i, inverse, column in factors.columns]
-        solution = solve(columns, [*r, *(c[k] for k in choice.rows)])
+        blocks = [
+            Block(
+                places, [[here(x) for x in row] for row in inverse], [(j, [here(x) for x in row]) for j, row in below]
+            )
+            for places, inverse, below in factors.blocks
+        ]
+        solution = solve(blocks, [*r, *(c[k] for k in choice.rows)])
         lam = [Form(self.graph, 0.0, {})] * len(c)
         for k, value in zip(choice.rows, solution[n:], strict=True):
             lam[k] = value
