@@ -39,9 +39,30 @@ from twoloop.tracing import (
 
 Array = NDArray[np.float64]
 
-DOUBLE = ir.DoubleType()
+DOUBLE, INTEGER = ir.DoubleType(), ir.IntType(64)
 FLAGS = ("contract", "reassoc", "nsz", "arcp")  # those of the kernels
-FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", SINE: "sin", COSINE: "cos", LOGARITHM: "log"}
+FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log"}
+
+# sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
+# sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
+LARGEST_ANGLE = 1e6  # beyond, the sum is not enough
+HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
+SINES = (
+    -1.66666666666666307295e-1,
+    8.33333333332211858878e-3,
+    -1.98412698295895385996e-4,
+    2.75573136213857245213e-6,
+    -2.50507477628578072866e-8,
+    1.58962301576546568060e-10,
+)
+COSINES = (
+    4.16666666666665929218e-2,
+    -1.38888888888730564116e-3,
+    2.48015872888517045348e-5,
+    -2.75573141792967388112e-7,
+    2.08757008419747316778e-9,
+    -1.13585365213876817300e-11,
+)
 
 
 class Emitter:
@@ -49,8 +70,10 @@ class Emitter:
 
     def __init__(self, builder: Any):
         self.builder = builder
+        self.angles: list[Any] = []  # absolute values
         self._values: dict[int, Any] = {}
         self._forms: dict[Any, Any] = {}
+        self._pairs: dict[Any, tuple[Any, Any]] = {}
 
     def set_value(self, quantity: int, value: Any) -> None:
         """What a quantity is."""
@@ -88,12 +111,47 @@ class Emitter:
             value = x
         elif kind == RECIPROCAL:
             value = b.fdiv(ir.Constant(DOUBLE, 1.0), x, flags=FLAGS)
+        elif kind in (SINE, COSINE):
+            if first.key not in self._pairs:
+                self._pairs[first.key] = self._sine_and_cosine(x)
+            value = self._pairs[first.key][kind == COSINE]
         elif kind == ARCTANGENT:
             kind_of_function = ir.FunctionType(DOUBLE, [DOUBLE])
             value = b.call(cgutils.get_or_insert_function(b.module, kind_of_function, "atan"), [x])
         else:
             value = b.call(b.module.declare_intrinsic(f"llvm.{FUNCTIONS[kind]}", [DOUBLE]), [x])
         self._values[quantity] = value
+
+    def _sine_and_cosine(self, x: Any) -> tuple[Any, Any]:
+        """Both for an angle up to LARGEST_ANGLE: without a call, so that those of several angles run side by side."""
+        b = self.builder
+
+        def function(name: str, y: Any) -> Any:
+            return b.call(b.module.declare_intrinsic(f"llvm.{name}", [DOUBLE]), [y])
+
+        def polynomial(square: Any, coefficients: tuple[float, ...]) -> Any:
+            total: Any = DOUBLE(coefficients[-1])
+            for coefficient in reversed(coefficients[:-1]):
+                total = b.fma(total, square, DOUBLE(coefficient))
+            return total
+
+        self.angles.append(function("fabs", x))
+        turns = function("rint", b.fmul(x, DOUBLE(1.0 / HALF_PI[0])))
+        rest = x
+        for part in HALF_PI:
+            rest = b.fma(turns, DOUBLE(-part), rest)
+        square = b.fmul(rest, rest)
+        sine = b.fma(b.fmul(square, rest), polynomial(square, SINES), rest)
+        cosine = b.fma(square, DOUBLE(-0.5), DOUBLE(1.0))
+        cosine = b.fma(b.fmul(square, square), polynomial(square, COSINES), cosine)
+        quarter = b.fptosi(turns, INTEGER)
+        odd = b.trunc(quarter, ir.IntType(1))
+        signs = [b.shl(b.and_(number, INTEGER(2)), INTEGER(62)) for number in (quarter, b.add(quarter, INTEGER(1)))]
+        made = [
+            b.bitcast(b.xor(b.bitcast(b.select(odd, one, other), INTEGER), sign), DOUBLE)
+            for one, other, sign in ((cosine, sine, signs[0]), (sine, cosine, signs[1]))
+        ]
+        return made[0], made[1]
 
 
 def _pointer(context: Any, builder: Any, value: Any) -> Any:
@@ -131,6 +189,8 @@ def function_of(graph: Graph, outputs: Outputs) -> Any:
         holds = builder.fcmp_ordered("==", total, zero)
         for one, other in outputs.conditions:
             holds = builder.and_(holds, builder.fcmp_ordered(">", emitter.form(one), emitter.form(other)))
+        for angle in emitter.angles:
+            holds = builder.and_(holds, builder.fcmp_ordered("<", angle, DOUBLE(LARGEST_ANGLE)))
         with builder.if_then(holds):
             for k, values in enumerate(results.values()):
                 pointer = _pointer(context, builder, builder.extract_value(filled, k))
