@@ -172,7 +172,8 @@ def _order(rows: list[dict[int, Form]], n: int) -> list[tuple[int, ...]]:
     left, order, depth = set(range(len(rows))), [], [0] * len(rows)
     while left:
         i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
-        alike = [j for j in neighbours[i] if neighbours[j] | {j} == neighbours[i] | {i} and (j < n) == (i < n)]
+        ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
+        alike = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
         places = (i, *sorted(alike)[:1])
         order.append(places)
         left -= set(places)

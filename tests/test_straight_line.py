@@ -1,0 +1,368 @@
+"""Code made for the equations of one mechanism: against the general inner loop, dense linear algebra and references."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+
+from tests.problems import pendulum, worst
+from twoloop import ConstrainedSystem, ConstraintWarning, callback
+from twoloop.kernels import calls
+from twoloop.kernels.common import DONE
+from twoloop.mechanisms import (
+    andrews,
+    bricard,
+    driven_crank,
+    four_bar,
+    governor,
+    heavy_top,
+    knife_edge,
+    redundant_slider_crank,
+    rolling_disc,
+    spatial_four_bar,
+)
+from twoloop.methods import PRESETS
+from twoloop.run import Run
+from twoloop.solve import solve_dae
+from twoloop.straight_code import LARGEST_ANGLE, function_of
+from twoloop.straight_line import Choice, Derivative, Factors, Outputs, Solution, StraightLine
+from twoloop.tracing import Form, Graph
+
+MECHANISMS = [
+    four_bar,
+    andrews,
+    driven_crank,
+    heavy_top,
+    spatial_four_bar,
+    governor,
+    redundant_slider_crank,
+    bricard,
+    knife_edge,
+    rolling_disc,
+]
+ending_at_a_reference = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+
+
+@njit
+def _inner(f, w, task, t, q, v, theta, a, lam):
+    return f.inner(f, w, task, t, q, v, theta, a, lam)
+
+
+def inner(run, task, t, q, v):
+    """What an inner loop makes of a state: code, q, v, a and lam."""
+    q, v, a, lam = q.copy(), v.copy(), np.zeros_like(q), np.zeros(run.work.Rate.size)
+    return _inner(run.kit, run.work, task, t, q, v, 1e-14, a, lam), q, v, a, lam
+
+
+def run_of(problem, compiled):
+    plan = PRESETS["DOP853"].plan(problem.system.n_q, 1e-8, 1e-8, False)
+    n = problem.system.n_q
+    vars(plan)["compiled"] = compiled
+    return Run(problem.system, plan, 0.0, problem.q0, problem.v0, 1e-8, np.full(n, 1e-8), None)
+
+
+def compute(graph, outputs, inputs):
+    """What code for some outputs gives: whether its conditions hold, and the arrays."""
+    function = function_of(graph, outputs)
+    filled = tuple(np.full(len(forms), np.nan) for forms in outputs.arrays.values())
+
+    @njit
+    def call(inputs, filled):
+        return function(inputs, filled)
+
+    return call(inputs, filled), filled
+
+
+@ending_at_a_reference
+@pytest.mark.parametrize("make", MECHANISMS)
+def test_accelerations_off_the_constraints_are_those_of_the_general_inner_loop(make):
+    problem, rng = make(), np.random.default_rng(3)
+    general, own = (run_of(problem, compiled) for compiled in (False, True))
+    for _ in range(5):
+        q = problem.q0 + 1e-4 * rng.standard_normal(problem.q0.size)
+        v = problem.v0 + 1e-2 * rng.standard_normal(problem.q0.size)
+        if general.rank < general.work.Rate.size:  # off the constraints it matters which of redundant rows are kept
+            _, q, v, *_ = inner(general, calls.PROJECT, 0.1, q, v)
+        expected, known = (inner(run, calls.EVALUATE_THERE, 0.1, q, v) for run in (general, own))
+        assert known[0] == expected[0] == DONE
+        assert worst(known[3], expected[3]) < 1e-9 * max(1.0, np.abs(expected[3]).max())
+
+
+@ending_at_a_reference
+@pytest.mark.parametrize("make", [make for make in MECHANISMS if make not in (knife_edge, rolling_disc)])
+def test_a_state_is_moved_to_the_nearest_on_the_constraints(make):
+    problem, rng = make(), np.random.default_rng(4)
+    system, run = problem.system, run_of(problem, True)
+    q0 = problem.q0 + 1e-6 * rng.standard_normal(problem.q0.size)
+    v0 = problem.v0 + 1e-3 * rng.standard_normal(problem.q0.size)
+    code, q, v, a, lam = inner(run, calls.PROJECT, 0.0, q0, v0)
+    assert code == DONE and run.work.notes[-1] == 0.0  # not by the general inner loop
+    M, G = system.mass(0.0, q), system.jacobian(0.0, q)
+    assert np.abs(system.constraint(0.0, q)).max() < 1e-13 * max(1.0, np.abs(q).max())
+    assert np.abs(system.velocity_constraint(0.0, q, v)).max() < 1e-11 * max(1.0, np.abs(G).max() * np.abs(v).max())
+    # nearest in the metric of M: what was taken away is M^-1 G^T times something
+    tangents = np.linalg.svd(G)[2][run.rank :].T
+    for move, scale in ((q - q0, 1e-4), (v - v0, 1e-9)):
+        assert np.abs(tangents.T @ M @ move).max() < scale * np.abs(M @ move).max() + 1e-15
+    force = system.force(0.0, q, v)
+    size = max(1.0, np.abs(force).max(), np.abs(G.T @ lam).max())
+    assert np.abs(M @ a + G.T @ lam - force).max() < 1e-10 * size
+    if run.rank < len(lam):  # of least norm
+        unseen = np.linalg.svd(G.T)[2][run.rank :]
+        assert np.abs(unseen @ lam).max() < 1e-8 * np.abs(lam).max()
+
+
+@ending_at_a_reference
+@pytest.mark.parametrize("make", MECHANISMS)
+@pytest.mark.parametrize("method", ["DOP853", "Adams"])
+def test_a_run_ends_at_its_reference_by_as_many_evaluations(make, method):
+    problem = make()
+    known = problem.reference
+    span = (0.0, min(known.t, 10.0))
+    with_code, without = (
+        solve_dae(problem.system, span, problem.q0, problem.v0, method, 1e-9, 1e-9, compiled=compiled)
+        for compiled in (True, False)
+    )
+    assert with_code.success, with_code.message
+    error = np.nanmax(np.abs(with_code.q[:, -1] - known.q))
+    assert error < max(1e-8, 3.0 * np.nanmax(np.abs(without.q[:, -1] - known.q)))
+    assert with_code.stats.n_evaluations < 1.1 * without.stats.n_evaluations
+    for t, q in zip(with_code.t, with_code.q.T, strict=True):
+        assert np.abs(problem.system.constraint(t, q)).max(initial=0.0) < 1e-12
+
+
+def test_gamma_need_not_be_given():
+    runs = [
+        solve_dae(pendulum(gamma=gamma), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "DOP853", 1e-11, 1e-11, compiled=True)
+        for gamma in (True, False)
+    ]
+    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-12
+
+
+@ending_at_a_reference
+@pytest.mark.parametrize("make", [four_bar, driven_crank, spatial_four_bar, knife_edge])
+def test_gamma_from_the_rules_of_differentiation_is_that_of_the_formula(make):
+    problem = make()
+    system = problem.system
+    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
+    rows, kind = (
+        (equations.all_rows[system.n_c :], "nonholonomic") if system.n_a else (equations.all_rows, "constraint")
+    )
+    rates = equations._made(f"{kind}_rate", (len(rows),), equations.q)
+    made = equations._differentiated(rows, rates, equations.v)
+    holds, (gamma,) = compute(equations.graph, Outputs({"gamma": made}, []), (0.2, problem.q0, problem.v0))
+    given = system.nonholonomic_gamma if system.n_a else system.gamma
+    assert holds
+    assert worst(gamma, given(0.2, problem.q0, problem.v0)) < 1e-12 * max(1.0, np.abs(gamma).max())
+
+
+@pytest.mark.parametrize("make", [four_bar, andrews, heavy_top, spatial_four_bar, rolling_disc])
+def test_factors_that_are_kept_solve_for_any_right_hand_side(make):
+    problem, rng = make(), np.random.default_rng(5)
+    system = problem.system
+    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
+    solution = Solution(equations)
+    holds, (kept,) = compute(equations.graph, solution.kept, (0.0, problem.q0, problem.v0))
+    M, G = system.mass(0.0, problem.q0), system.rows(0.0, problem.q0)
+    r, c = rng.standard_normal(len(M)), rng.standard_normal(len(G))
+    _, (a, lam) = compute(solution.graph, solution.solved, (r, c, kept))
+    assert holds
+    assert np.abs(M @ a + G.T @ lam - r).max() < 1e-10 * np.abs(G.T @ lam).max()
+    assert np.abs(G @ a - c).max() < 1e-10
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 7), st.integers(0, 4), st.integers(0, 10**6))
+def test_elimination_solves_what_dense_linear_algebra_solves(n, m, seed):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((n, n)) * (rng.random((n, n)) < 0.4)
+    matrix = np.zeros((n + m, n + m))
+    matrix[:n, :n] = root @ root.T + np.diag(1.0 + rng.random(n))
+    G = np.eye(m, n)[:, rng.permutation(n)] * 2.0 + 0.3 * rng.standard_normal((m, n)) * (rng.random((m, n)) < 0.5)
+    m = min(m, n)
+    matrix, G = matrix[: n + m, : n + m], G[:m]
+    matrix[n:, :n], matrix[:n, n:] = G, G.T
+    graph = Graph()
+    given = graph.inputs(matrix.size, False)
+    right = graph.inputs(n + m, False)
+    forms = {
+        (i, j): given[i * (n + m) + j] for i in range(n + m) for j in range(n + m) if matrix[i, j] != 0.0 or i == j < n
+    }
+    factors = Factors(forms, n + m, n)
+    b = rng.standard_normal(n + m)
+    known = dict(enumerate(np.concatenate([matrix.ravel(), b]).tolist()))
+    x = [evaluated(form, known) for form in factors.solve(right)]
+    assert np.allclose(x, np.linalg.solve(matrix, b), rtol=1e-6, atol=1e-9)
+    assert len(factors.conditions) == m
+    shares = [evaluated(one, known) / evaluated(other, known) for one, other in factors.conditions]
+    assert all(0.0 < share < 1.0 + 1e-9 for share in shares)
+
+
+def evaluated(form, known):
+    """The number that a form of sums, products and quotients is."""
+    for i in Outputs({"": [form]}, []).quantities(form.graph):
+        kind, first, second = form.graph.operations[i]
+        x = first.constant + sum(c * known[j] for j, c in first.terms.items())
+        y = 1.0 if second is None else second.constant + sum(c * known[j] for j, c in second.terms.items())
+        known[i] = 1.0 / x if kind == 1 else x * y
+    return form.constant + sum(c * known[j] for j, c in form.terms.items())
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3, 0.9 * LARGEST_ANGLE])
+def test_sine_and_cosine_are_right_to_rounding(size):
+    graph = Graph()
+    (angle,) = graph.inputs(1, False)
+    outputs = Outputs({"of": [angle.sine(), angle.cosine()]}, [])
+    function = function_of(graph, outputs)
+
+    @njit
+    def both(angles, sines, cosines):
+        out = np.zeros(2)
+        for k in range(angles.size):
+            function((angles[k],), (out,))
+            sines[k], cosines[k] = out
+
+    rng = np.random.default_rng(6)
+    angles = np.concatenate([size * rng.uniform(-1.0, 1.0, 20_000), np.arange(-50, 51) * np.pi / 4.0])
+    sines, cosines = np.zeros_like(angles), np.zeros_like(angles)
+    both(angles, sines, cosines)
+    assert worst(sines, np.sin(angles)) < 2.3e-16
+    assert worst(cosines, np.cos(angles)) < 2.3e-16
+
+
+def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so():
+    graph = Graph()
+    x, y = graph.inputs(2, False)
+    outputs = Outputs({"of": [x.sine() * y]}, [])
+    assert compute(graph, outputs, (np.array([1.0, 2.0]),))[0]
+    for given in ([2.0 * LARGEST_ANGLE, 1.0], [math.nan, 1.0], [1.0, math.inf], [1.0, math.nan]):
+        holds, (filled,) = compute(graph, outputs, (np.array(given),))
+        assert not holds
+        assert np.isnan(filled).all()  # nothing was written
+
+
+def test_near_a_singular_position_the_general_inner_loop_takes_over():
+    """A pin on two guides, y = 0 and y = a x: the rows become parallel as a goes to 0."""
+
+    def system(slope):
+        return ConstrainedSystem.from_python(
+            n_q=3,
+            n_c=2,
+            mass=np.eye(3),
+            force=lambda t, q, v: np.array([0.1, 0.2, -1.0]),
+            constraint=lambda t, q: np.array([q[1], q[1] - slope * (1.0 - t) * q[0]]),
+            jacobian=lambda t, q: np.array([[0.0, 1.0, 0.0], [-slope * (1.0 - t), 1.0, 0.0]]),
+            constraint_rate=lambda t, q: np.array([0.0, slope * q[0]]),
+            gamma=lambda t, q, v: np.array([0.0, -2.0 * slope * v[0]]),
+            name="guides",
+        )
+
+    made = system(1.0)
+    plan = PRESETS["DOP853"].plan(3, 1e-8, 1e-8, False)
+    vars(plan)["compiled"] = True
+    run = Run(made, plan, 0.0, np.zeros(3), np.zeros(3), 1e-8, np.full(3, 1e-8), None)
+    q = v = np.zeros(3)
+    assert inner(run, calls.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[-1] == 0.0
+    assert inner(run, calls.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[-1] == 1.0
+
+
+@pytest.mark.parametrize("method", ["Gauss4", "RadauIIA5", "PaperIRK", "BDF"])
+def test_methods_that_make_no_use_of_it_refuse(method):
+    problem = four_bar()
+    with pytest.raises(ValueError, match=r"compiled=True goes with .*; given method"):
+        solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, method, compiled=True)
+
+
+def test_equations_that_branch_are_refused_by_name():
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0]))
+    with pytest.raises(ValueError, match=r"compiled=True .* force of 'pendulum': it branches .* Leave it out"):
+        solve_dae(system, (0.0, 0.1), [1.0, 0.0], [0.0, 0.0], "DOP853", compiled=True)
+    with pytest.raises(TypeError, match="compiled must be True or False"):
+        solve_dae(system, (0.0, 0.1), [1.0, 0.0], [0.0, 0.0], "DOP853", compiled="yes")
+
+
+def test_redundant_rows_that_stop_holding_end_the_run():
+    def system(drift):
+        return ConstrainedSystem.from_python(
+            n_q=2,
+            n_c=2,
+            mass=np.eye(2),
+            force=lambda t, q, v: np.array([1.0, 0.0]),
+            constraint=lambda t, q: np.array([q[1], 2.0 * q[1] - drift * t * t * t]),
+            jacobian=lambda t, q: np.array([[0.0, 1.0], [0.0, 2.0]]),
+            constraint_rate=lambda t, q: np.array([0.0, -3.0 * drift * t * t]),
+            gamma=lambda t, q, v: np.array([0.0, 6.0 * drift * t]),
+            name="rail",
+        )
+
+    with pytest.warns(ConstraintWarning):
+        held = solve_dae(system(0.0), (0.0, 1.0), [0.0, 0.0], [1.0, 0.0], "DOP853", compiled=True)
+        broken = solve_dae(system(0.1), (0.0, 1.0), [0.0, 0.0], [1.0, 0.0], "DOP853", compiled=True)
+    assert held.success
+    assert not broken.success and broken.status.name == "ROWS_CONTRADICT"
+
+
+@callback("mass")
+def unit_mass(t, q, p, M):
+    M[0, 0] = 1.0
+
+
+@callback("force")
+def spring(t, q, v, p, Q):
+    Q[0] = -p[0] * q[0]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("method", ["DOP853", "Taylor"])
+def test_parameters_that_change_are_followed(method, compiled):
+    system = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[1.0])
+    for stiffness in (1.0, 4.0):
+        system.parameters[0] = stiffness
+        result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], method, 1e-10, 1e-10, compiled=compiled)
+        assert abs(result.q[0, -1] - math.cos(math.sqrt(stiffness))) < 1e-8
+
+
+def test_a_second_process_compiles_nothing():
+    program = (
+        "from twoloop import solve_dae, straight_code\n"
+        "from twoloop.mechanisms import four_bar\n"
+        "made = []\n"
+        "function_of = straight_code.Emitter.operation\n"
+        "def counted(*given):\n"
+        "    made.append(1)\n"
+        "    return function_of(*given)\n"
+        "straight_code.Emitter.operation = counted\n"
+        "p = four_bar(theta3=0.0123)\n"
+        "solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, 'DOP853', compiled=True)\n"
+        "print(len(made))\n"
+    )
+    counts = [
+        int(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
+        for _ in range(2)
+    ]
+    assert counts[1] == 0
+
+
+def test_the_derivative_of_every_operation():
+    graph = Graph()
+    (x,) = graph.inputs(1, False)
+    laws = {
+        "square root": (lambda x: (x + 2.0).square_root(), lambda x: math.sqrt(x + 2.0)),
+        "exponential": (lambda x: (x * 0.5).exponential(), lambda x: math.exp(0.5 * x)),
+        "sine": (lambda x: x.sine(), math.sin),
+        "cosine": (lambda x: x.cosine(), math.cos),
+        "logarithm": (lambda x: (x + 3.0).logarithm(), lambda x: math.log(x + 3.0)),
+        "arctangent": (lambda x: x.arctangent(), math.atan),
+        "quotient": (lambda x: x / (x * x + 1.0), lambda x: x / (x * x + 1.0)),
+    }
+    one = Form(graph, 1.0, {})
+    for law, known in laws.values():
+        slope = Derivative(graph, {0: one}).of(law(x))
+        _, (value,) = compute(graph, Outputs({"slope": [slope]}, []), (np.array([0.7]),))
+        e = 1e-5
+        assert abs(value[0] - (known(0.7 + e) - known(0.7 - e)) / (2.0 * e)) < 1e-9
