@@ -7,6 +7,7 @@ import pytest
 
 from tests.problems import run, violations, worst
 from twoloop import Status
+from twoloop.dense import Interpolator
 from twoloop.methods import PRESETS
 
 PAPERS = ("PaperIRK", "PaperNewmark")
@@ -53,6 +54,35 @@ def test_the_chunks_of_a_run_do_not_show(default_four_bar, chunk, monkeypatch):
     monkeypatch.setattr("twoloop.run.CHUNK_TIME", 0.0)  # chunks do not grow
     other = run(default_four_bar, 1.0, t_eval=TIMES)
     assert (other.q == usual.q).all() and (other.lam == usual.lam).all()
+
+
+@pytest.mark.parametrize("times", [[1.0], [0.0], [0.0, 1.0]])
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_nothing_is_interpolated_at_the_ends_of_a_run(default_four_bar, method, times, monkeypatch):
+    made = []
+    kept = Interpolator.__init__
+    monkeypatch.setattr(Interpolator, "__init__", lambda self, *given: made.append(self) or kept(self, *given))
+    every = run(default_four_bar, 1.0, method=method)
+    result = run(default_four_bar, 1.0, method=method, t_eval=times)
+    at = np.flatnonzero(np.isin(every.t, times))
+    assert (result.t == times).all()
+    assert (result.h == every.h).all()
+    for name in ("q", "v", "a", "lam"):
+        assert (getattr(result, name) == getattr(every, name)[:, at]).all(), name
+    assert not made
+    run(default_four_bar, 1.0, method=method, t_eval=[0.5, 1.0])
+    assert len(made) == 1
+
+
+def test_an_event_ends_a_run_with_output_at_the_end_only(default_four_bar):
+    def half_way(t, q, v):
+        return t - 0.5
+
+    half_way.terminal = True
+    result = run(default_four_bar, 1.0, t_eval=[0.0, 1.0], events=half_way)
+    assert result.status == Status.EVENT
+    assert result.t.tolist() == [0.0]
+    assert result.t_events[0] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("times", [[1.0], [0.0], [0.0, 1.0], [0.3], [0.3, 0.30000001], [1e-9, 1.0 - 1e-9]])

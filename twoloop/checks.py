@@ -59,6 +59,8 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
 
 def check_real(name: str, value: ArrayLike) -> Array:
     """Return `value` as a new float array, or say that it is not one."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value.astype(np.float64)
     expected = f"{name} must be an array of real numbers"
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{expected}; given a masked array: fill its gaps first, with filled()")

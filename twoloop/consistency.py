@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space, qr
@@ -45,8 +47,8 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
-    matrix = system.mass(t0, q0)
-    jacobian, rows = system.jacobian(t0, q0), system.rows(t0, q0)
+    matrix, jacobian = system.mass(t0, q0), system.jacobian(t0, q0)
+    rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
     reason = not_finite(system, t0, q0, v0)
     if reason is not None:
         raise ValueError(f"at the start, t = {t0:g}, {reason}")
@@ -56,8 +58,8 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
             f"{np.abs(matrix - matrix.T).max():.3g}"
         )
     if system.n_c > 0:
-        violation = Violation.of_position(system, t0, q0, jacobian, scales_of(system, t0, q0, jacobian))
-        violation.refuse("q0")
+        scales = scales_of(system, t0, q0, jacobian)
+        Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")
     if derivatives:
         check_derivatives(system, t0, q0)
     empty = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) == 0.0).tolist()
@@ -66,8 +68,10 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
             f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "
             "there. Leave these constraints out, or start from another position"
         )
+    if system.n_a > 0:
+        scales = scales_of(system, t0, q0, rows)
     if len(rows) > 0:
-        Violation.of_velocity(system, t0, q0, v0, rows, scales_of(system, t0, q0, rows)).refuse("v0")
+        Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
 
 
 class Violation:
@@ -214,15 +218,20 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q)."""
-    generator = np.random.default_rng(4)
     found = np.zeros((system.n_c + system.n_a, system.n_q))
-    for share in NEARBY:
-        place = q + share * np.maximum(np.abs(q), np.abs(q).max()) * generator.uniform(-1.0, 1.0, system.n_q)
+    size = np.maximum(np.abs(q), np.abs(q).max())
+    for share, direction in zip(NEARBY, _directions(system.n_q), strict=True):
         try:
-            found[system.rows(t, place) != 0.0] = 1.0
+            found[system.rows(t, q + share * size * direction) != 0.0] = 1.0
         except Exception:  # outside what the callbacks are made for; what is missed is found on the way
             continue
     return found
+
+
+@cache
+def _directions(n_q: int) -> Array:
+    """Ways in which positions near one lie, (len(NEARBY), n_q): always the same."""
+    return np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
 
 
 def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:

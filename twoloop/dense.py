@@ -13,6 +13,7 @@ from twoloop.checks import check_real
 from twoloop.consistency import ConstraintWarning, pattern_of
 from twoloop.kernels import common
 from twoloop.kernels import intervals as names
+from twoloop.linking import direct
 from twoloop.plan import INNER_TOL, Plan
 from twoloop.system import ConstrainedSystem
 from twoloop.workspace import kit_of, workspace
@@ -87,8 +88,9 @@ class Interpolator:
         """Rows [q, v] at `times`, sorted, each within the table."""
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
-        intervals = np.clip(np.searchsorted(table.t, times, side="right") - 1, 0, len(table.t) - 2)
-        which, first = np.unique(intervals, return_index=True)
+        intervals = np.searchsorted(table.t[1:-1], times, side="right")
+        first = np.flatnonzero(np.diff(intervals, prepend=-1))
+        which = intervals[first]
         groups = np.empty((len(which), names.N_COLUMNS), dtype=np.int64)
         groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
         groups[:, names.KIND] = table.kinds[which]
@@ -109,7 +111,7 @@ class Interpolator:
 
     def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
         arrays = (np.ascontiguousarray(groups), times, self.nodes, self.room, out)
-        return int(self.kernels.between(self.kit, self.work, INNER_TOL, table.t, table.states, *arrays))
+        return int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, table.t, table.states, *arrays))
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
         """A table of interior states, the groups of intervals that are in it, and those of others."""
@@ -140,7 +142,7 @@ class Interpolator:
         for parts in range(self.parts, 1, -1):
             rows = parts + 1
             out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
-            self.kernels.fill(self.kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            direct(self.kernels.fill)(self.kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
             times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
             found = np.isfinite(times[:, 0])
             for k in np.flatnonzero(found):

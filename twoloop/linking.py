@@ -8,7 +8,9 @@ kernel count from the end where it is negative, as none is: the code that asks f
 lie side by side.
 """
 
+from functools import cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from llvmlite import binding
 from numba import types
@@ -102,7 +104,22 @@ class VectorizingCompiler(KernelCompiler):
     library = _Vectorized
 
 
+@cache
+def direct(function: Dispatcher) -> Any:
+    """What Python calls of a function with one signature, past the look at the types of its arguments: these must fit.
+
+    That look costs as much as two steps of a small mechanism.
+    """
+    compiled: Any = next(iter(function.overloads.values()))
+    return compiled.entry_point
+
+
+_ADDRESSES: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # of the code of each library, which has one function
+
+
 def machine_code(function: Dispatcher, signature: Any) -> int:
     """The address of a compiled function; it takes arguments and reports errors as numba's functions do."""
-    compiled: Any = function.get_compile_result(signature)
-    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))
+    compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
+    if compiled.library not in _ADDRESSES:
+        _ADDRESSES[compiled.library] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))
+    return _ADDRESSES[compiled.library]

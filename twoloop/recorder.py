@@ -21,7 +21,7 @@ class Wanted:
     times : ndarray or None
         Output times; None: every accepted step.
     lands : bool
-        Whether steps end at the output times, so that nothing is interpolated.
+        Whether steps end at all output times, so that nothing is interpolated.
     dense : bool
         Whether the dense solution is wanted.
     events : list of Event or None
@@ -69,14 +69,20 @@ class Recorder:
         self._n_outputs = 0
         two = 2 * self._n_q
         self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[:two])
-        self._note_landings(self._t, self._rows)
+        if wanted.times is not None and wanted.lands:
+            self._outputs.append((self._t, self._rows))
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
-        """Take the states [q, v, a, lam] at which steps ended, and what kind of interval each step is."""
-        t, rows = t.copy(), rows.copy()
-        self._note_landings(t, rows)
+        """Take over the states [q, v, a, lam] at which steps ended, and what kind of interval each step is.
+
+        Of the kinds there is one a step where states between steps are wanted, else none.
+        """
         if not self.wanted.every_step:
+            self._outputs.append((t, rows))
             return
+        if self.wanted.times is not None and self.wanted.lands:
+            landed = np.isin(t, self.wanted.times)
+            self._outputs.append((t[landed], rows[landed]))
         if self.wanted.times is None or self.wanted.dense:
             self._all.append((t, rows, kinds))
         if not self.wanted.between_steps:
@@ -88,11 +94,6 @@ class Recorder:
     def finish(self) -> None:
         """No more states come."""
         self._look(len(self._t) - 1)
-
-    def _note_landings(self, t: Array, rows: Array) -> None:
-        if self.wanted.times is not None and self.wanted.lands:
-            hit = np.isin(t, self.wanted.times)
-            self._outputs.append((t[hit], rows[hit]))
 
     @property
     def ended(self) -> tuple[Event, float] | None:
@@ -126,7 +127,10 @@ class Recorder:
         """Times and rows [q, v, a, lam] of the result."""
         parts = self._outputs if self.wanted.times is not None else [(t, rows) for t, rows, _ in self._all]
         t, rows = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-        if self.wanted.times is not None and not self.wanted.lands:
+        if self.wanted.times is not None and self.wanted.lands:
+            landed = np.isin(t, self.wanted.times)  # the ends of the run may not be among them
+            t, rows = t[landed], rows[landed]
+        elif self.wanted.times is not None:
             rows = self._completed(t, rows)
         if self.search is None or self.search.ended is None:
             return t, rows

@@ -85,7 +85,9 @@ class Statistics:
     n_jacobians : int or None
         Times the derivatives of the right-hand side were made for Newton's method in the outer loop.
     cpu_time : float
-        Process time of the integration, s; compilation and checks of the input not included.
+        Process time of the integration, s: of the steps, of storing what they give, of events, and of q and v at output
+        times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
+        output times between steps are not included.
     """
 
     n_accepted: int | None = None

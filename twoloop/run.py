@@ -12,6 +12,7 @@ from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, lea
 from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
 from twoloop.kernels import common, intervals
+from twoloop.linking import direct
 from twoloop.plan import Plan, least_tolerance
 from twoloop.recorder import Recorder, Wanted
 from twoloop.result import Result, Statistics, Status, explained
@@ -40,6 +41,7 @@ CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go o
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
 
@@ -145,8 +147,9 @@ class Run:
     def _warn_of_redundant_rows(self) -> None:
         n_rows = self.system.n_c + self.system.n_a
         self.rank = len(self.work.rows_v)
-        self.redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
+        self.redundant = np.zeros(0, dtype=np.int64)
         if self.rank < n_rows:
+            self.redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
             n = self.system.n_q
             rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
             off = np.abs(rows @ a - self.work.Gamma)
@@ -200,20 +203,21 @@ class Run:
         if any(event.terminal < np.inf for event in wanted.events or []):
             largest_chunk = self.control[a.MAX_ATTEMPTS] = CHUNK_TO_EVENT
         step_parts = [np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])]  # the first partition of a run is not a renewal
-        out_t, out_steps = np.empty(BUFFER_ROWS), np.empty((BUFFER_STEPS, a.N_STEP_COLUMNS))
-        out_state = np.empty((BUFFER_ROWS, len(self.state)))
         filled = np.zeros(2, dtype=np.int64)
-        pace, looks = _Pace(self.t0), Looks(self.plan)
+        advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
         code = a.PAUSED
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
         while code == a.PAUSED:
-            filled[:] = 0
-            began = time.process_time()
             across = plan is not self.plan
+            began = time.process_time()
+            most = int(control[a.MAX_ATTEMPTS])  # each fills at most one row
+            n_rows, n_steps = min(most, BUFFER_ROWS), min(most, BUFFER_STEPS)
+            out_t, out_state = np.empty(n_rows), np.empty((n_rows, len(self.state)))
+            out_steps = np.empty((n_steps, a.N_STEP_COLUMNS))
             try:
-                code = a.advance(
+                code = advance(
                     kit,
                     self.work,
                     plan.options,
@@ -233,18 +237,21 @@ class Run:
                 code = INTERRUPTED
             except Exception as error:  # of a callback; beyond a terminal event it does not matter
                 code, raised = INTERRUPTED, error
+            n_rows, n_steps = filled.tolist()
+            steps = _filled(out_steps, n_steps)
+            step_parts.append(steps)
+            kinds = self._kinds(steps, across) if wanted.between_steps else NO_KINDS
+            recorder.add(_filled(out_t, n_rows), _filled(out_state, n_rows), kinds)
             spent = time.process_time() - began
-            step_parts.append(out_steps[: filled[1]].copy())
-            recorder.add(out_t[: filled[0]], out_state[: filled[0]], self._kinds(step_parts[-1], across))
-            cpu += time.process_time() - began
+            cpu += spent
             if recorder.ended is not None:
                 break
             if code == a.PAUSED and not across:
-                looks.take(float(self.clock[a.T]), self.state, system.n_q, step_parts[-1][:, a.H])
+                looks.take(float(self.clock[a.T]), self.state, system.n_q, steps[:, a.H])
             if spent < CHUNK_TIME:
                 self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
             limited = self.control[a.MAX_STEPS] < np.inf
-            if pace.stagnates(self.clock[a.T], out_steps[: filled[1], a.H], t1) and code == a.PAUSED and not limited:
+            if pace.stagnates(self.clock[a.T], steps[:, a.H], t1) and code == a.PAUSED and not limited:
                 code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
@@ -253,12 +260,13 @@ class Run:
                 kit = common.Kit(self.functions, self.kit.general, plan.step)
                 code = a.PAUSED
             elif plan is not self.plan and code != a.ALL_OUTPUT_DONE:
-                plan, control, code = self._beyond(plan, control, code, int(filled[1]))
+                plan, control, code = self._beyond(plan, control, code, n_steps)
                 kit = self.kit if plan is self.plan else kit
             report(self.clock[a.T])
-        began = time.process_time()
-        recorder.finish()
-        cpu += time.process_time() - began
+        if wanted.between_steps:
+            began = time.process_time()
+            recorder.finish()
+            cpu += time.process_time() - began
         if raised is not None and recorder.ended is None:
             raise raised
         t, table = recorder.output()
@@ -507,6 +515,11 @@ class Run:
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
+
+
+def _filled(buffer: Array, n: int) -> Array:
+    """The first n rows; a copy where the buffer is largely empty, as it would be kept with them."""
+    return buffer[:n] if 2 * n >= len(buffer) else buffer[:n].copy()
 
 
 class _Pace:

@@ -6,6 +6,7 @@ it is another Jacobian (a rod's length, a radian).
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +42,14 @@ class Scales:
 def sizes(q: Array) -> Array:
     """A first guess at how far each coordinate must move to matter."""
     size = np.abs(q)
-    typical = float(np.median(size[size > 0.0])) if size.any() else 1.0
+    typical = _median(size[size > 0.0]) if size.any() else 1.0
     return np.maximum(size, 1e-3 * typical)
+
+
+def _median(values: Array) -> float:
+    """Of numbers that are finite, without what NumPy does about others."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def column_scales(jacobian: Array, typical: Array) -> Array:
@@ -54,19 +61,23 @@ def column_scales(jacobian: Array, typical: Array) -> Array:
         return typical
     logs = np.where(counts, np.log(np.where(counts, size, 1.0)), 0.0)
     in_row, in_column = np.maximum(counts.sum(axis=1), 1), np.maximum(counts.sum(axis=0), 1)
-    rows, columns = np.zeros(len(size)), np.zeros(len(typical))
+    of_row, of_column = logs.sum(axis=1), logs.sum(axis=0)
+    counts_of = counts.astype(np.float64)
+    columns = np.zeros(len(typical))
     for _ in range(20):  # least squares of log|C_q| + columns - rows, by turns
-        rows = (logs.sum(axis=1) + counts @ columns) / in_row
-        columns = (rows @ counts - logs.sum(axis=0)) / in_column
+        rows = (of_row + counts_of.dot(columns)) / in_row
+        before, columns = columns, (rows.dot(counts_of) - of_column) / in_column
+        if (columns == before).all():
+            break
     # the unit of the whole is free: that of the coordinates
-    columns = np.exp(columns + float(np.median(np.log(typical[used]) - columns[used])))
+    columns = np.exp(columns + _median(np.log(typical[used]) - columns[used]))
     return np.where(used, columns, typical)
 
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
     """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
     size = np.abs(q)
-    typical = float(np.median(size[size > NEGLIGIBLE * size.max()])) if size.any() else 1.0
+    typical = _median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
     columns = column_scales(jacobian, np.maximum(size, typical))
     norms, curvature = np.linalg.norm(jacobian * columns, axis=1), _curvature(system, t, q, columns, len(jacobian))
     rows = np.maximum(norms, TURNS * curvature)
@@ -83,14 +94,20 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     return Scales(columns, rows, reach)
 
 
+@cache
+def _signs(n_q: int) -> Array:
+    """Of the displacements of the coordinates, (n_q,): always the same."""
+    return np.random.default_rng(3).choice((-1.0, 1.0), n_q)
+
+
 def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_rows: int) -> Array:
     """How fast each row of C_q turns, per unit of the coordinates: one digit is enough."""
-    signs = np.random.default_rng(3).choice((-1.0, 1.0), len(q))
+    way = columns * _signs(len(q))
     rows = system.jacobian if n_rows == system.n_c else system.rows
     largest = np.zeros(n_rows)
     for part in DISPLACEMENTS:
         try:
-            ends = [rows(t, q + side * part * columns * signs) for side in (1.0, -1.0)]
+            ends = [rows(t, q + side * part * way) for side in (1.0, -1.0)]
         except Exception:  # outside what the constraints are made for
             continue
         change = np.linalg.norm((ends[0] - ends[1]) * columns, axis=1) / (2.0 * part)

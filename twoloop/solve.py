@@ -183,7 +183,8 @@ def solve_dae(
     if max_steps is not None:
         run.control[run.a.MAX_STEPS] = max_steps
     with _progress_bar(progress, chosen.name, t0, t1) as report:
-        wanted = Wanted(times, plan.lands or step_size is not None, bool(dense_output), event_functions)
+        lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
+        wanted = Wanted(times, lands, bool(dense_output), event_functions)
         result = run.go(t1, wanted, report, time_limit, check_derivatives)
     return replace(result, method=chosen.name)
 

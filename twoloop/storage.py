@@ -108,7 +108,8 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
 
 
 def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str, Any]) -> DenseSolution:
-    table = Table(arrays["sol_t"], arrays["sol_states"], arrays["sol_kinds"])
+    t, states = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("sol_t", "sol_states"))
+    table = Table(t, states, arrays["sol_kinds"])
     rank, rank_v = words["sol_ranks"]
     interpolator = Interpolator(system, float(table.t[0]), table.states[0], words["sol_rtol"], (rank, rank_v))
     if "sol_interior_t" in arrays:

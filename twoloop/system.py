@@ -124,6 +124,10 @@ class ConstrainedSystem:
         self.functions: Any = Functions(**all_callbacks, p=self.parameters, flags=flags)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
+        self._shapes = {
+            kind: [tuple(getattr(self, size) for size in shape) for _, shape in entry.outputs]
+            for kind, entry in KINDS.items()
+        }
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
         self.made: dict[Any, Any] = {}  # of its equations, by what of them and by the parameters: see `remembered`
@@ -232,7 +236,7 @@ class ConstrainedSystem:
 
     def arrays_of(self, kind: str) -> list[Array]:
         """Zeros for a kind of callback to fill."""
-        return [np.zeros([getattr(self, size) for size in shape]) for _, shape in KINDS[kind].outputs]
+        return [np.zeros(shape) for shape in self._shapes[kind]]
 
     def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
         """What a callback gives at (t, q), (t, q, v) or (t, q, lam), whichever its kind asks for.

@@ -14,6 +14,7 @@ from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, Signature, infer_getattr
 from numba.extending import NativeValue, lower_builtin, models, register_model, unbox
 from numba.np.arrayobj import make_array, populate_array
+from numba.np.numpy_support import as_dtype
 
 from twoloop.linking import machine_code
 
@@ -40,6 +41,7 @@ class Reference(types.Type):
         super().__init__(name)
         _KNOWN[name] = self
         self.arrays = dict(arrays)
+        self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
         self.functions: dict[str, Signature] = {}
         self.places: dict[str, int] = {}
         self.n_words = 0
@@ -65,17 +67,17 @@ class Reference(types.Type):
         TypeError
             If an array is of another type than was declared.
         """
-        words = np.zeros(self.n_words, dtype=np.int64)
+        words: list[int] = []
         for field, kind in self.arrays.items():
-            array, place = getattr(values, field), self.places[field]
-            if array.ndim != kind.ndim or array.dtype.name != str(kind.dtype) or not array.flags.c_contiguous:
+            array = getattr(values, field)
+            if array.ndim != kind.ndim or array.dtype != self.dtypes[field] or not array.flags.c_contiguous:
                 raise TypeError(f"{field} must be a {kind}; given {array.dtype} of shape {array.shape}")
-            words[place] = array.ctypes.data
-            words[place + 1 : place + 1 + kind.ndim] = array.shape
+            words.append(array.__array_interface__["data"][0])
+            words.extend(array.shape)
         for field, signature in self.functions.items():
             function = getattr(values, field)
-            words[self.places[field]] = 0 if function is None else machine_code(function, signature)
-        return words
+            words.append(0 if function is None else machine_code(function, signature))
+        return np.array(words, dtype=np.int64)
 
 
 register_model(Reference)(models.OpaqueModel)
