@@ -14,7 +14,7 @@ from references.expressions import NotSymbolic
 from references.straight_line import program_of
 from studies import rivals, tables
 from studies.render import number, power
-from studies.solvers import COMPILED, TAYLOR
+from studies.solvers import DEFAULT, TAYLOR
 from studies.store import KeptRows
 
 GROUP = "operations"
@@ -71,8 +71,8 @@ def _profile(
         line[which] = {"solver": solver, "steps": steps if known else None, "cpu_s": seconds}
         line[which]["step_ns"] = 1e9 * seconds / steps if known else None
     evaluations, count = at["ours"]["n_evaluations"], operations.get(at["case"], np.nan)
-    # a step of Taylor computes series, not accelerations at points
-    counted = bool(evaluations and np.isfinite(evaluations)) and at["ours"]["solver"] not in (TAYLOR, COMPILED)
+    # a step of Taylor, which the default takes, too, computes series, not accelerations at points
+    counted = bool(evaluations and np.isfinite(evaluations)) and not at["ours"]["solver"].startswith((DEFAULT, TAYLOR))
     line["evaluations"] = evaluations if counted else None
     line["evaluation_ns"] = 1e9 * at["ours"]["cpu_s"] / evaluations if counted else None
     line["straight_ns"] = count * operation_ns if np.isfinite(count) else None

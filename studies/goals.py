@@ -34,7 +34,7 @@ def of_default(rows: pd.DataFrame) -> dict[str, Any]:
 
     Over all mechanisms and decades that any of these reaches.
     """
-    own, pairs = rows[(rows["family"] == "two-loop") & (rows["solver"] != COMPILED)], []
+    own, pairs = rows[(rows["family"] == "two-loop") & ~rows["solver"].isin(list(COMPILED))], []
     for case, runs in own.groupby("case", sort=False):
         for error in rivals.DECADES:
             ranked = tables.ranking(runs, error)

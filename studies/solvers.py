@@ -14,7 +14,7 @@ import numpy as np
 
 from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
-from twoloop import Result, RungeKutta, Taylor, paper_irk, paper_newmark, solve_dae
+from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.plan import Method
 from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
 
@@ -29,13 +29,23 @@ IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, 
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
 CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
-ADAMS, TAYLOR, COMPILED = "Adams", "Taylor", "Taylor, compiled"
+ADAMS, TAYLOR = "Adams", "Taylor"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 DEFAULT = "auto"  # of solve_dae
+# with code made for the mechanism, and the method of each
+COMPILED = {
+    "auto, compiled": DEFAULT,
+    "Taylor, compiled": TAYLOR,
+    "Adams, compiled": ADAMS,
+    "DOP853, compiled": "DOP853",
+}
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
 PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
 # of ours, beside the rivals
-OWN = (DEFAULT, TAYLOR, COMPILED, ADAMS, OWN_EXPLICIT, "Gauss12", "Gauss16", "RadauIIA5", "TRBDF2", OWN_BDF)
+OWN = (
+    *(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT),
+    *("Gauss12", "Gauss16", "RadauIIA5", "TRBDF2", OWN_BDF),
+)
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
@@ -52,7 +62,7 @@ RIVALS = (
 
 # what `compare` runs, and the lines from which its figure takes the cheapest seven
 COMPARED = (
-    *(DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
+    *("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
     *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
 )
 
@@ -61,14 +71,15 @@ def _start(case: Case) -> tuple[Any, Any, Any, Any]:
     return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
 
 
-def _preset(method: str | Method, case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_dae(*_start(case), method=method, rtol=tolerance, atol=tolerance, time_limit=case.time_limit)
+def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: bool = False) -> Result:
+    limit = case.time_limit
+    return solve_dae(*_start(case), method, tolerance, tolerance, time_limit=limit, compiled=compiled)
 
 
-def _taylor(compiled: bool, case: Case, tolerance: float, repeat: int) -> Result:
-    """`NotApplicable` where the callbacks cannot be traced or compiled, which is a ValueError of `solve_dae`."""
+def _traced(method: str, compiled: bool, case: Case, tolerance: float, repeat: int) -> Result:
+    """`NotApplicable` where the callbacks cannot be run on symbols, which is a ValueError of `solve_dae`."""
     try:
-        return _preset(Taylor(compiled=compiled), case, tolerance, repeat)
+        return _preset(method, case, tolerance, repeat, compiled)
     except ValueError as why:
         raise NotApplicable(str(why)) from None
 
@@ -234,8 +245,8 @@ def _all() -> Iterator[Solver]:
     yield paper_newmark_at(ERR_IN, 0.25)
     for preset in dict.fromkeys((*PRESETS, *OWN)):
         run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
-        if preset in (TAYLOR, COMPILED):
-            run = partial(_taylor, preset == COMPILED)
+        if preset == TAYLOR or preset in COMPILED:
+            run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
         yield _solver(preset, "two-loop", "compiled", "tol", run)
     newton = RungeKutta(radau_iia(4), "newton")
     yield _solver(NEWTON_4, "two-loop", "compiled", "tol", partial(_preset, newton))

@@ -1,4 +1,4 @@
-"""Machine code for the equations of one mechanism: the tasks of the inner loop that explicit methods call at each stage.
+"""Machine code for the equations of one mechanism: the tasks of the inner loop that explicit methods call.
 
 The operations of `twoloop.straight_line` become LLVM's instructions one by one, without numba's front end, which would
 take seconds for some hundred of them. The code is kept on disk as that of the kernels.
