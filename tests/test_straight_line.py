@@ -240,8 +240,8 @@ def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so(
     x, y = graph.inputs(2, False)
     outputs = Outputs({"of": [x.sine() * y]}, [])
     assert compute(graph, outputs, (np.array([1.0, 2.0]),))[0]
-    for given in ([2.0 * LARGEST_ANGLE, 1.0], [math.nan, 1.0], [1.0, math.inf], [1.0, math.nan]):
-        holds, (filled,) = compute(graph, outputs, (np.array(given),))
+    for each in ([2.0 * LARGEST_ANGLE, 1.0], [math.nan, 1.0], [1.0, math.inf], [1.0, math.nan]):
+        holds, (filled,) = compute(graph, outputs, (np.array(each),))
         assert not holds
         assert np.isnan(filled).all()  # nothing was written
 
