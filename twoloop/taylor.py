@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from twoloop.checks import check_flag, check_size
 from twoloop.plan import LARGEST_MOVE, Plan, least_tolerance
 from twoloop.series import SeriesProgram, series_program
-from twoloop.series_code import compiled_series, source_of
+from twoloop.series_code import compiled_series
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import Untraceable
 
@@ -126,7 +126,7 @@ class Taylor:
         if not self.compiled:
             return replace(plan, interior=interior)
         plan.options[kernels.COMPILED] = 1.0
-        return replace(plan, first=compiled_series(source_of(program)), interior=interior)
+        return replace(plan, first=compiled_series(program), second=kernels.solve_order, interior=interior)
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:

@@ -329,6 +329,13 @@ def _expand(f, w, options, memory, t, state, unit):
     return end_series(w, order, series)
 
 
+@kernel(STEP, vectorized=True)
+def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
+    """The linear solution of one order, for code made for a mechanism."""
+    solve_for_order(f, w, r, c, a, lam)
+    return DONE, 0.0
+
+
 @merged
 def _find_series(f, w, options, memory, t, state, unit, which):
     """The series about a state, into one of the two places."""
