@@ -21,7 +21,7 @@ Value = Any  # of LLVM
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
 FLAGS = tuple(sorted(OPTIONS["fastmath"]))
-DOUBLE, INTEGER = ir.DoubleType(), ir.IntType(64)
+DOUBLE, INTEGER, WORD = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
 ALIGNMENT = 64  # bytes: no vector lies in two lines of the cache
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt")}  # other functions are libm's
 
@@ -84,14 +84,35 @@ class Emitter:
     def store(self, value: Value, base: Value, place: int = 0) -> None:
         self.builder.store(value, self.pointer(base, place))
 
+    def vector(self, values: Sequence[Value]) -> Value:
+        """Numbers side by side, as many as a power of 2; one number as it is."""
+        if len(values) == 1:
+            return values[0]
+        kind = ir.VectorType(DOUBLE, len(values))
+        vector = kind(ir.Undefined)
+        for place, value in enumerate(values):
+            vector = self.builder.insert_element(vector, value, WORD(place))
+        return vector
+
+    def elements(self, vector: Value) -> list[Value]:
+        """The numbers of a vector."""
+        if vector.type == DOUBLE:
+            return [vector]
+        return [self.builder.extract_element(vector, WORD(place)) for place in range(vector.type.count)]
+
+    def same(self, value: Value, width: int) -> Value:
+        """A vector of equal numbers."""
+        return self.vector([value] * width)
+
     def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """Doubles side by side, of an aligned pointer."""
-        kind = ir.VectorType(DOUBLE, width).as_pointer()
-        return self.builder.load(self.builder.bitcast(self.pointer(base, place), kind), align=_alignment(place, width))
+        """Numbers side by side, of an aligned pointer."""
+        pointer = self.builder.bitcast(self.pointer(base, place), vector_type(width).as_pointer())
+        return self.builder.load(pointer, align=8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
+        """The same into memory."""
         pointer = self.builder.bitcast(self.pointer(base, place), value.type.as_pointer())
-        self.builder.store(value, pointer, align=_alignment(place, value.type.count))
+        self.builder.store(value, pointer, align=8 * getattr(value.type, "count", 1))
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Value], list[Value]]]:
@@ -119,9 +140,9 @@ class Emitter:
             new[k] = result
 
 
-def _alignment(place: int, width: int) -> int:
-    """That of a vector in an aligned array, as far as its place tells."""
-    return min(ALIGNMENT, 8 * (place & -place or width), 8 * width)
+def vector_type(width: int) -> ir.Type:
+    """Of so many doubles side by side; one is a double."""
+    return DOUBLE if width == 1 else ir.VectorType(DOUBLE, width)
 
 
 class Quantities:

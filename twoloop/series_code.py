@@ -12,7 +12,6 @@ import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from llvmlite import ir
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
@@ -37,20 +36,31 @@ WIDTH = 8  # doubles of a vector
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
 
 i8 = types.int64
+ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
 
-class Operation(NamedTuple):
-    """One operation; of sine and cosine of an angle together."""
+class Argument(NamedTuple):
+    """A form."""
+
+    terms: Terms
+    constant: float
+
+
+class Group(NamedTuple):
+    """Operations of one kind that do not depend on one another, side by side in a vector; at its end, the last again."""
 
     kind: int
     place: int  # in the rows of X and Y
-    quantity: int  # that it makes
-    first: Terms
-    first_constant: float
-    second: Terms
-    second_constant: float
-    apart: int  # of a sine: how far behind it the cosine of the same angle stands
+    width: int
+    quantities: list[int]  # that they make
+    first: list[Argument]
+    second: list[Argument]
+
+    @property
+    def pending(self) -> bool:
+        """Whether the second factors wait for the solution of an order."""
+        return self.kind == PENDING
 
 
 class Row(NamedTuple):
@@ -71,17 +81,30 @@ def _terms(sums: Sums, rows: Any) -> list[Terms]:
     return [tuple((i, c) for i, c in terms if c != 0.0) for terms in each]
 
 
-def _operations(table: Table, place: int, quantity: int) -> list[Operation]:
-    """Those of a table; the first has this place and makes this quantity."""
-    numbers = range(len(table.first.column))
-    first, second = _terms(table.first, numbers), _terms(table.second, numbers)
-    operations = []
+def _arguments(sums: Sums) -> list[Argument]:
+    numbers = range(len(sums.column))
+    return [Argument(*each) for each in zip(_terms(sums, numbers), sums.constant.tolist(), strict=True)]
+
+
+def _groups(table: Table, quantity: int) -> list[Group]:
+    """Those of a table, whose first operation makes this quantity; they have no places yet.
+
+    Of sines, the cosines of the same angles are the second half.
+    """
+    first, second = _arguments(table.first), _arguments(table.second)
+    groups = []
     for kind, begin, end in table.groups[:, :3].tolist():
-        apart = (end - begin) // 2 if kind == SINE else 0
-        for o in range(begin, end - apart):
-            forms = first[o], float(table.first.constant[o]), second[o], float(table.second.constant[o])
-            operations.append(Operation(kind, place + o, quantity + o, *forms, apart))
-    return operations
+        halves = 2 if kind == SINE else 1
+        size, most = (end - begin) // halves, WIDTH // halves
+        for part in range(0, size, most):
+            few = min(most, size - part)
+            width = 1 << (few - 1).bit_length()
+            members = [begin + h * size + part + min(k, few - 1) for h in range(halves) for k in range(width)]
+            quantities = [quantity + o for o in members]
+            groups.append(
+                Group(kind, 0, len(members), quantities, [first[o] for o in members], [second[o] for o in members])
+            )
+    return groups
 
 
 def _rows(sums: Sums, places: Any) -> list[Row]:
@@ -91,40 +114,55 @@ def _rows(sums: Sums, places: Any) -> list[Row]:
 class SeriesCode:
     """Writes the code of a program.
 
-    `scratch` holds, from an aligned place on, sums of products; the results of early operations that late ones use;
-    velocities; an inverse for each operation that divides; and the rows, X and Y of order 0, of order 1 and so on.
+    `scratch` holds, from an aligned place on, the results of early operations that late ones use; velocities; for each
+    operation that divides an inverse; a row of zeros; and the rows of orders 0, 1 and so on. A row is X and Y.
     """
 
     def __init__(self, program: SeriesProgram):
         n, n_early = program.n_q, len(program.early.first.column)
-        self.n, self.n_rows, self.n_early = n, program.n_rows, n_early
+        self.n, self.n_rows = n, program.n_rows
         self.first = 1 + 3 * n + program.n_rows  # quantity that is a result
-        self.early = _operations(program.early, 0, self.first)
-        self.late = _operations(program.late, n_early, self.first + n_early)
+        groups = {True: _groups(program.early, self.first), False: _groups(program.late, self.first + n_early)}
+        self.width = 0
+        for width in (8, 4, 2, 1):  # so that vectors are aligned
+            for each in groups.values():
+                for k, group in enumerate(each):
+                    if group.width == width:
+                        each[k] = group._replace(place=self.width)
+                        self.width += width
+        self.width = _rounded(self.width)
+        self.early, self.late = groups[True], groups[False]
         self.rows = _rows(program.rows, program.row_places)
         self.balance = _rows(program.balance, program.balance_places)
-        self.size = program.n_operations
-        self.width = _rounded(self.size)
-        self.results = self.width
-        self.velocities = self.results + _rounded(n_early)
+        self.velocities = _rounded(n_early)
         self.inverses = self.velocities + _rounded(n)
-        self.table = self.inverses + self.width
-        forms = [form for o in self.late for form in (o.first, o.second)] + [row.terms for row in self.balance]
-        self.kept = {i for form in forms for i, _ in form}  # quantities that are needed an order later
+        self.zeros = self.inverses + self.width
+        self.table = self.zeros + 2 * self.width
+        arguments = [each for group in self.late for each in (*group.first, *group.second)]
+        terms = [each.terms for each in arguments] + [row.terms for row in self.balance]
+        self.kept = {i for each in terms for i, _ in each}  # quantities that are needed an order later
 
     def scratch_size(self, order: int) -> int:
         """Length of `scratch` for a series of this order."""
         return WIDTH + self.table + 2 * self.width * (order + 1)
 
     def begin(
-        self, emit: Emitter, scratch: Value, series: Value, r: Value, c: Value, lam: Value, t: Value, unit: Value, state: Value
+        self,
+        emit: Emitter,
+        scratch: Value,
+        series: Value,
+        r: Value,
+        c: Value,
+        lam: Value,
+        t: Value,
+        unit: Value,
+        state: Value,
     ) -> None:
         """What is known of the orders 0 and 1, and the early operations of order 0; r, c and lam are zero."""
         base = emit.aligned(scratch)
-        zero = DOUBLE(0.0)
         for size, out in ((self.n, r), (self.n_rows, c), (self.n_rows, lam)):
             for i in range(size):
-                emit.store(zero, out, i)
+                emit.store(ZERO, out, i)
         known = Quantities(emit, lambda i: emit.load(state, i - 1) if i else t)
         for j in range(self.n):
             q, v = known.value(1 + j), known.value(1 + self.n + j)
@@ -132,57 +170,55 @@ class SeriesCode:
             emit.store(emit.multiply(unit, v), series, self.n + j)
             emit.store(v, base, self.velocities + j)
         table = emit.pointer(base, self.table)
-        for o in self.early:
-            self._begin_operation(emit, base, known, o)
-            if o.kind == PENDING:
-                emit.store(known.sum(o.second), table, self.width + o.place)
-        for place in range(self.n_early, self.size):
-            emit.store(zero, table, 2 * self.width + place)
+        for group in self.early:
+            self._begin_group(emit, base, known, group)
+            if group.pending:
+                self._store_waiting(emit, known, group, table)
         self._keep(emit, base, known)
 
     def order(
-        self, emit: Emitter, scratch: Value, series: Value, r: Value, c: Value, t: Value, unit: Value, order: Value
+        self,
+        emit: Emitter,
+        scratch: Value,
+        series: Value,
+        r: Value,
+        c: Value,
+        t: Value,
+        unit: Value,
+        order: Value,
     ) -> None:
         """Late operations of the order before and early ones of this order, as far as they are known; r and c."""
-        base = emit.aligned(scratch)
-        stride = INTEGER(2 * self.width)
-        row = emit.pointer(base, self.table, emit.builder.mul(order, stride))
-        q = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
-        inverse = emit.divide(DOUBLE(1.0), emit.number(order))
-        self._sums_of_products(emit, base, order)
+        builder, base = emit.builder, emit.aligned(scratch)
+        q = emit.pointer(series, builder.mul(order, INTEGER(self.n)))
+        before = builder.sub(order, INTEGER(1))
+        sums = self._sums_of_products(emit, base, order)
 
-        def late(time: Value) -> Quantities:
+        def quantities(time: Value) -> Quantities:
             def load(i: int) -> Value:
                 if i == 0:
                     return time
                 if i <= self.n:
                     return emit.load(q, i - 1 - self.n)
-                if i <= 2 * self.n:
-                    return emit.load(base, self.velocities + i - 1 - self.n)
-                return emit.load(base, self.results + i - self.first)
+                place = self.velocities + i - 1 - self.n if i < self.first else i - self.first
+                return emit.load(base, place)
 
             return Quantities(emit, load)
 
-        with emit.builder.if_else(emit.builder.icmp_signed("==", order, INTEGER(1))) as (then, otherwise):
+        with builder.if_else(builder.icmp_signed("==", order, INTEGER(1))) as (then, otherwise):
             with then:
-                known = late(t)
-                for o in self.late:
-                    self._begin_operation(emit, base, known, o)
+                known = quantities(t)
+                for group in self.late:
+                    self._begin_group(emit, base, known, group)
                 for place, terms, constant in self.balance:
                     emit.store(known.sum(terms, constant), r, place)
             with otherwise:
-                known = late(self._time(emit, unit, order, 2))
-                before = emit.builder.sub(order, INTEGER(1))
-                per_order = emit.divide(DOUBLE(1.0), emit.number(before))
-                for o in self.late:
-                    y = emit.pointer(row, -self.width)
-                    self._operation(emit, base, known, o, row, y, emit.number(before), per_order)
+                known = quantities(self._time(emit, unit, before))
+                self._groups_of_order(emit, base, known, self.late, sums, before)
                 for place, terms, _ in self.balance:
                     emit.store(known.sum(terms), r, place)
-        time = self._time(emit, unit, order, 1)
+        time = self._time(emit, unit, order)
         known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
-        for o in self.early:
-            self._operation(emit, base, known, o, row, emit.pointer(row, self.width), emit.number(order), inverse)
+        self._groups_of_order(emit, base, known, self.early, sums, order)
         scale = emit.negative(emit.divide(emit.number(order), unit))
         for place, terms, _ in self.rows:
             emit.store(emit.multiply(scale, known.sum(terms)), c, place)
@@ -193,7 +229,6 @@ class SeriesCode:
     ) -> None:
         """Velocities of this order and positions of the next, from accelerations; the factors that waited for them."""
         base = emit.aligned(scratch)
-        row = emit.pointer(base, self.table, emit.builder.mul(order, INTEGER(2 * self.width)))
         following = emit.builder.add(order, INTEGER(1))
         next_q = emit.pointer(series, emit.builder.mul(following, INTEGER(self.n)))
         per_v, per_q = (emit.divide(unit, emit.number(each)) for each in (order, following))
@@ -208,137 +243,165 @@ class SeriesCode:
             if 1 + self.n + j in self.kept:
                 emit.store(v, base, self.velocities + j)
             emit.store(emit.multiply(per_q, v), next_q, j)
-        for operations, y in ((self.early, self.width), (self.late, -self.width)):
-            for o in operations:
-                if o.kind == PENDING:
-                    emit.store(known.sum(o.second), row, y + o.place)
+        before = emit.builder.sub(order, INTEGER(1))
+        for groups, each in ((self.early, order), (self.late, before)):
+            for group in groups:
+                if group.pending:
+                    self._store_waiting(emit, known, group, self._row(emit, base, each))
 
     def finite(self, emit: Emitter, series: Value, order: Value) -> Value:
         """Whether the last coefficients are."""
         last = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
-        total = DOUBLE(0.0)
+        total = ZERO
         for j in range(self.n):
-            total = emit.add(total, emit.multiply(DOUBLE(0.0), emit.load(last, j)))
-        return emit.builder.fcmp_ordered("==", total, DOUBLE(0.0))
+            total = emit.add(total, emit.multiply(ZERO, emit.load(last, j)))
+        return emit.builder.fcmp_ordered("==", total, ZERO)
 
-    def _time(self, emit: Emitter, unit: Value, order: Value, linear: int) -> Value:
-        """The coefficient of the time, which is linear."""
-        is_linear = emit.builder.icmp_signed("==", order, INTEGER(linear))
-        return emit.builder.select(is_linear, unit, DOUBLE(0.0))
+    def _row(self, emit: Emitter, base: Value, order: Value) -> Value:
+        return emit.pointer(base, self.table, emit.builder.mul(order, INTEGER(2 * self.width)))
+
+    def _time(self, emit: Emitter, unit: Value, order: Value) -> Value:
+        """The coefficient of the time, of an order that is not 0."""
+        return emit.builder.select(emit.builder.icmp_signed("==", order, INTEGER(1)), unit, ZERO)
 
     def _keep(self, emit: Emitter, base: Value, known: Quantities) -> None:
-        for o in self.early:
-            for i in (o.quantity, o.quantity + o.apart):
-                if i in self.kept:
-                    emit.store(known.value(i), base, self.results + i - self.first)
+        made = {i for group in self.early for i in group.quantities}
+        for i in sorted(self.kept & made):
+            emit.store(known.value(i), base, i - self.first)
 
-    def _sums_of_products(self, emit: Emitter, base: Value, order: Value) -> None:
-        """For every operation the sum of X[j] Y[order - j] over 0 < j < order."""
-        builder, stride = emit.builder, INTEGER(2 * self.width)
-        places = [(place, _vector(self.size - place)) for place in range(0, self.size, WIDTH)]
-        for first in range(0, len(places), AT_ONCE):
-            group = places[first : first + AT_ONCE]
-            zeros = [ir.VectorType(DOUBLE, width)([0.0] * width) for _, width in group]
-            with emit.loop(INTEGER(1), order, zeros) as (j, totals, new):
-                x = emit.pointer(base, self.table, builder.mul(j, stride))
-                y = emit.pointer(base, self.table + self.width, builder.mul(builder.sub(order, j), stride))
-                for (place, width), total in zip(group, totals, strict=True):
-                    product = emit.multiply(emit.load_vector(x, place, width), emit.load_vector(y, place, width))
-                    new.append(emit.add(total, product))
-            for (place, _), total in zip(group, new, strict=True):
-                emit.store_vector(total, base, place)
+    def _store_waiting(self, emit: Emitter, known: Quantities, group: Group, row: Value) -> None:
+        y = emit.vector([known.sum(each.terms) for each in group.second])
+        emit.store_vector(y, row, self.width + group.place)
 
-    def _begin_operation(self, emit: Emitter, base: Value, known: Quantities, o: Operation) -> None:
-        """Order 0: the function itself; what waits stays zero."""
-        table = emit.pointer(base, self.table)
-        u = known.sum(o.first, o.first_constant)
-        x = y = result = u
-        if o.kind == PENDING:
-            result, y = DOUBLE(0.0), None
-        elif o.kind == SINE:
-            result, y = emit.function("sin", u), emit.function("cos", u)
-            known.define(o.quantity + o.apart, y)
-            emit.store(emit.negative(result), table, self.width + o.place + o.apart)
-        elif o.kind == PRODUCT:
-            y = known.sum(o.second, o.second_constant)
-            result = emit.multiply(u, y)
-        elif o.kind == RECIPROCAL:
-            result = y = emit.divide(DOUBLE(1.0), u)
+    def _sums_of_products(self, emit: Emitter, base: Value, order: Value) -> dict[int, Value]:
+        """For every group, by its place, the sum of X[j] Y[m - j] over 0 < j < m; m is the order, or one less of late ones.
+
+        Coefficients that are hardly there come last, so that little waits for them.
+        """
+        builder, stride = emit.builder, 2 * self.width
+        groups = [(group, 0) for group in self.early] + [(group, 1) for group in self.late]
+        sums: dict[int, Value] = {}
+
+        def product(x: Value, y: Value, group: Group) -> Value:
+            factors = emit.load_vector(x, group.place, group.width), emit.load_vector(y, self.width + group.place, group.width)
+            return emit.multiply(*factors)
+
+        for begin in range(0, len(groups), AT_ONCE):
+            some = groups[begin : begin + AT_ONCE]
+            zeros = [emit.same(ZERO, group.width) for group, _ in some]
+            with emit.loop(INTEGER(2), builder.sub(order, INTEGER(2)), zeros) as (j, totals, new):
+                x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(order, j))
+                for (group, late), total in zip(some, totals, strict=True):
+                    new.append(emit.add(total, product(x, emit.pointer(y, -stride * late), group)))
+            for (group, _), total in zip(some, new, strict=True):
+                sums[group.place] = total
+        nothing = emit.pointer(base, self.zeros)
+
+        def rows(j: Value, m: Value, least: int) -> tuple[Value, Value]:
+            """X[j] and Y[m - j], or zeros where m is less than `least`."""
+            counts = builder.icmp_signed(">=", m, INTEGER(least))
+            pair = self._row(emit, base, j), self._row(emit, base, builder.sub(m, j))
+            return tuple(builder.select(counts, each, nothing) for each in pair)
+
+        before = builder.sub(order, INTEGER(1))
+        second = builder.sub(order, INTEGER(2))
+        ends = {
+            0: [rows(second, order, 4), rows(before, order, 3), rows(INTEGER(1), order, 2)],
+            1: [rows(second, before, 3), rows(INTEGER(1), before, 2)],
+        }
+        for group, late in groups:
+            for pair in ends[late]:
+                sums[group.place] = emit.add(sums[group.place], product(*pair, group))
+        return sums
+
+    def _begin_group(self, emit: Emitter, base: Value, known: Quantities, group: Group) -> None:
+        """Order 0: the functions themselves; what waits stays zero."""
+        table, place, kind = emit.pointer(base, self.table), group.place, group.kind
+        first = [known.sum(*each) for each in group.first]
+        second = [ZERO if group.pending else known.sum(*each) for each in group.second]
+        u, y = emit.vector(first), emit.vector(second)
+        x, divisor = u, None
+        if group.pending:
+            results = second
+        elif kind == SINE:
+            half = group.width // 2
+            sines, cosines = ([emit.function(name, each) for each in first[:half]] for name in ("sin", "cos"))
+            results, y = [*sines, *cosines], emit.vector([*cosines, *map(emit.negative, sines)])
+        elif kind == PRODUCT:
+            results = emit.elements(emit.multiply(x, y))
+        elif kind == RECIPROCAL:
+            y = emit.divide(emit.same(ONE, group.width), u)
+            results = emit.elements(y)
         else:
-            result = emit.function(FUNCTIONS[o.kind], u)
-            y = result
-            divisor = None
-            if o.kind == SQUARE_ROOT:
-                divisor = emit.times(2.0, result)
-            elif o.kind in (LOGARITHM, ARCTANGENT):
-                divisor = known.sum(o.second, o.second_constant)
-            if divisor is not None:
-                emit.store(emit.divide(DOUBLE(1.0), divisor), base, self.inverses + o.place)
-        known.define(o.quantity, result)
-        emit.store(x, table, o.place)
-        if y is not None:
-            emit.store(y, table, self.width + o.place)
+            results = [emit.function(FUNCTIONS[kind], each) for each in first]
+            if kind in (LOGARITHM, ARCTANGENT):
+                divisor = y
+            else:
+                y = emit.vector(results)
+            if kind == SQUARE_ROOT:
+                divisor = emit.add(y, y)
+        if divisor is not None:
+            inverse = emit.divide(emit.same(ONE, group.width), divisor)
+            emit.store_vector(inverse, base, self.inverses + place)
+        for quantity, result in zip(group.quantities, results, strict=True):
+            known.define(quantity, result)
+        emit.store_vector(x, table, place)
+        if not group.pending:
+            emit.store_vector(y, table, self.width + place)
 
-    def _operation(
+    def _groups_of_order(
         self,
         emit: Emitter,
         base: Value,
         known: Quantities,
-        o: Operation,
-        x_row: Value,
-        y_row: Value,
+        groups: list[Group],
+        sums: dict[int, Value],
         order: Value,
-        inverse: Value,
     ) -> None:
         """An order that is not 0; of what waits, what is known before."""
+        row, number = self._row(emit, base, order), emit.number(order)
+        per_order = emit.divide(ONE, number)
+        for group in groups:
+            kind, place, width, total = group.kind, group.place, group.width, sums[group.place]
 
-        def with_last(place: int, x: Value) -> Value:
-            """The sum of products with that of X of this order."""
-            first = emit.load(base, self.table + self.width + place)
-            return emit.add(emit.load(base, place), emit.multiply(x, first))
+            def at(begin: int, group: Group = group) -> Value:
+                return emit.load_vector(base, begin + group.place, group.width)
 
-        u = known.sum(o.first)
-        x, y = u, None
-        if o.kind == PENDING:
-            result = with_last(o.place, u)
-        elif o.kind == SINE:
-            x = emit.multiply(order, u)
-            other = o.place + o.apart
-            result, y = (emit.multiply(with_last(place, x), inverse) for place in (o.place, other))
-            known.define(o.quantity + o.apart, y)
-            emit.store(x, x_row, other)
-            emit.store(emit.negative(result), y_row, other)
-        elif o.kind == PRODUCT:
-            y = known.sum(o.second)
-            result = emit.add(with_last(o.place, u), emit.multiply(emit.load(base, self.table + o.place), y))
-        elif o.kind == RECIPROCAL:
-            first = emit.load(base, self.table + self.width + o.place)
-            result = y = emit.negative(emit.multiply(with_last(o.place, u), first))
-        elif o.kind == EXPONENTIAL:
-            x = emit.multiply(order, u)
-            result = y = emit.multiply(with_last(o.place, x), inverse)
-        elif o.kind == SQUARE_ROOT:
-            difference = emit.subtract(u, emit.load(base, o.place))
-            result = x = y = emit.multiply(difference, emit.load(base, self.inverses + o.place))
-        else:
-            y = known.sum(o.second)
-            difference = emit.subtract(u, emit.multiply(emit.load(base, o.place), inverse))
-            result = emit.multiply(difference, emit.load(base, self.inverses + o.place))
-            x = emit.multiply(order, result)
-        known.define(o.quantity, result)
-        emit.store(x, x_row, o.place)
-        if y is not None:
-            emit.store(y, y_row, o.place)
+            def with_last(x: Value, total: Value = total, at: Any = at) -> Value:
+                """The sum of products with that of X of this order."""
+                return emit.add(total, emit.multiply(x, at(self.table + self.width)))
+
+            x = y = emit.vector([known.sum(each.terms) for each in group.first])
+            if kind in (EXPONENTIAL, SINE):
+                x = emit.multiply(emit.same(number, width), x)
+                result = y = emit.multiply(with_last(x), emit.same(per_order, width))
+                if kind == SINE:
+                    results = emit.elements(result)
+                    y = emit.vector([*results[width // 2 :], *map(emit.negative, results[: width // 2])])
+            elif kind == PENDING:
+                result = with_last(x)
+            elif kind == PRODUCT:
+                y = emit.vector([known.sum(each.terms) for each in group.second])
+                result = emit.add(with_last(x), emit.multiply(at(self.table), y))
+            elif kind == RECIPROCAL:
+                result = y = emit.negative(emit.multiply(with_last(x), at(self.table + self.width)))
+            elif kind == SQUARE_ROOT:
+                result = x = y = emit.multiply(emit.subtract(x, total), at(self.inverses))
+            else:
+                y = emit.vector([known.sum(each.terms) for each in group.second])
+                difference = emit.subtract(x, emit.multiply(total, emit.same(per_order, width)))
+                result = emit.multiply(difference, at(self.inverses))
+                x = emit.multiply(emit.same(number, width), result)
+            for quantity, value in zip(group.quantities, emit.elements(result), strict=True):
+                known.define(quantity, value)
+            emit.store_vector(x, row, place)
+            if not group.pending:
+                emit.store_vector(y, row, self.width + place)
 
 
 def _rounded(size: int) -> int:
     """So many doubles that vectors may begin behind them."""
     return -(-size // WIDTH) * WIDTH
-
-
-def _vector(size: int) -> int:
-    """Width of the vector that holds so many doubles, or the first of them."""
-    return next((width for width in (2, 4) if size <= width), WIDTH)
 
 
 def compiled_series(program: SeriesProgram) -> Dispatcher:
