@@ -115,7 +115,9 @@ class Emitter:
         self.builder.store(value, pointer, align=8 * getattr(value.type, "count", 1))
 
     @contextmanager
-    def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Value], list[Value]]]:
+    def loop(
+        self, first: Value, end: Value, initial: Sequence[Value]
+    ) -> Iterator[tuple[Value, list[Value], list[Value]]]:
         """A loop over integers from `first` to below `end`: the integer, what is carried from one turn to the next, and
         a list that takes its new values; after the loop it has the last ones."""
         builder = self.builder

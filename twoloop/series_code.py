@@ -283,7 +283,10 @@ class SeriesCode:
         sums: dict[int, Value] = {}
 
         def product(x: Value, y: Value, group: Group) -> Value:
-            factors = emit.load_vector(x, group.place, group.width), emit.load_vector(y, self.width + group.place, group.width)
+            factors = (
+                emit.load_vector(x, group.place, group.width),
+                emit.load_vector(y, self.width + group.place, group.width),
+            )
             return emit.multiply(*factors)
 
         for begin in range(0, len(groups), AT_ONCE):

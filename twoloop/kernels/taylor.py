@@ -377,10 +377,10 @@ def _length(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate(series, unit, order, x, q, v):
-    """q and v at x units of time, by Horner's scheme, four coordinates at once."""
+    """q and v at x units of time, by Horner's scheme; four coordinates at once, some of the last ones twice."""
     n, per_unit = q.size, 1.0 / unit
-    whole = n - n % 4
-    for j in range(0, whole, 4):
+    for first in range(0, n if n > 3 else 0, 4):
+        j = min(first, n - 4)
         q0, q1, q2, q3 = series[order, j], series[order, j + 1], series[order, j + 2], series[order, j + 3]
         v0 = v1 = v2 = v3 = 0.0
         for k in range(order - 1, -1, -1):
@@ -389,7 +389,7 @@ def _evaluate(series, unit, order, x, q, v):
             q2, q3 = q2 * x + series[k, j + 2], q3 * x + series[k, j + 3]
         q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
         v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
-    for j in range(whole, n):
+    for j in range(n if n < 4 else 0):
         q0, v0 = series[order, j], 0.0
         for k in range(order - 1, -1, -1):
             v0 = v0 * x + q0
