@@ -1,7 +1,7 @@
 """Arithmetic on numbers in memory as LLVM code, for code made for one mechanism.
 
-Numba takes milliseconds for a line of source, and LLVM microseconds for an operation. So what is nothing but a long
-list of operations is handed to LLVM directly, by numba's `intrinsic`, and numba sees a single call.
+Numba takes milliseconds for a line of source, and LLVM well below a millisecond for an operation. So a long list of
+operations goes to LLVM directly, by numba's `intrinsic`, and numba sees a single call.
 """
 
 import inspect
@@ -17,38 +17,47 @@ from numba.np.arrayobj import make_array
 from twoloop.callbacks import VECTOR
 from twoloop.kernels.common import OPTIONS
 
-Value = Any  # of LLVM
+Value = Any  # of LLVM: a double, a vector of doubles, an integer or a pointer to doubles
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
 FLAGS = tuple(sorted(OPTIONS["fastmath"]))
 DOUBLE, INTEGER, WORD = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
-ALIGNMENT = 64  # bytes: no vector lies in two lines of the cache
+ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
+ALIGNMENT = 64  # bytes, of the widest vector: none lies in two lines of the cache
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt")}  # other functions are libm's
 
 
 class Emitter:
-    """Appends operations to a function of LLVM; pointers are to doubles, places are counted in doubles."""
+    """Appends operations to a function of LLVM.
+
+    Operations are on doubles or on vectors of them. Places in memory are counted in doubles.
+    """
 
     def __init__(self, builder: ir.IRBuilder):
         self.builder = builder
 
     def add(self, a: Value, b: Value) -> Value:
+        """a + b."""
         return self.builder.fadd(a, b, flags=FLAGS)
 
     def subtract(self, a: Value, b: Value) -> Value:
+        """a - b."""
         return self.builder.fsub(a, b, flags=FLAGS)
 
     def multiply(self, a: Value, b: Value) -> Value:
+        """a b."""
         return self.builder.fmul(a, b, flags=FLAGS)
 
     def divide(self, a: Value, b: Value) -> Value:
+        """a / b."""
         return self.builder.fdiv(a, b, flags=FLAGS)
 
     def negative(self, a: Value) -> Value:
+        """-a."""
         return self.builder.fneg(a, flags=FLAGS)
 
     def times(self, factor: float, a: Value) -> Value:
-        """A multiple by a known number."""
+        """A multiple of a number by a known one."""
         if abs(factor) == 1.0:
             return a if factor == 1.0 else self.negative(a)
         return self.multiply(DOUBLE(factor), a)
@@ -58,9 +67,8 @@ class Emitter:
         return self.builder.sitofp(integer, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """A function of libm."""
-        known = INTRINSICS.get(name)
-        module = self.builder.module
+        """A function of libm, of a number."""
+        known, module = INTRINSICS.get(name), self.builder.module
         if known:
             function = module.declare_intrinsic(known, [DOUBLE])
         else:
@@ -79,17 +87,31 @@ class Emitter:
         return self.builder.inttoptr(self.builder.and_(address, INTEGER(-ALIGNMENT)), pointer.type)
 
     def load(self, base: Value, place: int = 0) -> Value:
+        """The number at a place."""
         return self.builder.load(self.pointer(base, place))
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
+        """Put a number at a place."""
         self.builder.store(value, self.pointer(base, place))
 
+    def load_vector(self, base: Value, place: int, width: int) -> Value:
+        """As many numbers side by side; base + place is aligned to them.
+
+        Slow just after they were stored one by one, because the processor then waits until they are in its cache.
+        """
+        pointer = self.builder.bitcast(self.pointer(base, place), _vector_type(width).as_pointer())
+        return self.builder.load(pointer, align=8 * width)
+
+    def store_vector(self, value: Value, base: Value, place: int) -> None:
+        """Put numbers side by side; base + place is aligned to them."""
+        pointer = self.builder.bitcast(self.pointer(base, place), value.type.as_pointer())
+        self.builder.store(value, pointer, align=8 * getattr(value.type, "count", 1))
+
     def vector(self, values: Sequence[Value]) -> Value:
-        """Numbers side by side, as many as a power of 2; one number as it is."""
+        """Numbers side by side; one number as it is."""
         if len(values) == 1:
             return values[0]
-        kind = ir.VectorType(DOUBLE, len(values))
-        vector = kind(ir.Undefined)
+        vector = _vector_type(len(values))(ir.Undefined)
         for place, value in enumerate(values):
             vector = self.builder.insert_element(vector, value, WORD(place))
         return vector
@@ -100,26 +122,13 @@ class Emitter:
             return [vector]
         return [self.builder.extract_element(vector, WORD(place)) for place in range(vector.type.count)]
 
-    def same(self, value: Value, width: int) -> Value:
-        """A vector of equal numbers."""
-        return self.vector([value] * width)
-
-    def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """Numbers side by side, of an aligned pointer."""
-        pointer = self.builder.bitcast(self.pointer(base, place), vector_type(width).as_pointer())
-        return self.builder.load(pointer, align=8 * width)
-
-    def store_vector(self, value: Value, base: Value, place: int) -> None:
-        """The same into memory."""
-        pointer = self.builder.bitcast(self.pointer(base, place), value.type.as_pointer())
-        self.builder.store(value, pointer, align=8 * getattr(value.type, "count", 1))
-
     @contextmanager
-    def loop(
-        self, first: Value, end: Value, initial: Sequence[Value]
-    ) -> Iterator[tuple[Value, list[Value], list[Value]]]:
-        """A loop over integers from `first` to below `end`: the integer, what is carried from one turn to the next, and
-        a list that takes its new values; after the loop it has the last ones."""
+    def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
+        """A loop over integers from `first` to below `end`.
+
+        Yields the integer; what is carried from one turn to the next, `initial` in the first; and a list that takes
+        its new values. After the loop that list has the last ones.
+        """
         builder = self.builder
         before, body, after = builder.block, builder.append_basic_block(), builder.append_basic_block()
         builder.cbranch(builder.icmp_signed("<", first, end), body, after)
@@ -127,24 +136,18 @@ class Emitter:
         index = builder.phi(INTEGER)
         index.add_incoming(first, before)
         carried = [builder.phi(value.type) for value in initial]
-        new: list[Value] = []
+        new: list[Any] = []
         yield index, carried, new
         following, last = builder.add(index, INTEGER(1)), builder.block
         index.add_incoming(following, last)
         builder.cbranch(builder.icmp_signed("<", following, end), body, after)
         builder.position_at_end(after)
         for k, value in enumerate(initial):
-            carried[k].add_incoming(value, before)
-            carried[k].add_incoming(new[k], last)
             result = builder.phi(value.type)
-            result.add_incoming(value, before)
-            result.add_incoming(new[k], last)
+            for phi in (carried[k], result):
+                phi.add_incoming(value, before)
+                phi.add_incoming(new[k], last)
             new[k] = result
-
-
-def vector_type(width: int) -> ir.Type:
-    """Of so many doubles side by side; one is a double."""
-    return DOUBLE if width == 1 else ir.VectorType(DOUBLE, width)
 
 
 class Quantities:
@@ -160,46 +163,45 @@ class Quantities:
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
-        self._sums: dict[tuple[float, Terms], Value] = {}
+        self._sums: dict[tuple[Terms, float], Value] = {}
 
     def define(self, quantity: int, value: Value) -> None:
+        """Give a quantity its value."""
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
+        """What was defined, or loaded."""
         if quantity not in self._values:
             self._values[quantity] = self._load(quantity)
         return self._values[quantity]
 
     def sum(self, terms: Terms, constant: float = 0.0) -> Value:
-        """constant + sum of coefficient * quantity."""
-        key = constant, terms
+        """constant + the sum of coefficient * quantity."""
+        key = terms, constant
         if key not in self._sums:
-            self._sums[key] = self._sum(terms, constant)
+            total = None if constant == 0.0 and terms else DOUBLE(constant)
+            for quantity, coefficient in terms:
+                value = self.value(quantity)
+                if total is None:
+                    total = self._emit.times(coefficient, value)
+                elif coefficient == -1.0:
+                    total = self._emit.subtract(total, value)
+                else:
+                    total = self._emit.add(total, self._emit.times(coefficient, value))
+            self._sums[key] = total
         return self._sums[key]
 
-    def _sum(self, terms: Terms, constant: float) -> Value:
-        emit = self._emit
-        total = None if constant == 0.0 and terms else DOUBLE(constant)
-        for quantity, coefficient in terms:
-            value = self.value(quantity)
-            if total is None:
-                total = emit.times(coefficient, value)
-            elif coefficient == -1.0:
-                total = emit.subtract(total, value)
-            else:
-                total = emit.add(total, emit.times(coefficient, value))
-        return total
 
-
-def emitted(emit: Callable[..., Value | None], result: Any, **arguments: Any) -> Any:
+def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
     """What numba takes for a function, whose code is written by emit(emitter, *arguments).
 
     Parameters
     ----------
     emit : callable
-        Gets vectors as pointers to their first elements.
+        Gets vectors as pointers to their first elements; returns the result, None for `types.none`.
     result : numba type
     **arguments : numba types
+        Under their names.
     """
 
     def typing(typingctx, *given):  # type: ignore[no-untyped-def]
@@ -213,7 +215,11 @@ def emitted(emit: Callable[..., Value | None], result: Any, **arguments: Any) ->
 
         return signature(result, *arguments.values()), generate
 
-    names = ["typingctx", *arguments]  # numba looks for them here
+    names = ["typingctx", *arguments]
     parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
-    typing.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    typing.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # where numba looks for names
     return intrinsic(typing)
+
+
+def _vector_type(width: int) -> ir.Type:
+    return DOUBLE if width == 1 else ir.VectorType(DOUBLE, width)

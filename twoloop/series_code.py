@@ -1,25 +1,26 @@
 """The series of one mechanism as code compiled for it: the same numbers as by the program, in a fraction of the time.
 
 What the program looks up at every order, which quantity times which coefficient, stands in the code, which goes to LLVM
-as a straight line of operations. Its machine code is kept on disk as that of the kernels.
+as a straight line of operations for one order. Its machine code is kept on disk as that of the kernels.
 
-The factors X and Y of all products are rows of a table, one for each order, so that the sums of products of known
-coefficients are vector operations. Late operations are an order behind: their factors X stand one row below their
-order, which makes these sums run over the same rows as those of the early ones.
+The factors X and Y of all products stand in rows, one for each order, so that sums of products of known coefficients
+are vector operations. What a processor has stored number by number it cannot read as a vector at once. So vectors are
+put together in registers, and the newest coefficients come last in the sums.
 """
 
 import hashlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
-from twoloop import llvm_code
+from twoloop import llvm_code, series_groups
 from twoloop.caches import compile_kept
 from twoloop.callbacks import VECTOR, f8
-from twoloop.llvm_code import DOUBLE, INTEGER, Emitter, Quantities, Terms, Value, emitted
-from twoloop.series import SeriesProgram, Sums, Table
+from twoloop.llvm_code import INTEGER, ONE, ZERO, Emitter, Quantities, Value, emitted
+from twoloop.series import SeriesProgram
+from twoloop.series_groups import WIDTH, Group, Groups, rounded
 from twoloop.tracing import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -31,84 +32,11 @@ from twoloop.tracing import (
     SQUARE_ROOT,
 )
 
-LARGEST = 4000  # operations; more take longer than ten seconds to compile
-WIDTH = 8  # doubles of a vector
+LARGEST = 5000  # operations; more take longer than ten seconds to compile
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
-
-i8 = types.int64
-ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
-
-class Argument(NamedTuple):
-    """A form."""
-
-    terms: Terms
-    constant: float
-
-
-class Group(NamedTuple):
-    """Operations of one kind that do not depend on one another, side by side in a vector; at its end, the last again."""
-
-    kind: int
-    place: int  # in the rows of X and Y
-    width: int
-    quantities: list[int]  # that they make
-    first: list[Argument]
-    second: list[Argument]
-
-    @property
-    def pending(self) -> bool:
-        """Whether the second factors wait for the solution of an order."""
-        return self.kind == PENDING
-
-
-class Row(NamedTuple):
-    """An entry of a right-hand side."""
-
-    place: int
-    terms: Terms
-    constant: float
-
-
-def _terms(sums: Sums, rows: Any) -> list[Terms]:
-    """Quantities and coefficients of each form."""
-    more: dict[int, list[tuple[int, float]]] = {int(row): [] for row in rows}
-    for row, column, coefficient in zip(sums.row, sums.more_column, sums.more_coefficient, strict=True):
-        more[int(row)].append((int(column), float(coefficient)))
-    firsts = zip(rows, sums.column, sums.coefficient, strict=True)
-    each = [[(int(column), float(coefficient)), *more[int(row)]] for row, column, coefficient in firsts]
-    return [tuple((i, c) for i, c in terms if c != 0.0) for terms in each]
-
-
-def _arguments(sums: Sums) -> list[Argument]:
-    numbers = range(len(sums.column))
-    return [Argument(*each) for each in zip(_terms(sums, numbers), sums.constant.tolist(), strict=True)]
-
-
-def _groups(table: Table, quantity: int) -> list[Group]:
-    """Those of a table, whose first operation makes this quantity; they have no places yet.
-
-    Of sines, the cosines of the same angles are the second half.
-    """
-    first, second = _arguments(table.first), _arguments(table.second)
-    groups = []
-    for kind, begin, end in table.groups[:, :3].tolist():
-        halves = 2 if kind == SINE else 1
-        size, most = (end - begin) // halves, WIDTH // halves
-        for part in range(0, size, most):
-            few = min(most, size - part)
-            width = 1 << (few - 1).bit_length()
-            members = [begin + h * size + part + min(k, few - 1) for h in range(halves) for k in range(width)]
-            quantities = [quantity + o for o in members]
-            groups.append(
-                Group(kind, 0, len(members), quantities, [first[o] for o in members], [second[o] for o in members])
-            )
-    return groups
-
-
-def _rows(sums: Sums, places: Any) -> list[Row]:
-    return [Row(*each) for each in zip(places.tolist(), _terms(sums, places), sums.constant.tolist(), strict=True)]
+i8 = types.int64
 
 
 class SeriesCode:
@@ -119,28 +47,13 @@ class SeriesCode:
     """
 
     def __init__(self, program: SeriesProgram):
-        n, n_early = program.n_q, len(program.early.first.column)
-        self.n, self.n_rows = n, program.n_rows
-        self.first = 1 + 3 * n + program.n_rows  # quantity that is a result
-        groups = {True: _groups(program.early, self.first), False: _groups(program.late, self.first + n_early)}
-        self.width = 0
-        for width in (8, 4, 2, 1):  # so that vectors are aligned
-            for each in groups.values():
-                for k, group in enumerate(each):
-                    if group.width == width:
-                        each[k] = group._replace(place=self.width)
-                        self.width += width
-        self.width = _rounded(self.width)
-        self.early, self.late = groups[True], groups[False]
-        self.rows = _rows(program.rows, program.row_places)
-        self.balance = _rows(program.balance, program.balance_places)
-        self.velocities = _rounded(n_early)
-        self.inverses = self.velocities + _rounded(n)
+        self.n, self.n_rows = program.n_q, program.n_rows
+        self.groups = groups = Groups(program)
+        self.width, self.first, self.kept = groups.width, groups.first, groups.kept
+        self.velocities = rounded(groups.n_early)
+        self.inverses = self.velocities + rounded(self.n)
         self.zeros = self.inverses + self.width
         self.table = self.zeros + 2 * self.width
-        arguments = [each for group in self.late for each in (*group.first, *group.second)]
-        terms = [each.terms for each in arguments] + [row.terms for row in self.balance]
-        self.kept = {i for each in terms for i, _ in each}  # quantities that are needed an order later
 
     def scratch_size(self, order: int) -> int:
         """Length of `scratch` for a series of this order."""
@@ -160,6 +73,9 @@ class SeriesCode:
     ) -> None:
         """What is known of the orders 0 and 1, and the early operations of order 0; r, c and lam are zero."""
         base = emit.aligned(scratch)
+        zeros = emit.vector([ZERO] * WIDTH)
+        for place in range(0, 2 * self.width, WIDTH):
+            emit.store_vector(zeros, base, self.zeros + place)
         for size, out in ((self.n, r), (self.n_rows, c), (self.n_rows, lam)):
             for i in range(size):
                 emit.store(ZERO, out, i)
@@ -169,87 +85,65 @@ class SeriesCode:
             emit.store(q, series, j)
             emit.store(emit.multiply(unit, v), series, self.n + j)
             emit.store(v, base, self.velocities + j)
-        table = emit.pointer(base, self.table)
-        for group in self.early:
+        for group in self.groups.early:
             self._begin_group(emit, base, known, group)
             if group.pending:
-                self._store_waiting(emit, known, group, table)
+                self._store_waiting(emit, known, group, emit.pointer(base, self.table))
         self._keep(emit, base, known)
 
-    def order(
-        self,
-        emit: Emitter,
-        scratch: Value,
-        series: Value,
-        r: Value,
-        c: Value,
-        t: Value,
-        unit: Value,
-        order: Value,
+    def find_order(
+        self, emit: Emitter, scratch: Value, series: Value, r: Value, c: Value, t: Value, unit: Value, order: Value
     ) -> None:
         """Late operations of the order before and early ones of this order, as far as they are known; r and c."""
-        builder, base = emit.builder, emit.aligned(scratch)
-        q = emit.pointer(series, builder.mul(order, INTEGER(self.n)))
-        before = builder.sub(order, INTEGER(1))
+        base, before = emit.aligned(scratch), emit.builder.sub(order, INTEGER(1))
+        q = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
         sums = self._sums_of_products(emit, base, order)
-
-        def quantities(time: Value) -> Quantities:
-            def load(i: int) -> Value:
-                if i == 0:
-                    return time
-                if i <= self.n:
-                    return emit.load(q, i - 1 - self.n)
-                place = self.velocities + i - 1 - self.n if i < self.first else i - self.first
-                return emit.load(base, place)
-
-            return Quantities(emit, load)
-
-        with builder.if_else(builder.icmp_signed("==", order, INTEGER(1))) as (then, otherwise):
+        is_first = emit.builder.icmp_signed("==", order, INTEGER(1))
+        with emit.builder.if_else(is_first) as (then, otherwise):
             with then:
-                known = quantities(t)
-                for group in self.late:
+                known = self._quantities_before(emit, base, q, t)
+                for group in self.groups.late:
                     self._begin_group(emit, base, known, group)
-                for place, terms, constant in self.balance:
+                for place, terms, constant in self.groups.balance:
                     emit.store(known.sum(terms, constant), r, place)
             with otherwise:
-                known = quantities(self._time(emit, unit, before))
-                self._groups_of_order(emit, base, known, self.late, sums, before)
-                for place, terms, _ in self.balance:
+                known = self._quantities_before(emit, base, q, self._time(emit, unit, before))
+                self._operate(emit, base, known, self.groups.late, sums, before)
+                for place, terms, _ in self.groups.balance:
                     emit.store(known.sum(terms), r, place)
         time = self._time(emit, unit, order)
         known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
-        self._groups_of_order(emit, base, known, self.early, sums, order)
+        self._operate(emit, base, known, self.groups.early, sums, order)
         scale = emit.negative(emit.divide(emit.number(order), unit))
-        for place, terms, _ in self.rows:
+        for place, terms, _ in self.groups.rows:
             emit.store(emit.multiply(scale, known.sum(terms)), c, place)
         self._keep(emit, base, known)
 
-    def take(
+    def take_order(
         self, emit: Emitter, scratch: Value, series: Value, a: Value, lam: Value, unit: Value, order: Value
     ) -> None:
         """Velocities of this order and positions of the next, from accelerations; the factors that waited for them."""
-        base = emit.aligned(scratch)
-        following = emit.builder.add(order, INTEGER(1))
-        next_q = emit.pointer(series, emit.builder.mul(following, INTEGER(self.n)))
+        n, base, following = self.n, emit.aligned(scratch), emit.builder.add(order, INTEGER(1))
+        next_q = emit.pointer(series, emit.builder.mul(following, INTEGER(n)))
         per_v, per_q = (emit.divide(unit, emit.number(each)) for each in (order, following))
 
         def load(i: int) -> Value:
-            return emit.load(a, i - 1 - 2 * self.n) if i <= 3 * self.n else emit.load(lam, i - 1 - 3 * self.n)
+            return emit.load(a, i - 1 - 2 * n) if i <= 3 * n else emit.load(lam, i - 1 - 3 * n)
 
         known = Quantities(emit, load)
-        for j in range(self.n):
-            v = emit.multiply(per_v, known.value(1 + 2 * self.n + j))
-            known.define(1 + self.n + j, v)
-            if 1 + self.n + j in self.kept:
+        for j in range(n):
+            v = emit.multiply(per_v, known.value(1 + 2 * n + j))
+            known.define(1 + n + j, v)
+            if 1 + n + j in self.kept:
                 emit.store(v, base, self.velocities + j)
             emit.store(emit.multiply(per_q, v), next_q, j)
         before = emit.builder.sub(order, INTEGER(1))
-        for groups, each in ((self.early, order), (self.late, before)):
+        for groups, of in ((self.groups.early, order), (self.groups.late, before)):
             for group in groups:
                 if group.pending:
-                    self._store_waiting(emit, known, group, self._row(emit, base, each))
+                    self._store_waiting(emit, known, group, self._row(emit, base, of))
 
-    def finite(self, emit: Emitter, series: Value, order: Value) -> Value:
+    def is_finite(self, emit: Emitter, series: Value, order: Value) -> Value:
         """Whether the last coefficients are."""
         last = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
         total = ZERO
@@ -264,76 +158,81 @@ class SeriesCode:
         """The coefficient of the time, of an order that is not 0."""
         return emit.builder.select(emit.builder.icmp_signed("==", order, INTEGER(1)), unit, ZERO)
 
+    def _quantities_before(self, emit: Emitter, base: Value, q: Value, time: Value) -> Quantities:
+        """Of the order before that of q, from where they are kept."""
+
+        def load(i: int) -> Value:
+            if i == 0:
+                return time
+            if i <= self.n:
+                return emit.load(q, i - 1 - self.n)
+            return emit.load(base, self.velocities + i - 1 - self.n if i < self.first else i - self.first)
+
+        return Quantities(emit, load)
+
     def _keep(self, emit: Emitter, base: Value, known: Quantities) -> None:
-        made = {i for group in self.early for i in group.quantities}
-        for i in sorted(self.kept & made):
-            emit.store(known.value(i), base, i - self.first)
+        for i in range(self.first, self.first + self.groups.n_early):
+            if i in self.kept:
+                emit.store(known.value(i), base, i - self.first)
 
     def _store_waiting(self, emit: Emitter, known: Quantities, group: Group, row: Value) -> None:
         y = emit.vector([known.sum(each.terms) for each in group.second])
         emit.store_vector(y, row, self.width + group.place)
 
     def _sums_of_products(self, emit: Emitter, base: Value, order: Value) -> dict[int, Value]:
-        """For every group, by its place, the sum of X[j] Y[m - j] over 0 < j < m; m is the order, or one less of late ones.
+        """For groups, by place, the sum of X[j] Y[m - j] over 0 < j < m; m is the order, of late ones one less."""
+        builder = emit.builder
+        groups = [(group, 0) for group in self.groups.early] + [(group, 1) for group in self.groups.late]
+        nothing = emit.pointer(base, self.zeros)
+        one, two, before, before_it = INTEGER(1), INTEGER(2), *(builder.sub(order, INTEGER(i)) for i in (1, 2))
 
-        Coefficients that are hardly there come last, so that little waits for them.
-        """
-        builder, stride = emit.builder, 2 * self.width
-        groups = [(group, 0) for group in self.early] + [(group, 1) for group in self.late]
-        sums: dict[int, Value] = {}
+        def rows(j: Value, m: Value, least: int) -> tuple[Value, Value]:
+            """Rows of X[j] and Y[m - j], or zeros where m is less than `least`."""
+            there = builder.icmp_signed(">=", m, INTEGER(least))
+            x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(m, j))
+            return builder.select(there, x, nothing), builder.select(there, y, nothing)
 
-        def product(x: Value, y: Value, group: Group) -> Value:
-            factors = (
+        def with_product(total: Value, x: Value, y: Value, group: Group) -> Value:
+            x, y = (
                 emit.load_vector(x, group.place, group.width),
                 emit.load_vector(y, self.width + group.place, group.width),
             )
-            return emit.multiply(*factors)
+            return emit.add(total, emit.multiply(x, y))
 
+        sums: dict[int, Value] = {}
         for begin in range(0, len(groups), AT_ONCE):
             some = groups[begin : begin + AT_ONCE]
-            zeros = [emit.same(ZERO, group.width) for group, _ in some]
-            with emit.loop(INTEGER(2), builder.sub(order, INTEGER(2)), zeros) as (j, totals, new):
+            zeros = [emit.vector([ZERO] * group.width) for group, _ in some]
+            with emit.loop(two, before_it, zeros) as (j, totals, new):
                 x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(order, j))
                 for (group, late), total in zip(some, totals, strict=True):
-                    new.append(emit.add(total, product(x, emit.pointer(y, -stride * late), group)))
-            for (group, _), total in zip(some, new, strict=True):
-                sums[group.place] = total
-        nothing = emit.pointer(base, self.zeros)
-
-        def rows(j: Value, m: Value, least: int) -> tuple[Value, Value]:
-            """X[j] and Y[m - j], or zeros where m is less than `least`."""
-            counts = builder.icmp_signed(">=", m, INTEGER(least))
-            pair = self._row(emit, base, j), self._row(emit, base, builder.sub(m, j))
-            return tuple(builder.select(counts, each, nothing) for each in pair)
-
-        before = builder.sub(order, INTEGER(1))
-        second = builder.sub(order, INTEGER(2))
-        ends = {
-            0: [rows(second, order, 4), rows(before, order, 3), rows(INTEGER(1), order, 2)],
-            1: [rows(second, before, 3), rows(INTEGER(1), before, 2)],
-        }
+                    new.append(with_product(total, x, emit.pointer(y, -2 * self.width * late), group))
+            sums |= {group.place: total for (group, _), total in zip(some, new, strict=True)}
+        last = [
+            [rows(before_it, order, 4), rows(before, order, 3), rows(one, order, 2)],
+            [rows(before_it, before, 3), rows(one, before, 2)],
+        ]
         for group, late in groups:
-            for pair in ends[late]:
-                sums[group.place] = emit.add(sums[group.place], product(*pair, group))
+            for pair in last[late]:
+                sums[group.place] = with_product(sums[group.place], *pair, group)
         return sums
 
     def _begin_group(self, emit: Emitter, base: Value, known: Quantities, group: Group) -> None:
         """Order 0: the functions themselves; what waits stays zero."""
-        table, place, kind = emit.pointer(base, self.table), group.place, group.kind
+        kind, table, half = group.kind, emit.pointer(base, self.table), group.width // 2
         first = [known.sum(*each) for each in group.first]
         second = [ZERO if group.pending else known.sum(*each) for each in group.second]
-        u, y = emit.vector(first), emit.vector(second)
-        x, divisor = u, None
-        if group.pending:
+        x, y = emit.vector(first), emit.vector(second)
+        ones, divisor = emit.vector([ONE] * group.width), None
+        if kind == PENDING:
             results = second
-        elif kind == SINE:
-            half = group.width // 2
-            sines, cosines = ([emit.function(name, each) for each in first[:half]] for name in ("sin", "cos"))
-            results, y = [*sines, *cosines], emit.vector([*cosines, *map(emit.negative, sines)])
         elif kind == PRODUCT:
             results = emit.elements(emit.multiply(x, y))
+        elif kind == SINE:
+            sines, cosines = ([emit.function(name, each) for each in first[:half]] for name in ("sin", "cos"))
+            results, y = [*sines, *cosines], emit.vector([*cosines, *map(emit.negative, sines)])
         elif kind == RECIPROCAL:
-            y = emit.divide(emit.same(ONE, group.width), u)
+            y = emit.divide(ones, x)
             results = emit.elements(y)
         else:
             results = [emit.function(FUNCTIONS[kind], each) for each in first]
@@ -344,15 +243,14 @@ class SeriesCode:
             if kind == SQUARE_ROOT:
                 divisor = emit.add(y, y)
         if divisor is not None:
-            inverse = emit.divide(emit.same(ONE, group.width), divisor)
-            emit.store_vector(inverse, base, self.inverses + place)
+            emit.store_vector(emit.divide(ones, divisor), base, self.inverses + group.place)
         for quantity, result in zip(group.quantities, results, strict=True):
             known.define(quantity, result)
-        emit.store_vector(x, table, place)
+        emit.store_vector(x, table, group.place)
         if not group.pending:
-            emit.store_vector(y, table, self.width + place)
+            emit.store_vector(y, table, self.width + group.place)
 
-    def _groups_of_order(
+    def _operate(
         self,
         emit: Emitter,
         base: Value,
@@ -363,90 +261,115 @@ class SeriesCode:
     ) -> None:
         """An order that is not 0; of what waits, what is known before."""
         row, number = self._row(emit, base, order), emit.number(order)
-        per_order = emit.divide(ONE, number)
+        inverse = emit.divide(ONE, number)
         for group in groups:
-            kind, place, width, total = group.kind, group.place, group.width, sums[group.place]
-
-            def at(begin: int, group: Group = group) -> Value:
-                return emit.load_vector(base, begin + group.place, group.width)
-
-            def with_last(x: Value, total: Value = total, at: Any = at) -> Value:
-                """The sum of products with that of X of this order."""
-                return emit.add(total, emit.multiply(x, at(self.table + self.width)))
-
-            x = y = emit.vector([known.sum(each.terms) for each in group.first])
-            if kind in (EXPONENTIAL, SINE):
-                x = emit.multiply(emit.same(number, width), x)
-                result = y = emit.multiply(with_last(x), emit.same(per_order, width))
-                if kind == SINE:
-                    results = emit.elements(result)
-                    y = emit.vector([*results[width // 2 :], *map(emit.negative, results[: width // 2])])
-            elif kind == PENDING:
-                result = with_last(x)
-            elif kind == PRODUCT:
-                y = emit.vector([known.sum(each.terms) for each in group.second])
-                result = emit.add(with_last(x), emit.multiply(at(self.table), y))
-            elif kind == RECIPROCAL:
-                result = y = emit.negative(emit.multiply(with_last(x), at(self.table + self.width)))
-            elif kind == SQUARE_ROOT:
-                result = x = y = emit.multiply(emit.subtract(x, total), at(self.inverses))
-            else:
-                y = emit.vector([known.sum(each.terms) for each in group.second])
-                difference = emit.subtract(x, emit.multiply(total, emit.same(per_order, width)))
-                result = emit.multiply(difference, at(self.inverses))
-                x = emit.multiply(emit.same(number, width), result)
-            for quantity, value in zip(group.quantities, emit.elements(result), strict=True):
+            known_factors = [emit.vector([known.sum(each.terms) for each in group.first])]
+            if group.kind in (PRODUCT, LOGARITHM, ARCTANGENT):
+                known_factors.append(emit.vector([known.sum(each.terms) for each in group.second]))
+            scales = (emit.vector([each] * group.width) for each in (number, inverse))
+            results, x, y = self._recurrence(emit, base, group, sums[group.place], *scales, *known_factors)
+            for quantity, value in zip(group.quantities, emit.elements(results), strict=True):
                 known.define(quantity, value)
-            emit.store_vector(x, row, place)
+            emit.store_vector(x, row, group.place)
             if not group.pending:
-                emit.store_vector(y, row, self.width + place)
+                emit.store_vector(y, row, self.width + group.place)
+
+    def _recurrence(
+        self,
+        emit: Emitter,
+        base: Value,
+        group: Group,
+        total: Value,
+        number: Value,
+        inverse: Value,
+        u: Value,
+        z: Value = None,
+    ) -> tuple[Value, Value, Value]:
+        """Results and factors X and Y of order `number`, from arguments u and z and the sum of products."""
+
+        def at(place: int) -> Value:
+            return emit.load_vector(base, place + group.place, group.width)
+
+        def with_last(x: Value) -> Value:
+            """The sum of products with that of X of this order."""
+            return emit.add(total, emit.multiply(x, at(self.table + self.width)))
+
+        kind = group.kind
+        if kind == PENDING:
+            return with_last(u), u, None
+        if kind == PRODUCT:
+            return emit.add(with_last(u), emit.multiply(at(self.table), z)), u, z
+        if kind == RECIPROCAL:
+            y = emit.negative(emit.multiply(with_last(u), at(self.table + self.width)))
+            return y, u, y
+        if kind == SQUARE_ROOT:
+            x = emit.multiply(emit.subtract(u, total), at(self.inverses))
+            return x, x, x
+        if kind in (LOGARITHM, ARCTANGENT):
+            result = emit.multiply(emit.subtract(u, emit.multiply(total, inverse)), at(self.inverses))
+            return result, emit.multiply(number, result), z
+        x = emit.multiply(number, u)
+        result = y = emit.multiply(with_last(x), inverse)
+        if kind == SINE:
+            each, half = emit.elements(result), group.width // 2
+            y = emit.vector([*each[half:], *map(emit.negative, each[:half])])
+        return result, x, y
 
 
-def _rounded(size: int) -> int:
-    """So many doubles that vectors may begin behind them."""
-    return -(-size // WIDTH) * WIDTH
+class CompiledSeries(NamedTuple):
+    """Machine code of a program, to be called as a step is, and what wrote it."""
+
+    function: Dispatcher
+    code: SeriesCode
+
+    def memory_size(self, order: int) -> int:
+        """Length of `memory` for series of this order."""
+        from twoloop.kernels import taylor
+
+        n, n_rows = self.code.n, self.code.n_rows
+        series = 2 * (order + 1) * n
+        return taylor.N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.code.scratch_size(order)
 
 
-def compiled_series(program: SeriesProgram) -> Dispatcher:
-    """The code of a program, compiled as a step is; its machine code is kept on disk.
+_COMPILED: dict[str, CompiledSeries] = {}  # by their digests
+
+
+def compiled_series(program: SeriesProgram) -> CompiledSeries:
+    """The code of a program, compiled; its machine code is kept on disk.
 
     Raises
     ------
     ValueError
-        If it would be too long to compile.
+        If it would take too long to compile.
     """
-    size = program.n_operations
-    if size > LARGEST:
+    if program.n_operations > LARGEST:
         raise ValueError(
-            f"compiled=True is for equations of at most {LARGEST} operations; these are {size}. Leave it out"
+            f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
+            f"it out"
         )
-    key = _digest(program)
-    if key not in _COMPILED:
-        _COMPILED[key] = _compiled(program, key)
-    return _COMPILED[key]
+    if program.digest not in _COMPILED:
+        code = SeriesCode(program)
+        _COMPILED[program.digest] = CompiledSeries(_compile(code, program.digest), code)
+    return _COMPILED[program.digest]
 
 
-_COMPILED: dict[str, Dispatcher] = {}
-
-
-def _compiled(program: SeriesProgram, key: str) -> Dispatcher:
+def _compile(code: SeriesCode, key: str) -> Dispatcher:
     from twoloop.kernels import common, taylor
     from twoloop.linking import KernelCompiler
 
-    code = SeriesCode(program)
     n, n_rows = code.n, code.n_rows
-    arrays = {"scratch": VECTOR, "series": VECTOR}
-    begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, t=f8, unit=f8, state=VECTOR)
-    find_order = emitted(code.order, types.none, **arrays, r=VECTOR, c=VECTOR, t=f8, unit=f8, order=i8)
-    take = emitted(code.take, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8)
-    finite = emitted(code.finite, types.boolean, series=VECTOR, order=i8)
-    HEAD, ORDER, TARGET = taylor.N_MEMORY_SCALARS, taylor.ORDER, taylor.TARGET
+    arrays, numbers = {"scratch": VECTOR, "series": VECTOR}, {"t": f8, "unit": f8}
+    begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **numbers, state=VECTOR)
+    find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **numbers, order=i8)
+    take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8)
+    is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
+    BEGIN, ORDER, TARGET = taylor.N_MEMORY_SCALARS, taylor.ORDER, taylor.TARGET
     N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
 
     def expand(f, w, options, memory, t, unit, tolerances, state, new_state):  # type: ignore[no-untyped-def]
         order = int(options[ORDER])
-        series = memory[HEAD + int(memory[TARGET]) * (order + 1) * n :]
-        place = HEAD + 2 * (order + 1) * n
+        series = memory[BEGIN + int(memory[TARGET]) * (order + 1) * n :]
+        place = BEGIN + 2 * (order + 1) * n
         r, a = memory[place : place + n], memory[place + n : place + 2 * n]
         place += 2 * n
         c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
@@ -454,27 +377,19 @@ def _compiled(program: SeriesProgram, key: str) -> Dispatcher:
         begin(scratch, series, r, c, lam, t, unit, state)
         for k in range(1, order):
             find_order(scratch, series, r, c, t, unit, k)
-            f.second(f, w, r, c, t, unit, tolerances, a, lam)
-            take(scratch, series, a, lam, unit, k)
+            f.second(f, w, r, c, t, unit, tolerances, a, lam)  # M a + G^T lam = r, G a = c
+            take_order(scratch, series, a, lam, unit, k)
         w.counters[N_EVALUATIONS] += order - 1
-        return DONE if finite(series, order) else NOT_FINITE, 0.0
+        return DONE if is_finite(series, order) else NOT_FINITE, 0.0
 
     return compile_kept(expand, common.STEP, (_stamp(), key), pipeline_class=KernelCompiler, **common.OPTIONS)
 
 
-def _digest(program: SeriesProgram) -> str:
-    """Of all that the code depends on."""
-    digest = hashlib.sha256(repr((program.n_q, program.n_rows)).encode())
-    tables = [(table.groups, *table.first, *table.second) for table in (program.early, program.late)]
-    rows = (*program.rows, program.row_places, *program.balance, program.balance_places)
-    for array in (*tables[0], *tables[1], *rows):
-        digest.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
-    return digest.hexdigest()
-
-
 def _stamp() -> str:
-    """Of what writes the code, and of what the code finds in memory."""
+    """A digest of what writes the code, and of the kernels that call it and are called."""
     from twoloop.kernels import common
 
-    texts = [Path(str(path)).read_text(encoding="utf-8") for path in (__file__, llvm_code.__file__)]
-    return hashlib.sha256("".join([common.stamp("taylor"), *texts]).encode()).hexdigest()
+    digest = hashlib.sha256(common.stamp("taylor").encode())
+    for module in (__file__, series_groups.__file__, llvm_code.__file__):
+        digest.update(Path(str(module)).read_bytes())
+    return digest.hexdigest()

@@ -20,7 +20,7 @@ LOWEST, HIGHEST = 4, 40  # orders that may be asked for
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
 FIXED = 19  # order of constant steps
 FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
-LONG = 16  # coordinates from which on the solution of an order is made of vector operations
+LONG = 16  # coordinates, with which vector operations pay in the solution of an order
 PADDED = 8  # operations of a table are a multiple of this
 
 
@@ -127,8 +127,14 @@ class Taylor:
         if not self.compiled:
             return replace(plan, interior=interior)
         plan.options[kernels.COMPILED] = 1.0
-        solve = kernels.solve_order if n_q < LONG else kernels.solve_long_order
-        return replace(plan, first=compiled_series(program), second=solve, interior=interior)
+        series = compiled_series(program)
+        return replace(
+            plan,
+            memory=np.zeros(series.memory_size(highest)),
+            first=series.function,
+            second=kernels.solve_order if n_q < LONG else kernels.solve_long_order,
+            interior=interior,
+        )
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
