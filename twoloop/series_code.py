@@ -1,18 +1,26 @@
-"""The series of one mechanism as code compiled for it: the same numbers as by the program, in two thirds of the time.
+"""The series of one mechanism as code compiled for it: the same numbers as by the program, in a fraction of the time.
 
-What the program looks up at every order, which quantity times which coefficient, stands in the code. It is kept in a
-file by its content, and its machine code as that of the kernels.
+What the program looks up at every order, which quantity times which coefficient, stands in the code, which goes to LLVM
+as a straight line of operations for one order. Its machine code is kept on disk as that of the kernels.
+
+The factors X and Y of all products stand in rows, one for each order, so that sums of products of known coefficients
+are vector operations. What a processor has stored number by number it cannot read as a vector at once. So vectors are
+put together in registers, and the newest coefficients come last in the sums.
 """
 
 import hashlib
-from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import NamedTuple
 
+from numba import types
 from numba.core.dispatcher import Dispatcher
 
-from twoloop.caches import compile_kept, sources_folder
-from twoloop.generated import module_of
-from twoloop.series import SeriesProgram, Sums, Table
+from twoloop import llvm_code, series_groups
+from twoloop.caches import compile_kept
+from twoloop.callbacks import VECTOR, f8
+from twoloop.llvm_code import INTEGER, ONE, ZERO, Emitter, Quantities, Value, emitted
+from twoloop.series import SeriesProgram
+from twoloop.series_groups import WIDTH, Group, Groups, rounded
 from twoloop.tracing import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -24,157 +32,364 @@ from twoloop.tracing import (
     SQUARE_ROOT,
 )
 
-LARGEST = 200  # operations; more take longer than ten seconds to compile, and gain little
+LARGEST = 5000  # operations; more take longer than ten seconds to compile
+AT_ONCE = 8  # vectors that are summed in one loop, in registers
+FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
-# what an operation o of order K makes of its arguments u and z, of `total` and of what is known of order 0
-RECURRENCES = {
-    PENDING: ("{r} = {total} + u * {y0}",),
-    PRODUCT: ("{y} = {z}", "{r} = {total} + {x0} * {y} + u * {y0}"),
-    RECIPROCAL: ("{r} = -({total} + u * {y0}) * {y0}", "{y} = {r}"),
-    SQUARE_ROOT: ("{r} = 0.5 * (u - {total}) / {x0}", "{x} = {r}", "{y} = {r}"),
-    EXPONENTIAL: ("{x} = {K} * u", "{r} = ({total} + {x} * {y0}) * {inverse}", "{y} = {r}"),
-    LOGARITHM: ("{y} = {z}", "{r} = (u - {total} * {inverse}) / {y0}", "{x} = {K} * {r}"),
-}
-RECURRENCES[ARCTANGENT] = RECURRENCES[LOGARITHM]
+i8 = types.int64
 
-FRAME = """
-def expand(f, w, options, memory, t, unit, tolerances, state, new_state):
-    n, n_rows, order = {n}, {n_rows}, int(options[ORDER])
-    N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
-    series = series_of(memory, order, n, memory[TARGET])
-    begin_series(options, t, unit, state, N, series, {first}, X1[0], Y1[0], r, c)
-    for k in range(order - 1):
-        K = k + 1
-        scale, inverse_k, inverse_K = -K / unit, 1.0 / max(k, 1), 1.0 / K
-        n_k, n_K, x1, y1, x2, y2 = N[k], N[K], X1[K], Y1[K], X2[k], Y2[k]
-        if K > 1:
-            n_K[0] = 0.0
-        interior(X1, Y1, K, total1)
-        {early}
-        {rows}
-        if k == 0:
-            begin_operations(options, LATE, n_k, N[0, {second}:], X2[0], Y2[0])
+
+class SeriesCode:
+    """Writes the code of a program.
+
+    `scratch` holds, from an aligned place on, the results of early operations that late ones use; velocities; for each
+    operation that divides an inverse; a row of zeros; and the rows of orders 0, 1 and so on. A row is X and Y.
+    """
+
+    def __init__(self, program: SeriesProgram):
+        self.n, self.n_rows = program.n_q, program.n_rows
+        self.groups = groups = Groups(program)
+        self.width, self.first, self.kept = groups.width, groups.first, groups.kept
+        self.velocities = rounded(groups.n_early)
+        self.inverses = self.velocities + rounded(self.n)
+        self.zeros = self.inverses + self.width
+        self.table = self.zeros + 2 * self.width
+
+    def scratch_size(self, order: int) -> int:
+        """Length of `scratch` for a series of this order."""
+        return WIDTH + self.table + 2 * self.width * (order + 1)
+
+    def begin(
+        self,
+        emit: Emitter,
+        scratch: Value,
+        series: Value,
+        r: Value,
+        c: Value,
+        lam: Value,
+        t: Value,
+        unit: Value,
+        state: Value,
+    ) -> None:
+        """What is known of the orders 0 and 1, and the early operations of order 0; r, c and lam are zero."""
+        base = emit.aligned(scratch)
+        zeros = emit.vector([ZERO] * WIDTH)
+        for place in range(0, 2 * self.width, WIDTH):
+            emit.store_vector(zeros, base, self.zeros + place)
+        for size, out in ((self.n, r), (self.n_rows, c), (self.n_rows, lam)):
+            for i in range(size):
+                emit.store(ZERO, out, i)
+        known = Quantities(emit, lambda i: emit.load(state, i - 1) if i else t)
+        for j in range(self.n):
+            q, v = known.value(1 + j), known.value(1 + self.n + j)
+            emit.store(q, series, j)
+            emit.store(emit.multiply(unit, v), series, self.n + j)
+            emit.store(v, base, self.velocities + j)
+        for group in self.groups.early:
+            self._begin_group(emit, base, known, group)
+            if group.pending:
+                self._store_waiting(emit, known, group, emit.pointer(base, self.table))
+        self._keep(emit, base, known)
+
+    def find_order(
+        self, emit: Emitter, scratch: Value, series: Value, r: Value, c: Value, t: Value, unit: Value, order: Value
+    ) -> None:
+        """Late operations of the order before and early ones of this order, as far as they are known; r and c."""
+        base, before = emit.aligned(scratch), emit.builder.sub(order, INTEGER(1))
+        q = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
+        sums = self._sums_of_products(emit, base, order)
+        is_first = emit.builder.icmp_signed("==", order, INTEGER(1))
+        with emit.builder.if_else(is_first) as (then, otherwise):
+            with then:
+                known = self._quantities_before(emit, base, q, t)
+                for group in self.groups.late:
+                    self._begin_group(emit, base, known, group)
+                for place, terms, constant in self.groups.balance:
+                    emit.store(known.sum(terms, constant), r, place)
+            with otherwise:
+                known = self._quantities_before(emit, base, q, self._time(emit, unit, before))
+                self._operate(emit, base, known, self.groups.late, sums, before)
+                for place, terms, _ in self.groups.balance:
+                    emit.store(known.sum(terms), r, place)
+        time = self._time(emit, unit, order)
+        known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
+        self._operate(emit, base, known, self.groups.early, sums, order)
+        scale = emit.negative(emit.divide(emit.number(order), unit))
+        for place, terms, _ in self.groups.rows:
+            emit.store(emit.multiply(scale, known.sum(terms)), c, place)
+        self._keep(emit, base, known)
+
+    def take_order(
+        self, emit: Emitter, scratch: Value, series: Value, a: Value, lam: Value, unit: Value, order: Value
+    ) -> None:
+        """Velocities of this order and positions of the next, from accelerations; the factors that waited for them."""
+        n, base, following = self.n, emit.aligned(scratch), emit.builder.add(order, INTEGER(1))
+        next_q = emit.pointer(series, emit.builder.mul(following, INTEGER(n)))
+        per_v, per_q = (emit.divide(unit, emit.number(each)) for each in (order, following))
+
+        def load(i: int) -> Value:
+            return emit.load(a, i - 1 - 2 * n) if i <= 3 * n else emit.load(lam, i - 1 - 3 * n)
+
+        known = Quantities(emit, load)
+        for j in range(n):
+            v = emit.multiply(per_v, known.value(1 + 2 * n + j))
+            known.define(1 + n + j, v)
+            if 1 + n + j in self.kept:
+                emit.store(v, base, self.velocities + j)
+            emit.store(emit.multiply(per_q, v), next_q, j)
+        before = emit.builder.sub(order, INTEGER(1))
+        for groups, of in ((self.groups.early, order), (self.groups.late, before)):
+            for group in groups:
+                if group.pending:
+                    self._store_waiting(emit, known, group, self._row(emit, base, of))
+
+    def is_finite(self, emit: Emitter, series: Value, order: Value) -> Value:
+        """Whether the last coefficients are."""
+        last = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
+        total = ZERO
+        for j in range(self.n):
+            total = emit.add(total, emit.multiply(ZERO, emit.load(last, j)))
+        return emit.builder.fcmp_ordered("==", total, ZERO)
+
+    def _row(self, emit: Emitter, base: Value, order: Value) -> Value:
+        return emit.pointer(base, self.table, emit.builder.mul(order, INTEGER(2 * self.width)))
+
+    def _time(self, emit: Emitter, unit: Value, order: Value) -> Value:
+        """The coefficient of the time, of an order that is not 0."""
+        return emit.builder.select(emit.builder.icmp_signed("==", order, INTEGER(1)), unit, ZERO)
+
+    def _quantities_before(self, emit: Emitter, base: Value, q: Value, time: Value) -> Quantities:
+        """Of the order before that of q, from where they are kept."""
+
+        def load(i: int) -> Value:
+            if i == 0:
+                return time
+            if i <= self.n:
+                return emit.load(q, i - 1 - self.n)
+            return emit.load(base, self.velocities + i - 1 - self.n if i < self.first else i - self.first)
+
+        return Quantities(emit, load)
+
+    def _keep(self, emit: Emitter, base: Value, known: Quantities) -> None:
+        for i in range(self.first, self.first + self.groups.n_early):
+            if i in self.kept:
+                emit.store(known.value(i), base, i - self.first)
+
+    def _store_waiting(self, emit: Emitter, known: Quantities, group: Group, row: Value) -> None:
+        y = emit.vector([known.sum(each.terms) for each in group.second])
+        emit.store_vector(y, row, self.width + group.place)
+
+    def _sums_of_products(self, emit: Emitter, base: Value, order: Value) -> dict[int, Value]:
+        """For groups, by place, the sum of X[j] Y[m - j] over 0 < j < m; m is the order, of late ones one less."""
+        builder = emit.builder
+        groups = [(group, 0) for group in self.groups.early] + [(group, 1) for group in self.groups.late]
+        nothing = emit.pointer(base, self.zeros)
+        one, two, before, before_it = INTEGER(1), INTEGER(2), *(builder.sub(order, INTEGER(i)) for i in (1, 2))
+
+        def rows(j: Value, m: Value, least: int) -> tuple[Value, Value]:
+            """Rows of X[j] and Y[m - j], or zeros where m is less than `least`."""
+            there = builder.icmp_signed(">=", m, INTEGER(least))
+            x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(m, j))
+            return builder.select(there, x, nothing), builder.select(there, y, nothing)
+
+        def with_product(total: Value, x: Value, y: Value, group: Group) -> Value:
+            x, y = (
+                emit.load_vector(x, group.place, group.width),
+                emit.load_vector(y, self.width + group.place, group.width),
+            )
+            return emit.add(total, emit.multiply(x, y))
+
+        sums: dict[int, Value] = {}
+        for begin in range(0, len(groups), AT_ONCE):
+            some = groups[begin : begin + AT_ONCE]
+            zeros = [emit.vector([ZERO] * group.width) for group, _ in some]
+            with emit.loop(two, before_it, zeros) as (j, totals, new):
+                x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(order, j))
+                for (group, late), total in zip(some, totals, strict=True):
+                    new.append(with_product(total, x, emit.pointer(y, -2 * self.width * late), group))
+            sums |= {group.place: total for (group, _), total in zip(some, new, strict=True)}
+        last = [
+            [rows(before_it, order, 4), rows(before, order, 3), rows(one, order, 2)],
+            [rows(before_it, before, 3), rows(one, before, 2)],
+        ]
+        for group, late in groups:
+            for pair in last[late]:
+                sums[group.place] = with_product(sums[group.place], *pair, group)
+        return sums
+
+    def _begin_group(self, emit: Emitter, base: Value, known: Quantities, group: Group) -> None:
+        """Order 0: the functions themselves; what waits stays zero."""
+        kind, table, half = group.kind, emit.pointer(base, self.table), group.width // 2
+        first = [known.sum(*each) for each in group.first]
+        second = [ZERO if group.pending else known.sum(*each) for each in group.second]
+        x, y = emit.vector(first), emit.vector(second)
+        ones, divisor = emit.vector([ONE] * group.width), None
+        if kind == PENDING:
+            results = second
+        elif kind == PRODUCT:
+            results = emit.elements(emit.multiply(x, y))
+        elif kind == SINE:
+            sines, cosines = ([emit.function(name, each) for each in first[:half]] for name in ("sin", "cos"))
+            results, y = [*sines, *cosines], emit.vector([*cosines, *map(emit.negative, sines)])
+        elif kind == RECIPROCAL:
+            y = emit.divide(ones, x)
+            results = emit.elements(y)
         else:
-            interior(X2, Y2, k, total2)
-            {late}
-        {balance}
-        if k == 0:
-            {constants}
-        a, lam = n_k[{A} : {LAM}], n_k[{LAM} : {first}]
-        if w.rows_v.size < n_rows:
-            lam[:] = 0.0
-        solve_for_order(f, w, r, c, a, lam)
-        take_order(w, K, unit, N, series, a)
-        {seconds}
-    return end_series(w, order, series), 0.0
-"""
+            results = [emit.function(FUNCTIONS[kind], each) for each in first]
+            if kind in (LOGARITHM, ARCTANGENT):
+                divisor = y
+            else:
+                y = emit.vector(results)
+            if kind == SQUARE_ROOT:
+                divisor = emit.add(y, y)
+        if divisor is not None:
+            emit.store_vector(emit.divide(ones, divisor), base, self.inverses + group.place)
+        for quantity, result in zip(group.quantities, results, strict=True):
+            known.define(quantity, result)
+        emit.store_vector(x, table, group.place)
+        if not group.pending:
+            emit.store_vector(y, table, self.width + group.place)
+
+    def _operate(
+        self,
+        emit: Emitter,
+        base: Value,
+        known: Quantities,
+        groups: list[Group],
+        sums: dict[int, Value],
+        order: Value,
+    ) -> None:
+        """An order that is not 0; of what waits, what is known before."""
+        row, number = self._row(emit, base, order), emit.number(order)
+        inverse = emit.divide(ONE, number)
+        for group in groups:
+            known_factors = [emit.vector([known.sum(each.terms) for each in group.first])]
+            if group.kind in (PRODUCT, LOGARITHM, ARCTANGENT):
+                known_factors.append(emit.vector([known.sum(each.terms) for each in group.second]))
+            scales = (emit.vector([each] * group.width) for each in (number, inverse))
+            results, x, y = self._recurrence(emit, base, group, sums[group.place], *scales, *known_factors)
+            for quantity, value in zip(group.quantities, emit.elements(results), strict=True):
+                known.define(quantity, value)
+            emit.store_vector(x, row, group.place)
+            if not group.pending:
+                emit.store_vector(y, row, self.width + group.place)
+
+    def _recurrence(
+        self,
+        emit: Emitter,
+        base: Value,
+        group: Group,
+        total: Value,
+        number: Value,
+        inverse: Value,
+        u: Value,
+        z: Value = None,
+    ) -> tuple[Value, Value, Value]:
+        """Results and factors X and Y of order `number`, from arguments u and z and the sum of products."""
+
+        def at(place: int) -> Value:
+            return emit.load_vector(base, place + group.place, group.width)
+
+        def with_last(x: Value) -> Value:
+            """The sum of products with that of X of this order."""
+            return emit.add(total, emit.multiply(x, at(self.table + self.width)))
+
+        kind = group.kind
+        if kind == PENDING:
+            return with_last(u), u, None
+        if kind == PRODUCT:
+            return emit.add(with_last(u), emit.multiply(at(self.table), z)), u, z
+        if kind == RECIPROCAL:
+            y = emit.negative(emit.multiply(with_last(u), at(self.table + self.width)))
+            return y, u, y
+        if kind == SQUARE_ROOT:
+            x = emit.multiply(emit.subtract(u, total), at(self.inverses))
+            return x, x, x
+        if kind in (LOGARITHM, ARCTANGENT):
+            result = emit.multiply(emit.subtract(u, emit.multiply(total, inverse)), at(self.inverses))
+            return result, emit.multiply(number, result), z
+        x = emit.multiply(number, u)
+        result = y = emit.multiply(with_last(x), inverse)
+        if kind == SINE:
+            each, half = emit.elements(result), group.width // 2
+            y = emit.vector([*each[half:], *map(emit.negative, each[:half])])
+        return result, x, y
 
 
-def source_of(program: SeriesProgram) -> str:
-    """The code for a program.
+class CompiledSeries(NamedTuple):
+    """Machine code of a program, to be called as a step is, and what wrote it."""
+
+    function: Dispatcher
+    code: SeriesCode
+
+    def memory_size(self, order: int) -> int:
+        """Length of `memory` for series of this order."""
+        from twoloop.kernels import taylor
+
+        n, n_rows = self.code.n, self.code.n_rows
+        series = 2 * (order + 1) * n
+        return taylor.N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.code.scratch_size(order)
+
+
+_COMPILED: dict[str, CompiledSeries] = {}  # by their digests
+
+
+def compiled_series(program: SeriesProgram) -> CompiledSeries:
+    """The code of a program, compiled; its machine code is kept on disk.
 
     Raises
     ------
     ValueError
-        If it would be too long to compile.
+        If it would take too long to compile.
     """
-    size = program.n_operations
-    if size > LARGEST:
+    if program.n_operations > LARGEST:
         raise ValueError(
-            f"compiled=True is for equations of at most {LARGEST} operations; these are {size}. Leave it out"
+            f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
+            f"it out"
         )
-    n, n_rows = program.n_q, program.n_rows
-    first = 1 + 3 * n + n_rows
-    second = first + len(program.early.first.column)
-    early = _operations(program.early, first, "K", "n_K", "1")
-    late = _operations(program.late, second, "k", "n_k", "2")
-    seconds = [*_forms(program.early, "n_K", "1"), *_forms(program.late, "n_k", "2")]
-    constants = zip(program.balance_places, program.balance.constant, strict=True)
-    return FRAME.format(
-        n=n,
-        n_rows=n_rows,
-        first=first,
-        second=second,
-        A=1 + 2 * n,
-        LAM=1 + 3 * n,
-        early=_lines(early, 2),
-        rows=_lines(_all(program.rows, program.row_places, "n_K", "c", "scale * "), 2),
-        late=_lines(late, 3),
-        balance=_lines(_all(program.balance, program.balance_places, "n_k", "r", ""), 2),
-        constants=_lines([f"r[{i}] += {float(value)!r}" for i, value in constants if value != 0.0], 3),
-        seconds=_lines(seconds, 2),
-    )
+    if program.digest not in _COMPILED:
+        code = SeriesCode(program)
+        _COMPILED[program.digest] = CompiledSeries(_compile(code, program.digest), code)
+    return _COMPILED[program.digest]
 
 
-def _lines(lines: list[str], depth: int) -> str:
-    return ("\n" + 4 * depth * " ").join(lines or ["pass"])
-
-
-def _terms(sums: Sums, o: int, row: int) -> list[tuple[int, float]]:
-    more = [(c, x) for k, c, x in zip(sums.row, sums.more_column, sums.more_coefficient, strict=True) if k == row]
-    every = [(sums.column[o], sums.coefficient[o]), *more]
-    return [(int(column), float(coefficient)) for column, coefficient in every if coefficient != 0.0]
-
-
-def _text(terms: list[tuple[int, float]], values: str) -> str:
-    signs = {1.0: "", -1.0: "-"}
-    parts = [f"{signs.get(x, f'{x!r} * ')}{values}[{column}]" for column, x in terms]
-    return " + ".join(parts) or "0.0"
-
-
-def _operations(table: Table, base: int, order: str, values: str, number: str) -> list[str]:
-    """Order K or k of the operations of a table; `base` is the quantity that the first makes."""
-    lines = []
-    for kind, first, last in table.groups[:, :3].tolist():
-        half = (last - first) // 2 if kind == SINE else last - first
-        for o in range(first, first + half):
-            u = _text(_terms(table.first, o, o), values)
-            if kind == SINE:
-                p = o + half
-                lines += [
-                    f"u = {order} * ({u})",
-                    f"x{number}[{o}] = x{number}[{p}] = u",
-                    f"sine = (total{number}[{o}] + u * Y{number}[0, {o}]) * inverse_{order}",
-                    f"cosine = (total{number}[{p}] + u * Y{number}[0, {p}]) * inverse_{order}",
-                    f"{values}[{base + o}], {values}[{base + p}] = sine, cosine",
-                    f"y{number}[{o}], y{number}[{p}] = cosine, -sine",
-                ]
-                continue
-            names = {
-                "x": f"x{number}[{o}]",
-                "y": f"y{number}[{o}]",
-                "x0": f"X{number}[0, {o}]",
-                "y0": f"Y{number}[0, {o}]",
-                "total": f"total{number}[{o}]",
-                "r": f"{values}[{base + o}]",
-                "z": _text(_terms(table.second, o, o), values),
-                "K": order,
-                "inverse": f"inverse_{order}",
-            }
-            lines += [f"u = x{number}[{o}] = {u}", *(line.format(**names) for line in RECURRENCES[kind])]
-    return lines
-
-
-def _forms(table: Table, values: str, number: str) -> list[str]:
-    """The second factors of the products that wait."""
-    _, first, last = table.groups[-1, :3].tolist()
-    return [f"y{number}[{o}] = {_text(_terms(table.second, o, o), values)}" for o in range(first, last)]
-
-
-def _all(sums: Sums, places: Any, values: str, out: str, scale: str) -> list[str]:
-    terms = [(place, _terms(sums, o, place)) for o, place in enumerate(places.tolist())]
-    return [f"{out}[{place}] = {scale}({_text(each, values)})" for place, each in terms]
-
-
-@cache
-def compiled_series(source: str) -> Dispatcher:
-    """The code, compiled as a step is; its machine code is kept on disk."""
+def _compile(code: SeriesCode, key: str) -> Dispatcher:
     from twoloop.kernels import common, taylor
-    from twoloop.linking import VectorizingCompiler
+    from twoloop.linking import KernelCompiler
 
-    key = hashlib.sha256(source.encode()).hexdigest()[:32]
-    path = sources_folder() / f"series_{key}.py"
-    missing = not path.exists() or path.read_text(encoding="utf-8") != source
-    function = module_of(f"twoloop_series_{key}", path, source, missing, vars(taylor))["expand"]
-    stamp = (common.stamp("taylor"), "")
-    return compile_kept(function, common.STEP, stamp, pipeline_class=VectorizingCompiler, **common.OPTIONS)
+    n, n_rows = code.n, code.n_rows
+    arrays, numbers = {"scratch": VECTOR, "series": VECTOR}, {"t": f8, "unit": f8}
+    begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **numbers, state=VECTOR)
+    find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **numbers, order=i8)
+    take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8)
+    is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
+    BEGIN, ORDER, TARGET = taylor.N_MEMORY_SCALARS, taylor.ORDER, taylor.TARGET
+    N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
+
+    def expand(f, w, options, memory, t, unit, tolerances, state, new_state):  # type: ignore[no-untyped-def]
+        order = int(options[ORDER])
+        series = memory[BEGIN + int(memory[TARGET]) * (order + 1) * n :]
+        place = BEGIN + 2 * (order + 1) * n
+        r, a = memory[place : place + n], memory[place + n : place + 2 * n]
+        place += 2 * n
+        c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
+        scratch = memory[place + 2 * n_rows :]
+        begin(scratch, series, r, c, lam, t, unit, state)
+        for k in range(1, order):
+            find_order(scratch, series, r, c, t, unit, k)
+            f.second(f, w, r, c, t, unit, tolerances, a, lam)  # M a + G^T lam = r, G a = c
+            take_order(scratch, series, a, lam, unit, k)
+        w.counters[N_EVALUATIONS] += order - 1
+        return DONE if is_finite(series, order) else NOT_FINITE, 0.0
+
+    return compile_kept(expand, common.STEP, (_stamp(), key), pipeline_class=KernelCompiler, **common.OPTIONS)
+
+
+def _stamp() -> str:
+    """A digest of what writes the code, and of the kernels that call it and are called."""
+    from twoloop.kernels import common
+
+    digest = hashlib.sha256(common.stamp("taylor").encode())
+    for module in (__file__, series_groups.__file__, llvm_code.__file__):
+        digest.update(Path(str(module)).read_bytes())
+    return digest.hexdigest()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from twoloop.checks import check_flag, check_size
 from twoloop.plan import LARGEST_MOVE, Plan, least_tolerance
 from twoloop.series import SeriesProgram, series_program
-from twoloop.series_code import compiled_series, source_of
+from twoloop.series_code import compiled_series
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import Untraceable
 
@@ -20,6 +20,7 @@ LOWEST, HIGHEST = 4, 40  # orders that may be asked for
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
 FIXED = 19  # order of constant steps
 FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
+LONG = 16  # coordinates, with which vector operations pay in the solution of an order
 PADDED = 8  # operations of a table are a multiple of this
 
 
@@ -122,7 +123,14 @@ class Taylor:
         if not self.compiled:
             return replace(plan, interior=interior)
         plan.options[kernels.COMPILED] = 1.0
-        return replace(plan, first=compiled_series(source_of(program)), interior=interior)
+        series = compiled_series(program)
+        return replace(
+            plan,
+            memory=np.zeros(series.memory_size(highest)),
+            first=series.function,
+            second=kernels.solve_order if n_q < LONG else kernels.solve_long_order,
+            interior=interior,
+        )
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:

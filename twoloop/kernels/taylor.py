@@ -330,6 +330,24 @@ def _expand(f, w, options, memory, t, state, unit):
 
 
 @merged
+def _solve_order(f, w, r, c, a, lam):
+    solve_for_order(f, w, r, c, a, lam)
+    return DONE, 0.0
+
+
+@kernel(STEP)
+def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
+    """The linear solution of one order, for code made for a mechanism; r and c were written just before, one by one."""
+    return _solve_order(f, w, r, c, a, lam)
+
+
+@kernel(STEP, vectorized=True)
+def solve_long_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
+    """The same for many coordinates."""
+    return _solve_order(f, w, r, c, a, lam)
+
+
+@merged
 def _find_series(f, w, options, memory, t, state, unit, which):
     """The series about a state, into one of the two places."""
     memory[TARGET] = which
@@ -340,44 +358,43 @@ def _find_series(f, w, options, memory, t, state, unit, which):
 
 
 @merged
-def _size(tolerances, series, unit, k, n):
-    """The largest term of order k, of positions or velocities, over the tolerances, at one unit of time."""
-    largest = 0.0
-    rtol = tolerances[RTOL]
+def _length(tolerances, series, unit, order, n):
+    """The step, in units, at which the last two terms, of positions and velocities, are within the tolerances."""
+    rtol, last, before = tolerances[RTOL], 0.0, 0.0
     for j in range(n):
         atol = tolerances[ATOL + j]
-        term = abs(series[k, j])
-        largest = max(largest, term / (atol + rtol * abs(series[0, j])))
-        largest = max(largest, k * term / (unit * (atol + rtol * abs(series[1, j]) / unit)))
-    return largest
-
-
-@merged
-def _length(tolerances, series, unit, order, n):
-    """The step, in units, at which the last two terms are within the tolerances."""
-    last, before = _size(tolerances, series, unit, order, n), _size(tolerances, series, unit, order - 1, n)
-    length = np.inf
+        of_q = 1.0 / (atol + rtol * abs(series[0, j]))
+        of_v = 1.0 / (atol * unit + rtol * abs(series[1, j]))
+        last = max(last, abs(series[order, j]) * max(of_q, order * of_v))
+        before = max(before, abs(series[order - 1, j]) * max(of_q, (order - 1) * of_v))
+    least = -np.inf  # logarithm of 1 / length
     if last > 0.0:
-        length = last ** (-1.0 / order)
+        least = np.log(last) / order
     if before > 0.0:
-        length = min(length, before ** (-1.0 / (order - 1)))
-    return length
+        least = max(least, np.log(before) / (order - 1))
+    return np.exp(-least)
 
 
 @merged
 def _evaluate(series, unit, order, x, q, v):
-    """q and v at x units of time, by Horner's scheme."""
-    n = q.size
-    for j in range(n):
-        q[j] = series[order, j]
-        v[j] = order * series[order, j]
-    for k in range(order - 1, 0, -1):
-        for j in range(n):
-            q[j] = q[j] * x + series[k, j]
-            v[j] = v[j] * x + k * series[k, j]
-    for j in range(n):
-        q[j] = q[j] * x + series[0, j]
-        v[j] /= unit
+    """q and v at x units of time, by Horner's scheme; four coordinates at once, some of the last ones twice."""
+    n, per_unit = q.size, 1.0 / unit
+    for first in range(0, n if n > 3 else 0, 4):
+        j = min(first, n - 4)
+        q0, q1, q2, q3 = series[order, j], series[order, j + 1], series[order, j + 2], series[order, j + 3]
+        v0 = v1 = v2 = v3 = 0.0
+        for k in range(order - 1, -1, -1):
+            v0, v1, v2, v3 = v0 * x + q0, v1 * x + q1, v2 * x + q2, v3 * x + q3
+            q0, q1 = q0 * x + series[k, j], q1 * x + series[k, j + 1]
+            q2, q3 = q2 * x + series[k, j + 2], q3 * x + series[k, j + 3]
+        q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
+        v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
+    for j in range(n if n < 4 else 0):
+        q0, v0 = series[order, j], 0.0
+        for k in range(order - 1, -1, -1):
+            v0 = v0 * x + q0
+            q0 = q0 * x + series[k, j]
+        q[j], v[j] = q0, v0 * per_unit
 
 
 @kernel(STEP)
