@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 from twoloop.plan import Method, Plan, least_tolerance
+from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
 from twoloop.taylor import Taylor
 
@@ -72,21 +73,17 @@ class Auto:
     tight: Method
     fixed: Method
 
-    def __post_init__(self) -> None:
-        if self.series is not None and self.series.compiled:
-            raise ValueError("series of Auto must not be compiled: leave compiled out of Taylor(...)")
-
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
         return "auto"
 
-    def for_system(self, system: ConstrainedSystem) -> "Auto":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen."""
         if self.series is None or system.called_in_python:  # functions whose values may depend on more than arguments
             return replace(self, series=None)
         try:
-            return replace(self, series=self.series.for_system(system))
+            return replace(self, series=self.series.for_system(system, code))
         except ValueError:
             return replace(self, series=None)
 

@@ -65,7 +65,7 @@ class Interpolator:
         self.system, self.plan, self.rtol, self.ranks = system, plan, rtol, ranks
         self.parts = 1 if plan is None else plan.parts
         q0 = row[: system.n_q]
-        self.kit = kit_of(system, t0, q0, None if plan is None else plan.step)
+        self.kit = kit_of(system, t0, q0, plan)
         self.work = workspace(system, self.kit, pattern_of(system, t0, q0), q0, rtol, 0.0, ranks)
         self.work.notes[common.GENERATION] = 1.0  # the ranks are known
         advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))

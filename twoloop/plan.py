@@ -27,7 +27,7 @@ class Plan:
     options: Array
     memory: Array
     exponent: float
-    first: Any = None  # the two steps between which `step` chooses, or, first alone, what finds a series for it
+    first: Any = None  # the two steps between which `step` chooses
     second: Any = None
     safety: float = 0.9
     factor_min: float = 0.2
@@ -44,8 +44,10 @@ class Plan:
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
-    compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism ...
-    compiled: bool = False  # ... and whether it is to be
+    compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
+    inner: Any = None  # ... that code; None: the inner loop is the general one
+    expand: Any = None  # Taylor series made for the mechanism, and what solves for an order where it cannot
+    solve_order: Any = None
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
 
 

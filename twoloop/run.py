@@ -72,7 +72,7 @@ class Run:
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interior = rtol, plan.reuse, interior
-        self.kit = kit_of(system, t0, q0, plan.step, plan.first, plan.second, compiled=plan.compiled)
+        self.kit = kit_of(system, t0, q0, plan)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])

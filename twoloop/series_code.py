@@ -12,6 +12,7 @@ import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
@@ -21,6 +22,8 @@ from twoloop.callbacks import VECTOR, f8
 from twoloop.llvm_code import INTEGER, ONE, ZERO, Emitter, Quantities, Value, emitted
 from twoloop.series import SeriesProgram
 from twoloop.series_groups import WIDTH, Group, Groups, rounded
+from twoloop.straight_code import OwnCode, function_of
+from twoloop.straight_line import Solution
 from twoloop.tracing import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -321,6 +324,7 @@ class CompiledSeries(NamedTuple):
 
     function: Dispatcher
     code: SeriesCode
+    n_kept: int  # numbers in the factors
 
     def memory_size(self, order: int) -> int:
         """Length of `memory` for series of this order."""
@@ -328,14 +332,14 @@ class CompiledSeries(NamedTuple):
 
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
-        return taylor.N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.code.scratch_size(order)
+        return taylor.N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order)
 
 
 _COMPILED: dict[str, CompiledSeries] = {}  # by their digests
 
 
-def compiled_series(program: SeriesProgram) -> CompiledSeries:
-    """The code of a program, compiled; its machine code is kept on disk.
+def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
+    """The code of a program, and of the solution of an order, compiled; its machine code is kept on disk.
 
     Raises
     ------
@@ -347,17 +351,20 @@ def compiled_series(program: SeriesProgram) -> CompiledSeries:
             f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
             f"it out"
         )
-    if program.digest not in _COMPILED:
-        code = SeriesCode(program)
-        _COMPILED[program.digest] = CompiledSeries(_compile(code, program.digest), code)
-    return _COMPILED[program.digest]
+    key = program.digest + own.digest
+    if key not in _COMPILED:
+        code, solution = SeriesCode(program), Solution(own.equations)
+        _COMPILED[key] = CompiledSeries(_compile(code, solution, own, key), code, solution.n_kept)
+    return _COMPILED[key]
 
 
-def _compile(code: SeriesCode, key: str) -> Dispatcher:
-    from twoloop.kernels import common, taylor
+def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Dispatcher:
+    from twoloop.kernels import calls, common, taylor
     from twoloop.linking import KernelCompiler
 
-    n, n_rows = code.n, code.n_rows
+    n, n_rows, n_kept = code.n, code.n_rows, solution.n_kept
+    keep = function_of(own.equations.graph, solution.kept)
+    solve = function_of(solution.graph, solution.solved)
     arrays, numbers = {"scratch": VECTOR, "series": VECTOR}, {"t": f8, "unit": f8}
     begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **numbers, state=VECTOR)
     find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **numbers, order=i8)
@@ -365,6 +372,7 @@ def _compile(code: SeriesCode, key: str) -> Dispatcher:
     is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
     BEGIN, ORDER, TARGET = taylor.N_MEMORY_SCALARS, taylor.ORDER, taylor.TARGET
     N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
+    EVALUATE_THERE = calls.EVALUATE_THERE
 
     def expand(f, w, options, memory, t, unit, tolerances, state, new_state):  # type: ignore[no-untyped-def]
         order = int(options[ORDER])
@@ -373,11 +381,19 @@ def _compile(code: SeriesCode, key: str) -> Dispatcher:
         r, a = memory[place : place + n], memory[place + n : place + 2 * n]
         place += 2 * n
         c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
-        scratch = memory[place + 2 * n_rows :]
+        place += 2 * n_rows
+        kept, scratch = memory[place : place + n_kept], memory[place + n_kept :]
+        q, v = state[:n], state[n : 2 * n]
+        own_factors = keep((t, q, v), (kept,))
+        if not own_factors:
+            code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
+            if code != DONE:
+                return code, np.inf
         begin(scratch, series, r, c, lam, t, unit, state)
         for k in range(1, order):
             find_order(scratch, series, r, c, t, unit, k)
-            f.second(f, w, r, c, t, unit, tolerances, a, lam)  # M a + G^T lam = r, G a = c
+            if not own_factors or not solve((r, c, kept), (a, lam)):  # M a + G^T lam = r, G a = c
+                f.solve_order(f, w, r, c, t, unit, tolerances, a, lam)
             take_order(scratch, series, a, lam, unit, k)
         w.counters[N_EVALUATIONS] += order - 1
         return DONE if is_finite(series, order) else NOT_FINITE, 0.0

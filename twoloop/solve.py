@@ -27,6 +27,7 @@ from twoloop.plan import Method
 from twoloop.recorder import Wanted
 from twoloop.result import Result
 from twoloop.run import Run
+from twoloop.straight_code import own_code
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -169,12 +170,15 @@ def solve_dae(
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     check_start(system, t0, q0, v0, derivatives=check_derivatives)
 
+    code = own_code(system, t0, q0) if compiled else None
     if hasattr(chosen, "for_system"):
-        chosen = chosen.for_system(system)
+        chosen = chosen.for_system(system, code)
     plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-    if compiled and not plan.compilable:
-        raise ValueError(f"compiled=True goes with 'auto', 'Taylor', 'DOP853' and 'Adams'; given method {chosen.name}")
-    plan, interior = replace(plan, compiled=compiled), plan.interior
+    interior = plan.interior
+    if code is not None:
+        if not plan.compilable:
+            raise ValueError(f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}")
+        plan = replace(plan, inner=code.inner)
     if plan.parts > 1 and interior is None:
         interior = chosen.plan(system.n_q, float(rtol), float(atol.min()), True)
     run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interior)

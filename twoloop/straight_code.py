@@ -18,6 +18,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
+from twoloop import straight_line
 from twoloop.caches import compile_kept
 from twoloop.callbacks import VECTOR
 from twoloop.straight_line import Choice, Outputs, StraightLine
@@ -205,36 +206,50 @@ def function_of(graph: Graph, outputs: Outputs) -> Any:
     return function
 
 
-def straight_inner(system: ConstrainedSystem, t0: float, q0: Array) -> Dispatcher:
-    """The inner loop for a system, compiled for its equations.
+class OwnCode:
+    """The inner loop for a system, compiled for its equations, or read from the disk.
+
+    Attributes
+    ----------
+    equations : StraightLine
+    digest : str
+        Of all that code made of these depends on.
+    inner : Dispatcher
+    """
+
+    def __init__(self, equations: StraightLine):
+        from twoloop.kernels import common
+
+        self.equations = equations
+        digest = hashlib.sha256(repr(list(_described(equations))).encode())
+        for module in (__file__, straight_line.__file__):
+            digest.update(Path(module).read_bytes())
+        self.digest = digest.hexdigest()
+        self.inner = _inner(equations, (common.stamp("calls"), self.digest))
+
+
+def own_code(system: ConstrainedSystem, t0: float, q0: Array) -> OwnCode:
+    """The code for a system, for a run that starts at a position.
 
     Raises
     ------
     ValueError
-        If they cannot be had.
+        If its equations cannot be had.
     """
     try:
         choice = Choice.at(system, t0, q0)
-        return system.remembered(("inner", choice), lambda: _compiled(StraightLine(system, choice)))
+        made: OwnCode = system.remembered(("code", choice), lambda: OwnCode(StraightLine(system, choice)))
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
-
-
-def _compiled(equations: StraightLine) -> Dispatcher:
-    from twoloop.kernels import common
-
-    digest = hashlib.sha256(repr(("inner", *_described(equations))).encode() + Path(__file__).read_bytes()).hexdigest()
-    return _inner(equations, (common.stamp("calls"), digest))
+    return made
 
 
 def _described(equations: StraightLine) -> Iterable[Any]:
-    """All that the code depends on."""
-    yield equations.system.n_q, equations.system.n_c
+    yield equations.system.n_q, equations.choice
     for outputs in (equations.there, equations.closer, equations.nearer):
-        if outputs is None:
-            continue
-        yield {name: [form.key for form in forms] for name, forms in outputs.arrays.items()}
-        yield [(one.key, other.key) for one, other in outputs.conditions]
+        if outputs is not None:
+            yield {name: [form.key for form in forms] for name, forms in outputs.arrays.items()}
+            yield [(one.key, other.key) for one, other in outputs.conditions]
     for operation in equations.graph.operations:
         yield None if operation is None else tuple(x.key if isinstance(x, Form) else x for x in operation)
 

@@ -336,8 +336,8 @@ class Solution:
 
     Attributes
     ----------
-    kept : Outputs
-        Of the equations: what is to be kept.
+    kept, n_kept : Outputs, int
+        Of the equations: what is to be kept, and how many numbers.
     graph : Graph
         Its inputs are r (n_q,), c (n_c + n_a,) and what was kept.
     solved : Outputs
@@ -350,6 +350,7 @@ class Solution:
         forms = [*added, *(form for block in factors.blocks for row in block.inverse for form in row)]
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
         known = sorted({i for form in forms for i in form.terms})
+        self.n_kept = len(known)
         self.kept = Outputs({"kept": [Form(equations.graph, 0.0, {i: 1.0}) for i in known]}, equations.conditions)
         self.graph, n = Graph(), equations.system.n_q
         r, c = self.graph.inputs(n, False), self.graph.inputs(len(equations.all_rows), False)

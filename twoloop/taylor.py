@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks import check_flag, check_size
+from twoloop.checks import check_size
 from twoloop.plan import LARGEST_MOVE, Plan, least_tolerance
 from twoloop.series import SeriesProgram, series_program
 from twoloop.series_code import compiled_series
+from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import Untraceable
 
@@ -20,7 +21,6 @@ LOWEST, HIGHEST = 4, 40  # orders that may be asked for
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
 FIXED = 19  # order of constant steps
 FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
-LONG = 16  # coordinates, with which vector operations pay in the solution of an order
 PADDED = 8  # operations of a table are a multiple of this
 
 
@@ -45,14 +45,10 @@ class Taylor:
         Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
         digit of the smaller tolerance, or 19 with constant steps.
 
-    compiled : bool
-        Whether the series is found by code compiled for the mechanism, in about two thirds of the time: worth its
-        compilation of some 3 s, kept on disk, for many runs of one mechanism with the same parameters.
-
     Raises
     ------
     TypeError, ValueError
-        If order is not such a number, or compiled not True or False.
+        If order is not such a number.
 
     Notes
     -----
@@ -63,23 +59,20 @@ class Taylor:
     """
 
     order: int | None = None
-    compiled: bool = False
-    program: SeriesProgram | None = None  # of one system; solve_dae puts it in
+    program: SeriesProgram | None = None  # of one system; solve_dae puts it in ...
+    code: OwnCode | None = None  # ... and what is compiled for it
 
     def __post_init__(self) -> None:
         if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
             raise ValueError(f"order must be between {LOWEST} and {HIGHEST}; given {self.order}")
-        check_flag("compiled", self.compiled)
 
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        changed = {"order": self.order, "compiled": self.compiled or None}
-        given = ", ".join(f"{name}={value}" for name, value in changed.items() if value is not None)
-        return f"Taylor({given})" if given else "Taylor"
+        return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
-    def for_system(self, system: ConstrainedSystem) -> "Taylor":
-        """The method with the operations of this system.
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Taylor":
+        """The method with the operations of this system, and with what is compiled for it.
 
         Raises
         ------
@@ -92,7 +85,7 @@ class Taylor:
             raise ValueError(
                 f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
             ) from error
-        return replace(self, program=program)
+        return replace(self, program=program, code=code)
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -115,22 +108,18 @@ class Taylor:
             safety=1.0,
             factor_max=kernels.GROWTH,
             watchful=True,
+            compilable=True,
             parts=min(max(highest // 3, FEWEST), MOST),
         )
         kept = plan.options.copy()
         kept[kernels.KEEP] = 1.0
         interior = replace(plan, options=kept, memory=plan.memory.copy())
-        if not self.compiled:
+        if self.code is None:
             return replace(plan, interior=interior)
         plan.options[kernels.COMPILED] = 1.0
-        series = compiled_series(program)
-        return replace(
-            plan,
-            memory=np.zeros(series.memory_size(highest)),
-            first=series.function,
-            second=kernels.solve_order if n_q < LONG else kernels.solve_long_order,
-            interior=interior,
-        )
+        series = compiled_series(program, self.code)
+        memory = np.zeros(series.memory_size(highest))
+        return replace(plan, memory=memory, expand=series.function, solve_order=kernels.solve_order, interior=interior)
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:

@@ -1,7 +1,5 @@
 """What every use of the kernels needs of a system: its callbacks with flags, and a workspace."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,7 @@ from twoloop.kernels.augmented import augmented_pays
 from twoloop.kernels.banded import banded_pays
 from twoloop.kernels.lapack import addresses
 from twoloop.kernels.layout import make_work
-from twoloop.straight_code import straight_inner
+from twoloop.plan import Plan
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -21,19 +19,8 @@ SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M m
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
-def kit_of(
-    system: ConstrainedSystem,
-    t0: float,
-    q0: Array,
-    step: Any = None,
-    first: Any = None,
-    second: Any = None,
-    compiled: bool = False,
-) -> common.Kit:
-    """The callbacks of a system, with flags that say which linear algebra suits it, the inner loop and steps.
-
-    `compiled`: the inner loop is code made for the system.
-    """
+def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None) -> common.Kit:
+    """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
     from twoloop.kernels.calls import inner_loop  # compiled, or read from the cache, at the first run of a process
 
     flags = system.functions.flags.copy()
@@ -50,10 +37,12 @@ def kit_of(
     sparse = augmented_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
-    inner = inner_loop
-    if compiled:
-        inner, flags[common.STRAIGHT] = straight_inner(system, t0, q0), 1
-    return common.Kit(system.functions._replace(flags=flags), inner, step, first, second, inner_loop)
+    functions = system.functions._replace(flags=flags)
+    if plan is None:
+        return common.Kit(functions, inner_loop)
+    flags[common.STRAIGHT] = plan.inner is not None
+    steps = (plan.step, plan.first, plan.second)
+    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, plan.expand, plan.solve_order)
 
 
 def workspace(

@@ -178,7 +178,8 @@ class Kit:
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
     chooses between two others has these as `first` and `second`. An inner loop made for the mechanism leaves to
-    `general` what it does not do itself.
+    `general` what it does not do itself; `expand` is a Taylor series made for it, and `solve_order` what it calls where
+    factors are those of the general inner loop.
     """
 
     def __init__(
@@ -189,9 +190,11 @@ class Kit:
         first: Any = None,
         second: Any = None,
         general: Any = None,
+        expand: Any = None,
+        solve_order: Any = None,
     ):
         self.functions, self.inner, self.step, self.first, self.second = functions, inner, step, first, second
-        self.general = general
+        self.general, self.expand, self.solve_order = general, expand, solve_order
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -208,7 +211,7 @@ for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
 # (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
 STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-for _name in ("step", "first", "second"):
+for _name in ("step", "first", "second", "expand", "solve_order"):
     KIT.add_function(_name, STEP)
 
 

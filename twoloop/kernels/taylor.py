@@ -44,7 +44,7 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits
 # KEEP: steps follow one another by the same series, about the first state, as between the ends of a step
-# COMPILED: the series is found by f.first, code made for the mechanism
+# COMPILED: the series is found by f.expand, code made for the mechanism
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, COMPILED, N_SCALARS = range(8)
 # arrays of a table; arrays of sums as twoloop.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
@@ -329,22 +329,11 @@ def _expand(f, w, options, memory, t, state, unit):
     return end_series(w, order, series)
 
 
-@merged
-def _solve_order(f, w, r, c, a, lam):
-    solve_for_order(f, w, r, c, a, lam)
-    return DONE, 0.0
-
-
 @kernel(STEP)
 def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
-    """The linear solution of one order, for code made for a mechanism; r and c were written just before, one by one."""
-    return _solve_order(f, w, r, c, a, lam)
-
-
-@kernel(STEP, vectorized=True)
-def solve_long_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
-    """The same for many coordinates."""
-    return _solve_order(f, w, r, c, a, lam)
+    """The linear solution of one order, for code made for a mechanism where its own factors do not serve."""
+    solve_for_order(f, w, r, c, a, lam)
+    return DONE, 0.0
 
 
 @merged
@@ -352,7 +341,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
     """The series about a state, into one of the two places."""
     memory[TARGET] = which
     if options[COMPILED] == 1.0:
-        code, _ = f.first(f, w, options, memory, t, unit, state, state, state)
+        code, _ = f.expand(f, w, options, memory, t, unit, state, state, state)
         return code
     return _expand(f, w, options, memory, t, state, unit)
 
