@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from twoloop.mechanisms import (
 from twoloop.methods import PRESETS
 from twoloop.run import Run
 from twoloop.solve import solve_dae
-from twoloop.straight_code import LARGEST_ANGLE, function_of
+from twoloop.straight_code import LARGEST_ANGLE, function_of, own_code
 from twoloop.straight_line import Choice, Derivative, Factors, Outputs, Solution, StraightLine
 from twoloop.tracing import Form, Graph
 
@@ -60,10 +61,14 @@ def inner(run, task, t, q, v):
 
 
 def run_of(problem, compiled):
-    plan = PRESETS["DOP853"].plan(problem.system.n_q, 1e-8, 1e-8, False)
-    n = problem.system.n_q
-    vars(plan)["compiled"] = compiled
-    return Run(problem.system, plan, 0.0, problem.q0, problem.v0, 1e-8, np.full(n, 1e-8), None)
+    return run_from(problem.system, problem.q0, problem.v0, compiled)
+
+
+def run_from(system, q0, v0, compiled):
+    plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
+    if compiled:
+        plan = replace(plan, inner=own_code(system, 0.0, q0).inner)
+    return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
 
 
 def compute(graph, outputs, inputs):
@@ -262,11 +267,8 @@ def test_near_a_singular_position_the_general_inner_loop_takes_over():
             name="guides",
         )
 
-    made = system(1.0)
-    plan = PRESETS["DOP853"].plan(3, 1e-8, 1e-8, False)
-    vars(plan)["compiled"] = True
-    run = Run(made, plan, 0.0, np.zeros(3), np.zeros(3), 1e-8, np.full(3, 1e-8), None)
     q = v = np.zeros(3)
+    run = run_from(system(1.0), q, v, True)
     assert inner(run, calls.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[-1] == 0.0
     assert inner(run, calls.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[-1] == 1.0
 
