@@ -27,7 +27,7 @@ class Plan:
     options: Array
     memory: Array
     exponent: float
-    first: Any = None  # the two steps between which `step` chooses, or, first alone, what finds a series for it
+    first: Any = None  # the two steps between which `step` chooses, or what finds a series, and solves an order of it
     second: Any = None
     safety: float = 0.9
     factor_min: float = 0.2

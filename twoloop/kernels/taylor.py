@@ -44,7 +44,7 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits
 # KEEP: steps follow one another by the same series, about the first state, as between the ends of a step
-# COMPILED: the series is found by f.first, code made for the mechanism
+# COMPILED: the series is found by f.first, code made for the mechanism, which calls f.second for each solution
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, COMPILED, N_SCALARS = range(8)
 # arrays of a table; arrays of sums as twoloop.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
