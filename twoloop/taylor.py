@@ -127,10 +127,10 @@ class Taylor:
         interior = replace(plan, options=kept, memory=plan.memory.copy())
         if not self.compiled:
             return replace(plan, interior=interior)
-        plan.options[kernels.COMPILED] = 1.0
         series = compiled_series(program)
         return replace(
             plan,
+            step=kernels.compiled_taylor_step,
             memory=np.zeros(series.memory_size(highest)),
             first=series.function,
             second=kernels.solve_order if n_q < LONG else kernels.solve_long_order,

@@ -44,8 +44,7 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits
 # KEEP: steps follow one another by the same series, about the first state, as between the ends of a step
-# COMPILED: the series is found by f.first, code made for the mechanism, which calls f.second for each solution
-ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, COMPILED, N_SCALARS = range(8)
+ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
@@ -95,9 +94,9 @@ def _numbers(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """One of the two series of q (order + 1, n_q)."""
+    """One of the two series of q; row by row, as numba calls a function for an array of two dimensions."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
-    return memory[begin : begin + (order + 1) * n].reshape((order + 1, n))
+    return memory[begin : begin + (order + 1) * n]
 
 
 @merged
@@ -264,9 +263,9 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
     for j in range(n):
-        N[0, 1 + j] = series[0, j] = state[j]
+        N[0, 1 + j] = series[j] = state[j]
         N[0, 1 + n + j] = state[n + j]
-        N[1, 1 + j] = series[1, j] = unit * state[n + j]
+        N[1, 1 + j] = series[n + j] = unit * state[n + j]
     begin_operations(options, EARLY, N[0], N[0, first:], x, y)
 
 
@@ -278,15 +277,16 @@ def take_order(w, K, unit, N, series, a):
     for j in range(n):
         v = per_v * a[j]
         N[K, 1 + n + j] = v
-        N[K + 1, 1 + j] = series[K + 1, j] = per_q * v
+        N[K + 1, 1 + j] = series[(K + 1) * n + j] = per_q * v
 
 
 @merged
 def end_series(w, order, series):
     """Count, and look whether all is finite."""
     w.counters[N_EVALUATIONS] += order - 1
-    for j in range(series.shape[1]):
-        if not np.isfinite(series[order, j]):
+    n = series.size // (order + 1)
+    for j in range(n):
+        if not np.isfinite(series[order * n + j]):
             return NOT_FINITE
     return DONE
 
@@ -348,10 +348,10 @@ def solve_long_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
 
 
 @merged
-def _find_series(f, w, options, memory, t, state, unit, which):
-    """The series about a state, into one of the two places."""
+def _find_series(f, w, options, memory, t, state, unit, which, by_code):
+    """The series about a state, into one of the two places; by f.first, code made for the mechanism, if there is."""
     memory[TARGET] = which
-    if options[COMPILED] == 1.0:
+    if by_code:
         code, _ = f.first(f, w, options, memory, t, unit, state, state, state)
         return code
     return _expand(f, w, options, memory, t, state, unit)
@@ -361,12 +361,13 @@ def _find_series(f, w, options, memory, t, state, unit, which):
 def _length(tolerances, series, unit, order, n):
     """The step, in units, at which the last two terms, of positions and velocities, are within the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
+    row, row_before = order * n, (order - 1) * n
     for j in range(n):
         atol = tolerances[ATOL + j]
-        of_q = 1.0 / (atol + rtol * abs(series[0, j]))
-        of_v = 1.0 / (atol * unit + rtol * abs(series[1, j]))
-        last = max(last, abs(series[order, j]) * max(of_q, order * of_v))
-        before = max(before, abs(series[order - 1, j]) * max(of_q, (order - 1) * of_v))
+        of_q = 1.0 / (atol + rtol * abs(series[j]))
+        of_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
+        last = max(last, abs(series[row + j]) * max(of_q, order * of_v))
+        before = max(before, abs(series[row_before + j]) * max(of_q, (order - 1) * of_v))
     least = -np.inf  # logarithm of 1 / length
     if last > 0.0:
         least = np.log(last) / order
@@ -381,24 +382,25 @@ def _evaluate(series, unit, order, x, q, v):
     n, per_unit = q.size, 1.0 / unit
     for first in range(0, n if n > 3 else 0, 4):
         j = min(first, n - 4)
-        q0, q1, q2, q3 = series[order, j], series[order, j + 1], series[order, j + 2], series[order, j + 3]
+        m = order * n + j
+        q0, q1, q2, q3 = series[m], series[m + 1], series[m + 2], series[m + 3]
         v0 = v1 = v2 = v3 = 0.0
-        for k in range(order - 1, -1, -1):
+        for m in range((order - 1) * n + j, -1, -n):
             v0, v1, v2, v3 = v0 * x + q0, v1 * x + q1, v2 * x + q2, v3 * x + q3
-            q0, q1 = q0 * x + series[k, j], q1 * x + series[k, j + 1]
-            q2, q3 = q2 * x + series[k, j + 2], q3 * x + series[k, j + 3]
+            q0, q1 = q0 * x + series[m], q1 * x + series[m + 1]
+            q2, q3 = q2 * x + series[m + 2], q3 * x + series[m + 3]
         q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
         v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
     for j in range(n if n < 4 else 0):
-        q0, v0 = series[order, j], 0.0
-        for k in range(order - 1, -1, -1):
+        q0, v0 = series[order * n + j], 0.0
+        for m in range((order - 1) * n + j, -1, -n):
             v0 = v0 * x + q0
-            q0 = q0 * x + series[k, j]
+            q0 = q0 * x + series[m]
         q[j], v[j] = q0, v0 * per_unit
 
 
-@kernel(STEP)
-def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
+@merged
+def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
@@ -412,7 +414,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
         if code == DONE:
-            code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH])
+            code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH], by_code)
         if code != DONE:
             return code, np.inf
         memory[KNOWN], memory[UNIT] = 1.0, h
@@ -443,7 +445,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return DONE, w.notes[DEPARTURE]
     series = series_of(memory, order, n, 1.0 - memory[WHICH])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
-    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH])
+    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH], by_code)
     if code != DONE:
         return code, np.inf
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
@@ -452,3 +454,15 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
         w.notes[STEP_FACTOR] = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
     return DONE, max(error, w.notes[DEPARTURE])
+
+
+@kernel(STEP)
+def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """The step with series found by their program."""
+    return _step(f, w, options, memory, t, h, tolerances, state, new_state, False)
+
+
+@kernel(STEP, vectorized=True)
+def compiled_taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """The step with series found by f.first, code made for the mechanism, which calls f.second for each solution."""
+    return _step(f, w, options, memory, t, h, tolerances, state, new_state, True)
