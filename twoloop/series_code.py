@@ -324,11 +324,11 @@ class CompiledSeries(NamedTuple):
 
     def memory_size(self, order: int) -> int:
         """Length of `memory` for series of this order."""
-        from twoloop.kernels import taylor
+        from twoloop.kernels.series import N_MEMORY_SCALARS
 
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
-        return taylor.N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.code.scratch_size(order)
+        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.code.scratch_size(order)
 
 
 _COMPILED: dict[str, CompiledSeries] = {}  # by their digests
@@ -354,7 +354,7 @@ def compiled_series(program: SeriesProgram) -> CompiledSeries:
 
 
 def _compile(code: SeriesCode, key: str) -> Dispatcher:
-    from twoloop.kernels import common, taylor
+    from twoloop.kernels import common, series
     from twoloop.linking import KernelCompiler
 
     n, n_rows = code.n, code.n_rows
@@ -363,7 +363,7 @@ def _compile(code: SeriesCode, key: str) -> Dispatcher:
     find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **numbers, order=i8)
     take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8)
     is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
-    BEGIN, ORDER, TARGET = taylor.N_MEMORY_SCALARS, taylor.ORDER, taylor.TARGET
+    BEGIN, ORDER, TARGET = series.N_MEMORY_SCALARS, series.ORDER, series.TARGET
     N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
 
     def expand(f, w, options, memory, t, unit, tolerances, state, new_state):  # type: ignore[no-untyped-def]
