@@ -47,8 +47,8 @@ class Taylor:
 
     compiled : bool
         Whether the series is found by code compiled for the mechanism: steps then take about half the time. The
-        compilation takes some 0.2 s, and 1.5 s for a thousand operations; it is kept on disk for one mechanism with one
-        set of parameters. `solve_dae` raises ValueError where there are more than 5000 operations.
+        compilation takes some 0.2 s, and 2 s for a thousand operations; it is kept on disk for one mechanism with one
+        set of parameters. `solve_dae` raises ValueError where there are more than 3000 operations.
 
     Raises
     ------
