@@ -46,7 +46,7 @@ class Taylor:
         digit of the smaller tolerance, or 19 with constant steps.
 
     compiled : bool
-        Whether the series is found by code compiled for the mechanism, which takes 20 to 60 % off a step. The
+        Whether the series is found by code compiled for the mechanism, which takes 10 to 60 % off a step. The
         compilation takes some 0.2 s, and 2 s for a thousand operations; it is kept on disk for one mechanism with one
         set of parameters. `solve_dae` raises ValueError where there are more than 3000 operations.
 
