@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from twoloop import ConstrainedSystem, Taylor, callback, consistent_state, series_code, solve_dae
-from twoloop.kernels.taylor import N_MEMORY_SCALARS
+from twoloop.kernels.series import N_MEMORY_SCALARS
 from twoloop.mechanisms import (
     andrews,
     bricard,

@@ -43,11 +43,11 @@ class Plan:
     lands: bool = False  # whether steps are shortened to end at output times
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
-    parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
     inner: Any = None  # ... that code; None: the inner loop is the general one
     expand: Any = None  # Taylor series made for the mechanism, and what solves for an order where it cannot
     solve_order: Any = None
+    parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
 
 

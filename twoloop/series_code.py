@@ -35,7 +35,7 @@ from twoloop.tracing import (
     SQUARE_ROOT,
 )
 
-LARGEST = 5000  # operations; more take longer than ten seconds to compile
+LARGEST = 3000  # operations, which take 6 s to compile; the time grows faster than their number
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
@@ -328,11 +328,11 @@ class CompiledSeries(NamedTuple):
 
     def memory_size(self, order: int) -> int:
         """Length of `memory` for series of this order."""
-        from twoloop.kernels import taylor
+        from twoloop.kernels.series import N_MEMORY_SCALARS
 
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
-        return taylor.N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order)
+        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order)
 
 
 _COMPILED: dict[str, CompiledSeries] = {}  # by their digests
@@ -359,7 +359,7 @@ def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
 
 
 def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Dispatcher:
-    from twoloop.kernels import calls, common, taylor
+    from twoloop.kernels import calls, common, series
     from twoloop.linking import KernelCompiler
 
     n, n_rows, n_kept = code.n, code.n_rows, solution.n_kept
@@ -370,7 +370,7 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
     find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **numbers, order=i8)
     take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8)
     is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
-    BEGIN, ORDER, TARGET = taylor.N_MEMORY_SCALARS, taylor.ORDER, taylor.TARGET
+    BEGIN, ORDER, TARGET = series.N_MEMORY_SCALARS, series.ORDER, series.TARGET
     N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
     EVALUATE_THERE = calls.EVALUATE_THERE
 

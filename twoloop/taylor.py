@@ -89,7 +89,7 @@ class Taylor:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
-        from twoloop.kernels import taylor as kernels
+        from twoloop.kernels import series, taylor
 
         program = self.program
         if program is None:
@@ -101,38 +101,43 @@ class Taylor:
         highest = order + 1
         widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
         plan = Plan(
-            kernels.taylor_step,
+            taylor.taylor_step,
             _options(program, highest, widths),
-            np.zeros(kernels.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
+            np.zeros(series.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
             exponent=1.0 / highest,
             safety=1.0,
-            factor_max=kernels.GROWTH,
+            factor_max=taylor.GROWTH,
             watchful=True,
             compilable=True,
             parts=min(max(highest // 3, FEWEST), MOST),
         )
         kept = plan.options.copy()
-        kept[kernels.KEEP] = 1.0
+        kept[series.KEEP] = 1.0
         interior = replace(plan, options=kept, memory=plan.memory.copy())
         if self.code is None:
             return replace(plan, interior=interior)
-        plan.options[kernels.COMPILED] = 1.0
-        series = compiled_series(program, self.code)
-        memory = np.zeros(series.memory_size(highest))
-        return replace(plan, memory=memory, expand=series.function, solve_order=kernels.solve_order, interior=interior)
+        code = compiled_series(program, self.code)
+        return replace(
+            plan,
+            step=taylor.compiled_taylor_step,
+            memory=np.zeros(code.memory_size(highest)),
+            expand=code.function,
+            solve_order=taylor.solve_order,
+            interior=interior,
+        )
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
     """The parameter block that the step reads, integers by their bits."""
-    from twoloop.kernels import taylor as kernels
+    from twoloop.kernels import series
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
     arrays: list[Any] = [*tables[0], *tables[1], *program.rows, program.row_places]
     arrays += [*program.balance, program.balance_places]
     arrays = [each.view(np.float64) if each.dtype == np.int64 else each for each in arrays]
-    scalars = np.zeros(kernels.N_SCALARS)
-    scalars[kernels.ORDER], scalars[kernels.THETA], scalars[kernels.N_NODES] = highest, LARGEST_MOVE, program.n_nodes
-    scalars[kernels.EARLY_WIDTH], scalars[kernels.LATE_WIDTH] = widths
-    begin = kernels.N_SCALARS + kernels.N_ARRAYS + 1
+    scalars = np.zeros(series.N_SCALARS)
+    scalars[series.ORDER], scalars[series.THETA], scalars[series.N_NODES] = highest, LARGEST_MOVE, program.n_nodes
+    scalars[series.EARLY_WIDTH], scalars[series.LATE_WIDTH] = widths
+    begin = series.N_SCALARS + series.N_ARRAYS + 1
     ends = begin + np.cumsum([0, *(len(each) for each in arrays)])
     return np.concatenate([scalars, ends.astype(float), *arrays])
