@@ -11,15 +11,23 @@ MANY = 16  # coordinates from which on evaluations cost more than the algebra of
 SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... up to so many operations a coordinate ...
 SIMPLE = 8  # ... or, with many coordinates, at any tolerance up to so many
+# the same of code made for the mechanism, where loops over coordinates and operations cost little:
+SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
+SHORT_FROM = 1e-3
+SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-10  # tolerance, for fewer than MANY coordinates and for others
+MANY_COMPILED = 64  # coordinates from which on Adams' method costs less than DOP853
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
-LIMIT_FEW, LIMIT_MANY = 2.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
+LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
+LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
+LIMIT_SERIES = 0.4  # times the order: the same of a series, whose steps grow with its order
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
 
 
-def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
+def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1) -> Plan:
     """The plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
-    `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried.
+    `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried, if it is found at so many
+    `looks` in a row.
     """
     from twoloop.kernels import switching as kernels
 
@@ -31,7 +39,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int) -> Plan:
     return replace(
         first,
         step=kernels.switching_step,
-        options=kernels.switching_options(limit, MATRIX_COST + n_q / 8.0, each, first.options, second.options),
+        options=kernels.switching_options(limit, looks, MATRIX_COST + n_q / 8.0, each, first.options, second.options),
         memory=kernels.switching_memory(n_q, first.memory, second.memory),
         first=first.step,
         second=second.step,
@@ -72,6 +80,7 @@ class Auto:
     loose: Method
     tight: Method
     fixed: Method
+    compiled: bool = False  # whether there is code made for the mechanism; solve_dae says so
 
     @property
     def name(self) -> str:
@@ -79,19 +88,23 @@ class Auto:
         return "auto"
 
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Auto":
-        """The same for the operations of a system, without `series` where they cannot be seen."""
-        if self.series is None or system.called_in_python:  # functions whose values may depend on more than arguments
-            return replace(self, series=None)
+        """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
+        chosen = replace(self, compiled=code is not None)
+        if self.series is None or (code is None and system.called_in_python):
+            return replace(chosen, series=None)
         try:
-            return replace(self, series=self.series.for_system(system, code))
+            return replace(chosen, series=self.series.for_system(system, code))
         except ValueError:
-            return replace(self, series=None)
+            return replace(chosen, series=None)
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Whether a step of the series costs less than the steps of the others that it replaces."""
         if self.series is None or self.series.program is None:
             return False
         operations = self.series.program.n_operations / n_q
+        if self.compiled:
+            short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
+            return short or tolerance < (SERIES_COMPILED if n_q < MANY else SERIES_COMPILED_MANY)
         return operations <= INVOLVED if tolerance < SERIES else operations <= SIMPLE and n_q >= MANY
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -101,6 +114,8 @@ class Auto:
         tolerance = least_tolerance(rtol, atol)
         second = (self.loose if tolerance >= LOOSE else self.tight).plan(n_q, rtol, atol, False)
         if self.series is not None and self._series_pays(n_q, tolerance):
-            return switching(self.series.plan(n_q, rtol, atol, False), second, LIMIT_FEW, n_q)
-        explicit, limit = (self.few, LIMIT_FEW) if n_q < MANY else (self.many, LIMIT_MANY)
-        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q)
+            series = self.series.plan(n_q, rtol, atol, False)
+            return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW)
+        many = n_q >= (MANY_COMPILED if self.compiled else MANY)
+        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
+        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks)

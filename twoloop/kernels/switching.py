@@ -13,7 +13,7 @@ Both methods are called by their addresses, f.first and f.second, and are compil
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.calls import evaluate
+from twoloop.kernels.calls import PROJECT, evaluate
 from twoloop.kernels.common import (
     DONE,
     ESTIMATE,
@@ -25,6 +25,7 @@ from twoloop.kernels.common import (
     ROUNDED,
     STEP,
     STEP_FACTOR,
+    STRAIGHT,
     compiled,
     inlined,
     kernel,
@@ -52,8 +53,8 @@ PATIENCE = 4.0  # looks before the next trial
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 
 # places in `options`: of the pair, then SAFETY ... REUSE_OF of the first and of the second method; then their options
-# LIMIT: h rho from which on the implicit method is tried
-LIMIT, MATRIX_COST, SIZE_1, N_PAIR = range(4)
+# LIMIT: h rho from which on the implicit method is tried, found at so many LOOKS in a row
+LIMIT, LOOKS, MATRIX_COST, SIZE_1, N_PAIR = range(5)
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, LEAST_ERROR, N_OF_EACH = range(7)  # LEAST_ERROR 0: no trend
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
@@ -76,16 +77,17 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     H_TRIED,
     ERROR_TRIED,
     N_TRIALS,
+    NEAR,  # looks in a row at which h rho was above LIMIT
     N_SCALARS,
-) = range(18)
+) = range(19)
 
 
 def switching_options(
-    limit: float, matrix_cost: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
+    limit: float, looks: int, matrix_cost: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
     """`options`: of the pair, the cost of a Newton matrix in evaluations, then six numbers of each, then their own."""
     first = np.asarray(first, dtype=np.float64)
-    scalars = [limit, matrix_cost, float(first.size)]
+    scalars = [limit, float(looks), matrix_cost, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
 
@@ -119,12 +121,17 @@ def _along(f, w, t, state, direction, by_v, Q, V, A):
     moved = V if by_v else Q
     for i in places:
         moved[i] += size * direction[i]
-    if evaluate(f, w, t, Q, V, INNER_TOL, A) != DONE:
+    if f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size:  # cheaper, to the nearest state on the constraints
+        code = f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
+    else:
+        code = evaluate(f, w, t, Q, V, INNER_TOL, A)
+    if code != DONE:
         return 0.0
-    image = 0.0
+    image, size = 0.0, 0.0
     for i in places:
         image = max(image, abs(A[i] - a[i]))
-    if not (image > 0.0 and np.isfinite(image)):
+        size = max(size, abs(V[i] - v[i]) if by_v else abs(Q[i] - q[i]))
+    if not (image > 0.0 and np.isfinite(image) and size > 0.0):
         return 0.0
     for i in places:
         direction[i] = (A[i] - a[i]) / image
@@ -193,11 +200,12 @@ def _look(f, w, options, memory, t, state, new_state):
     memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
     memory[LOOKS_TO_WAIT] -= 1.0
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
+    memory[NEAR] = memory[NEAR] + 1.0 if share > 1.0 else 0.0
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
     cheap = f.flags[FORCE_BY_Q_GIVEN] == 1 or _cost(w, options) > EARN * w.independent.size
-    due = share > SURELY or (share > 1.0 and cheap)
+    due = share > SURELY or (memory[NEAR] >= options[LOOKS] and cheap)
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
@@ -268,5 +276,6 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if memory[PHASE] == ON_TRIAL:
         error *= STRICT
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
-    w.notes[STEP_FACTOR] = _factor(memory, each, h, error)
+    if w.notes[STEP_FACTOR] == 0.0:  # else the method knows better
+        w.notes[STEP_FACTOR] = _factor(memory, each, h, error)
     return code, error
