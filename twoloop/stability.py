@@ -21,7 +21,7 @@ DISPLACEMENT = 1e-6  # of the largest coordinate or velocity, for derivatives al
 INNER_TOL = 1e-8  # of the positions; their error is squared
 ALIGNED = 0.9  # cosine from which on two directions are one
 MANY = 200  # accepted steps before the last look, from which on it is worth a sentence
-NEXT_TO = 0.7  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
+NEXT_TO = 0.55  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
 
 
 class Look(NamedTuple):
