@@ -2,7 +2,8 @@
 
 Numba optimises each function together with all that it calls and makes machine code of it, so that a helper at depth
 five is optimised six times, and its machine code is made without ever being called. Here helpers are handed on as
-LLVM's intermediate code, and the kernel at the top is optimised once. Loops are neither unrolled nor vectorised: those
+LLVM's intermediate code, and the kernel at the top is optimised once. Numba's front end, half of the time, leaves out
+what finds nothing to do. Loops are neither unrolled nor vectorised: those
 of a mechanism are short, and the code that tests whether they are costs more than it gains. Nor does an index of a
 kernel count from the end where it is negative, as none is: the code that asks for it would hide from LLVM that elements
 lie side by side.
@@ -17,6 +18,9 @@ from numba import types
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
+from numba.core.targetconfig import ConfigStack
+from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
+from numba.core.types.functions import BaseFunction, Function
 from numba.np import arrayobj
 
 
@@ -80,14 +84,47 @@ def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
 arrayobj.fix_integer_index = _index
 
 
-class HelperCompiler(Compiler):
+_plain_call_type: Any = BaseFunction.get_call_type
+_call_types: dict[Any, tuple[Any, Any]] = {}
+
+
+def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """The signature of a call of one of numba's functions, found once for the same types and options.
+
+    Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
+    """
+    key = self, args, tuple(kws.items()), repr(ConfigStack.top_or_none())
+    if key not in _call_types:
+        signature = _plain_call_type(self, context, args, kws)
+        _call_types[key] = signature, self._impl_keys[signature.args]
+    signature, self._impl_keys[signature.args] = _call_types[key]
+    return signature
+
+
+# passes over every function that find nothing to do in kernels: whole arrays in an expression, as none is allocated;
+# overloads that are put in the place of calls before lowering; what cannot stand in a compiled function
+_NEEDLESS = {NopythonRewrites, InlineOverloads, IRLegalization}
+
+
+class _Compiler(Compiler):
+    """Numba's compiler without what kernels do not need."""
+
+    def define_pipelines(self) -> list[Any]:
+        """The passes."""
+        pipelines: list[Any] = super().define_pipelines()
+        for pipeline in pipelines:
+            pipeline.passes = [each for each in pipeline.passes if each[0] not in _NEEDLESS]
+        return pipelines
+
+
+class HelperCompiler(_Compiler):
     """Numba's compiler, but for a function that is called by compiled ones only; from Python the call would crash."""
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
         super().__init__(typing_context, target_context, _Linked(target_context.codegen(), "helper"), *others)
 
 
-class KernelCompiler(Compiler):
+class KernelCompiler(_Compiler):
     """Numba's compiler, but for a function that is optimised together with its helpers, once."""
 
     library: type[_Whole] = _Whole
@@ -96,6 +133,15 @@ class KernelCompiler(Compiler):
         library = self.library(target_context.codegen(), "kernel")
         library.enable_object_caching()
         super().__init__(typing_context, target_context, library, *others)
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile a function and all that it calls."""
+        numbas: Any = Function
+        numbas.get_call_type = _call_type
+        try:
+            return super().compile_extra(function)
+        finally:
+            del numbas.get_call_type  # what it inherits is numba's own
 
 
 class VectorizingCompiler(KernelCompiler):

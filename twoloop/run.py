@@ -211,6 +211,7 @@ class Run:
         raised: Exception | None = None
         while code == a.PAUSED:
             across = plan is not self.plan
+            filled[:] = 0  # whatever Ctrl-C comes between
             began = time.process_time()
             most = int(control[a.MAX_ATTEMPTS])  # each fills at most one row
             n_rows, n_steps = min(most, BUFFER_ROWS), min(most, BUFFER_STEPS)

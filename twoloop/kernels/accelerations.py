@@ -118,7 +118,7 @@ def _equal(A, B):
     return True
 
 
-@compiled
+@merged
 def _schur_complement(f, w):
     """S = G M^-1 G^T of the rows that count, and its factors; with a constant M only if G has changed."""
     keep = f.flags[CONSTANT_MASS] == 1
@@ -144,7 +144,7 @@ def _schur_complement(f, w):
     return DONE
 
 
-@compiled
+@merged
 def _by_multipliers(f, w, a):
     """(7), then (8), with M^-1 Q and M^-1 G^T as they stand; the multipliers stay in w.z."""
     code = _schur_complement(f, w)
@@ -164,7 +164,7 @@ def _by_multipliers(f, w, a):
     return DONE
 
 
-@compiled
+@merged
 def _reduce_diagonal(columns, independent, M, D, g, Q, y, A, m):
     """T^T M T of a diagonal M, upper triangle into A, and y = Q - M g; m is scratch."""
     copy(Q, y)
@@ -181,7 +181,7 @@ def _reduce_diagonal(columns, independent, M, D, g, Q, y, A, m):
         A[i, i] += M[independent[i], independent[i]]
 
 
-@compiled
+@merged
 def _reduce_dense(columns, independent, M, D, g, Q, y, A, MT):
     """T^T M T of any M, upper triangle into A, and y = Q - M g; MT is scratch."""
     n, n_dof = Q.size, independent.size
@@ -206,7 +206,7 @@ def _reduce_dense(columns, independent, M, D, g, Q, y, A, MT):
                     A[i, j] += factor * MT[columns[k], j]
 
 
-@compiled
+@merged
 def _solve_reduced(columns, independent, D, g, y, A, x, a):
     """a = g + T x with A x = T^T y; A becomes its factors. False: it is not positive definite."""
     n_dof = independent.size
@@ -278,7 +278,7 @@ def _by_form(f, w, a):
     return DONE
 
 
-@compiled
+@merged
 def factor_for_projection(f, w, t, q):
     """M, and the factors of T^T M T or G M^-1 G^T, at a state whose rows, factors and w.D stand in w."""
     code = DONE

@@ -287,9 +287,10 @@ def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# a helper whose floating-point operations keep their order; said outright, because a callee inherits its caller's flags
-exact = _helper(fastmath=False)
-compiled = _helper()  # a helper that kernels call
+# Flags are said outright, because a callee inherits its caller's: what a merged helper calls would be merged, too.
+# A helper whose floating-point operations keep their order
+exact = _helper(fastmath=False, forceinline=False)
+compiled = _helper(forceinline=False)  # a helper that kernels call; one copy, unless LLVM finds it short
 inlined = _helper(inline="always")  # one that vanishes in its caller; only such a one can return views of arrays
-# the same later, by LLVM, and so typed once. Calls of what gets Functions and Work are dear
+# the same later, by LLVM, and so typed once: for what is short, or called in every evaluation; each call is a copy
 merged = _helper(forceinline=True)

@@ -39,7 +39,7 @@ def clear_rows(f, w):
         w.entries[:] = 0.0
 
 
-@compiled
+@merged
 def row_residual(w, v, rows):
     """G v + (C_t, b) of these rows, into w.z."""
     for k in range(rows.size):
@@ -76,7 +76,7 @@ def kinematics(f, w, t, q, v):
             f.nonholonomic_rate(t, q, f.p, w.Rate[n_c:])
 
 
-@compiled
+@merged
 def gather_independent_columns(G, rate, rows, independent, D):
     """Right-hand sides for the rows of w.D."""
     for j in range(independent.size):

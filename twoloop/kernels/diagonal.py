@@ -59,7 +59,7 @@ from twoloop.kernels.newton_memory import (
     vector,
 )
 from twoloop.kernels.predictor import departure, keep_predicted
-from twoloop.kernels.stages import INNER_TOL, N_SCALARS, OUTER_TOL, options_array
+from twoloop.kernels.stages import INNER_TOL, N_SCALARS, OUTER_TOL, STAGES, options_array
 
 MAX_ITERATIONS = 8
 GROWTH = 2.0  # of a correction, from which the iteration is given up
@@ -121,6 +121,12 @@ def _dense_tangents(f, w):
     return f.flags[FORCE_BY_Q_GIVEN] == 1 and f.flags[BANDWIDTH] < 0 and w.Rate.size == w.C.size
 
 
+@merged
+def _one(options):
+    """The one stage, as a number that numba does not know: so it has what newton.py calls compiled already."""
+    return int(options[STAGES])
+
+
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
     """The factors for an iteration at (Q, V), evaluated just before with accelerations F: DONE, or why not."""
@@ -131,11 +137,11 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
         memory[H_FACTORED] = 0.0
         if _dense_tangents(f, w):
             return factor_iteration(f, w, memory, t, Q, V, h * _gamma(options))
-        code = derivatives_at(f, w, options, memory, 1, t, Q, V, F)
+        code = derivatives_at(f, w, options, memory, _one(options), t, Q, V, F)
         if code != DONE:
             return code
     if memory[H_FACTORED] != h:
-        return factor_systems(f, w, options, memory, 1, h)
+        return factor_systems(f, w, options, memory, _one(options), h)
     return DONE
 
 
@@ -171,7 +177,7 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
         if _dense_tangents(f, w):
             solve_iteration(w, memory, residual[0], a)
         else:
-            correct(f, w, options, memory, 1, residual, A_stage)
+            correct(f, w, options, memory, _one(options), residual, A_stage)
         change = 0.0
         for m in w.independent:
             d = abs(residual[0, m])
@@ -223,9 +229,9 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
     if _dense_tangents(f, w):
         filter_by_iteration(w, memory, z, e_q[:count], e_v[:count])
     elif f.flags[BANDWIDTH] >= 0:
-        filter_banded(f, w, options, memory, 1, h, e_q, e_v)
+        filter_banded(f, w, options, memory, _one(options), h, e_q, e_v)
     else:
-        filter_dense(w, options, memory, 1, h, e_q[:count], e_v[:count])
+        filter_dense(w, options, memory, _one(options), h, e_q[:count], e_v[:count])
     error = 0.0
     for i in range(count):
         j = w.independent[i]

@@ -69,7 +69,7 @@ def make_program(G, pattern, rows, columns, index, values):
     return code != SINGULAR_MATRIX
 
 
-@compiled
+@merged
 def factor(entries, index, values):
     """Factor G[rows][:, columns]; 1/pivots on the diagonal. `entries` are those of G (n, n_q), whose last row is zero.
 
@@ -134,7 +134,7 @@ def sign_of(index, values):
     return sign
 
 
-@compiled
+@merged
 def solve(index, values, x):
     """Solve for one right-hand side, overwritten."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
@@ -150,14 +150,14 @@ def solve(index, values, x):
         x[index[in_row + s]] -= values[s] * x[index[in_column + s]]
 
 
-@compiled
+@merged
 def solve_rows(index, values, X, n):
     """Solve for each of the first n rows of X."""
     for j in range(n):
         solve(index, values, X[j])
 
 
-@compiled
+@merged
 def solve_transposed(index, values, x):
     """Solve with the transposed matrix: x is in the order of columns on entry, in that of rows on return."""
     r = index[SIZE]

@@ -22,7 +22,6 @@ from twoloop.kernels.common import (
     NULL_SPACE,
     PIVOT,
     ROUNDED,
-    compiled,
     merged,
 )
 from twoloop.kernels.constraints import constraint_rates, kinematics
@@ -84,7 +83,7 @@ def _nearest(f, w, columns):
     ldl_solve(w.A, x[:n_dof])
 
 
-@compiled
+@merged
 def _to_constraints(f, w, q, v):
     """Correct q and v by T and the factors of T^T M T; the largest correction of a position, and of a velocity."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
@@ -126,7 +125,7 @@ def _to_constraints(f, w, q, v):
     return largest, faster
 
 
-@compiled
+@merged
 def _by_multipliers(w, q, v):
     """The same by the factors of G M^-1 G^T."""
     rows, solved, g = w.rows_v, w.W, w.g[: w.rows_v.size]
