@@ -15,6 +15,7 @@ from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.kernels import calls
 from twoloop.kernels.common import DONE
+from twoloop.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.mechanisms import (
     andrews,
     bricard,
@@ -30,7 +31,7 @@ from twoloop.mechanisms import (
 from twoloop.methods import PRESETS
 from twoloop.run import Run
 from twoloop.solve import solve_dae
-from twoloop.straight_code import LARGEST_ANGLE, function_of, own_code
+from twoloop.straight_code import function_of, own_code
 from twoloop.straight_line import Choice, Derivative, Factors, Outputs, Solution, StraightLine
 from twoloop.tracing import Form, Graph
 
@@ -334,11 +335,11 @@ def test_a_second_process_compiles_nothing():
         "from twoloop import solve_dae, straight_code\n"
         "from twoloop.mechanisms import four_bar\n"
         "made = []\n"
-        "function_of = straight_code.Emitter.operation\n"
+        "function_of = straight_code.Written.operation\n"
         "def counted(*given):\n"
         "    made.append(1)\n"
         "    return function_of(*given)\n"
-        "straight_code.Emitter.operation = counted\n"
+        "straight_code.Written.operation = counted\n"
         "p = four_bar(theta3=0.0123)\n"
         "solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, 'DOP853', compiled=True)\n"
         "print(len(made))\n"

@@ -24,7 +24,10 @@ FLAGS = tuple(sorted(OPTIONS["fastmath"]))
 DOUBLE, INTEGER, WORD = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
 ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
 ALIGNMENT = 64  # bytes, of the widest vector: none lies in two lines of the cache
-INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt")}  # other functions are libm's
+# functions of LLVM; others are those of libm
+INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "fabs")}
+    name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "fabs")
+}  # other functions are libm's
 
 
 class Emitter:

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
-from twoloop import straight_line
+from twoloop import llvm_code, llvm_trigonometry, straight_line
 from twoloop.caches import compile_kept
 from twoloop.callbacks import VECTOR
+from twoloop.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, Value
+from twoloop.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.straight_line import Choice, Outputs, StraightLine
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import (
@@ -40,127 +40,47 @@ from twoloop.tracing import (
 
 Array = NDArray[np.float64]
 
-DOUBLE, INTEGER = ir.DoubleType(), ir.IntType(64)
-FLAGS = ("contract", "reassoc", "nsz", "arcp")  # those of the kernels
-FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log"}
-
-# sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
-# sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
-LARGEST_ANGLE = 1e6  # beyond, the sum is not enough
-HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
-SINES = (
-    -1.66666666666666307295e-1,
-    8.33333333332211858878e-3,
-    -1.98412698295895385996e-4,
-    2.75573136213857245213e-6,
-    -2.50507477628578072866e-8,
-    1.58962301576546568060e-10,
-)
-COSINES = (
-    4.16666666666665929218e-2,
-    -1.38888888888730564116e-3,
-    2.48015872888517045348e-5,
-    -2.75573141792967388112e-7,
-    2.08757008419747316778e-9,
-    -1.13585365213876817300e-11,
-)
+FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
 
-class Emitter:
-    """Instructions for quantities of a graph, each computed once."""
+class Written:
+    """Values of the quantities of a graph, as they are written into a function."""
 
-    def __init__(self, builder: Any):
-        self.builder = builder
-        self.angles: list[Any] = []  # absolute values
-        self._values: dict[int, Any] = {}
-        self._forms: dict[Any, Any] = {}
-        self._pairs: dict[Any, tuple[Any, Any]] = {}
+    def __init__(self, emit: Emitter):
+        self.emit = emit
+        self.angles: list[Value] = []  # of sines and cosines
+        self._known = Quantities(emit, self._missing)
+        self._pairs: dict[Any, tuple[Value, Value]] = {}
 
-    def set_value(self, quantity: int, value: Any) -> None:
-        """What a quantity is."""
-        self._values[quantity] = value
+    def _missing(self, quantity: int) -> Value:
+        raise KeyError(quantity)  # every quantity is defined before it is used
 
-    def form(self, form: Form) -> Any:
+    def define(self, quantity: int, value: Value) -> None:
+        """Say what an input is."""
+        self._known.define(quantity, value)
+
+    def form(self, form: Form) -> Value:
         """The value of a form."""
-        key = form.key
-        if key not in self._forms:
-            self._forms[key] = self._sum(form)
-        return self._forms[key]
-
-    def _sum(self, form: Form) -> Any:
-        b = self.builder
-        total = None if form.constant == 0.0 else ir.Constant(DOUBLE, form.constant)
-        for i, c in form.terms.items():
-            x = self._values[i]
-            if total is None:
-                total = x if c == 1.0 else b.fmul(ir.Constant(DOUBLE, c), x, flags=FLAGS)
-            elif c == 1.0:
-                total = b.fadd(total, x, flags=FLAGS)
-            elif c == -1.0:
-                total = b.fsub(total, x, flags=FLAGS)
-            else:
-                total = b.fadd(total, b.fmul(ir.Constant(DOUBLE, c), x, flags=FLAGS), flags=FLAGS)
-        return ir.Constant(DOUBLE, 0.0) if total is None else total
+        return self._known.sum(tuple(form.terms.items()), form.constant)
 
     def operation(self, quantity: int, kind: int, first: Form, second: Form | None) -> None:
         """Compute a quantity."""
-        b, x = self.builder, self.form(first)
+        emit, x = self.emit, self.form(first)
         if kind == PRODUCT:
             assert second is not None
-            value = b.fmul(x, self.form(second), flags=FLAGS)
+            value = emit.multiply(x, self.form(second))
         elif kind == SUM:
             value = x
         elif kind == RECIPROCAL:
-            value = b.fdiv(ir.Constant(DOUBLE, 1.0), x, flags=FLAGS)
+            value = emit.divide(ONE, x)
         elif kind in (SINE, COSINE):
             if first.key not in self._pairs:
-                self._pairs[first.key] = self._sine_and_cosine(x)
+                self.angles.append(x)
+                self._pairs[first.key] = sine_and_cosine(emit, x)
             value = self._pairs[first.key][kind == COSINE]
-        elif kind == ARCTANGENT:
-            kind_of_function = ir.FunctionType(DOUBLE, [DOUBLE])
-            value = b.call(cgutils.get_or_insert_function(b.module, kind_of_function, "atan"), [x])
         else:
-            value = b.call(b.module.declare_intrinsic(f"llvm.{FUNCTIONS[kind]}", [DOUBLE]), [x])
-        self._values[quantity] = value
-
-    def _sine_and_cosine(self, x: Any) -> tuple[Any, Any]:
-        """Both for an angle up to LARGEST_ANGLE: without a call, so that those of several angles run side by side."""
-        b = self.builder
-
-        def function(name: str, y: Any) -> Any:
-            return b.call(b.module.declare_intrinsic(f"llvm.{name}", [DOUBLE]), [y])
-
-        def polynomial(square: Any, coefficients: tuple[float, ...]) -> Any:
-            total: Any = DOUBLE(coefficients[-1])
-            for coefficient in reversed(coefficients[:-1]):
-                total = b.fma(total, square, DOUBLE(coefficient))
-            return total
-
-        self.angles.append(function("fabs", x))
-        turns = function("rint", b.fmul(x, DOUBLE(1.0 / HALF_PI[0])))
-        rest = x
-        for part in HALF_PI:
-            rest = b.fma(turns, DOUBLE(-part), rest)
-        square = b.fmul(rest, rest)
-        sine = b.fma(b.fmul(square, rest), polynomial(square, SINES), rest)
-        cosine = b.fma(square, DOUBLE(-0.5), DOUBLE(1.0))
-        cosine = b.fma(b.fmul(square, square), polynomial(square, COSINES), cosine)
-        quarter = b.fptosi(turns, INTEGER)
-        odd = b.trunc(quarter, ir.IntType(1))
-        signs = [b.shl(b.and_(number, INTEGER(2)), INTEGER(62)) for number in (quarter, b.add(quarter, INTEGER(1)))]
-        made = [
-            b.bitcast(b.xor(b.bitcast(b.select(odd, one, other), INTEGER), sign), DOUBLE)
-            for one, other, sign in ((cosine, sine, signs[0]), (sine, cosine, signs[1]))
-        ]
-        return made[0], made[1]
-
-
-def _pointer(context: Any, builder: Any, value: Any) -> Any:
-    return make_array(VECTOR)(context, builder, value).data
-
-
-def _place(builder: Any, pointer: Any, i: int) -> Any:
-    return builder.gep(pointer, [ir.Constant(ir.IntType(64), i)], inbounds=True)
+            value = emit.function(FUNCTIONS[kind], x)
+        self._known.define(quantity, value)
 
 
 def function_of(graph: Graph, outputs: Outputs) -> Any:
@@ -169,39 +89,41 @@ def function_of(graph: Graph, outputs: Outputs) -> Any:
     It returns whether the conditions hold and what it computes is finite, and fills the vectors only then.
     """
 
-    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def pointer(vectors: Value, k: int) -> Value:
+            return make_array(VECTOR)(context, builder, builder.extract_value(vectors, k)).data
+
         given, filled = arguments
-        emitter, first = Emitter(builder), 0
+        emit = Emitter(builder)
+        written, quantity = Written(emit), 0
         for k, (kind, size) in enumerate(zip(signature.args[0], graph.sizes, strict=True)):
-            value = builder.extract_value(given, k)
             for j in range(size):
-                place = _place(builder, _pointer(context, builder, value), j) if kind == VECTOR else None
-                emitter.set_value(first + j, value if place is None else builder.load(place))
-            first += size
+                is_vector = kind == VECTOR
+                value = emit.load(pointer(given, k), j) if is_vector else builder.extract_value(given, k)
+                written.define(quantity, value)
+                quantity += 1
         for i in outputs.quantities(graph):
             operation = graph.operations[i]
             assert operation is not None
-            emitter.operation(i, *operation)
-        zero: Any = ir.Constant(DOUBLE, 0.0)
-        total, holds = zero, ir.Constant(ir.IntType(1), 1)
-        results = {name: [emitter.form(form) for form in forms] for name, forms in outputs.arrays.items()}
+            written.operation(i, *operation)
+        results = {name: [written.form(form) for form in forms] for name, forms in outputs.arrays.items()}
+        total = ZERO
         for value in next(iter(results.values())):  # what is not finite becomes NaN
-            total = builder.fadd(total, builder.fmul(value, zero, flags=FLAGS), flags=FLAGS)
-        holds = builder.fcmp_ordered("==", total, zero)
-        for one, other in outputs.conditions:
-            holds = builder.and_(holds, builder.fcmp_ordered(">", emitter.form(one), emitter.form(other)))
-        for angle in emitter.angles:
-            holds = builder.and_(holds, builder.fcmp_ordered("<", angle, DOUBLE(LARGEST_ANGLE)))
+            total = emit.add(total, emit.multiply(value, ZERO))
+        holds = builder.fcmp_ordered("==", total, ZERO)
+        pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
+        pairs += [(DOUBLE(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
+        for one, other in pairs:
+            holds = builder.and_(holds, builder.fcmp_ordered(">", one, other))
         with builder.if_then(holds):
             for k, values in enumerate(results.values()):
-                pointer = _pointer(context, builder, builder.extract_value(filled, k))
                 for j, value in enumerate(values):
-                    builder.store(value, _place(builder, pointer, j))
+                    emit.store(value, pointer(filled, k), j)
         return holds
 
     @intrinsic
     def function(typing: Any, given: Any, filled: Any) -> Any:
-        return types.boolean(given, filled), emit
+        return types.boolean(given, filled), generate
 
     return function
 
@@ -222,8 +144,8 @@ class OwnCode:
 
         self.equations = equations
         digest = hashlib.sha256(repr(list(_described(equations))).encode())
-        for module in (__file__, straight_line.__file__):
-            digest.update(Path(module).read_bytes())
+        for module in (__file__, straight_line.__file__, llvm_code.__file__, llvm_trigonometry.__file__):
+            digest.update(Path(str(module)).read_bytes())
         self.digest = digest.hexdigest()
         self.inner = _inner(equations, (common.stamp("calls"), self.digest))
 
