@@ -26,8 +26,6 @@ ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
 ALIGNMENT = 64  # bytes, of the widest vector: none lies in two lines of the cache
 # functions of LLVM; others are those of libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "fabs")}
-    name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "fabs")
-}  # other functions are libm's
 
 
 class Emitter:
