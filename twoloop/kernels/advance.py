@@ -251,7 +251,9 @@ def advance(
                 return RANK_LOST
             continue
         factor = control[FACTOR_MAX]
-        if error > 0.0:
+        if w.notes[STEP_FACTOR] > 0.0:
+            factor = w.notes[STEP_FACTOR]
+        elif error > 0.0:
             power = 1.0 / error if control[EXPONENT] == 1.0 else error ** -control[EXPONENT]
             factor = control[SAFETY] * power
             if accepted and control[PREDICTIVE] == 1.0 and clock[ERROR_BEFORE] > 0.0:
@@ -260,8 +262,6 @@ def advance(
             factor = min(control[FACTOR_MAX], max(control[FACTOR_MIN], factor))
             if accepted and control[PREDICTIVE] == 1.0 and 1.0 <= factor <= KEPT:
                 factor = 1.0
-        if w.notes[STEP_FACTOR] > 0.0:
-            factor = w.notes[STEP_FACTOR]
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1

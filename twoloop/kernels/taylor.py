@@ -95,7 +95,7 @@ def _length(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate(series, unit, order, x, q, v):
-    """q and v at x units of time, by Horner's scheme; four coordinates at once, some of the last ones twice."""
+    """q and v at x units of time, by Horner's scheme; four coordinates at once, or two, some of the last ones twice."""
     n, per_unit = q.size, 1.0 / unit
     for first in range(0, n if n > 3 else 0, 4):
         j = min(first, n - 4)
@@ -108,12 +108,14 @@ def _evaluate(series, unit, order, x, q, v):
             q2, q3 = q2 * x + series[m + 2], q3 * x + series[m + 3]
         q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
         v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
-    for j in range(n if n < 4 else 0):
-        q0, v0 = series[order * n + j], 0.0
-        for m in range((order - 1) * n + j, -1, -n):
-            v0 = v0 * x + q0
-            q0 = q0 * x + series[m]
-        q[j], v[j] = q0, v0 * per_unit
+    for first in range(0, n if n < 4 else 0, 2):
+        j = max(min(first, n - 2), 0)
+        k = min(j + 1, n - 1)
+        q0, q1, v0, v1 = series[order * n + j], series[order * n + k], 0.0, 0.0
+        for m in range((order - 1) * n, -1, -n):
+            v0, v1 = v0 * x + q0, v1 * x + q1
+            q0, q1 = q0 * x + series[m + j], q1 * x + series[m + k]
+        q[j], q[k], v[j], v[k] = q0, q1, v0 * per_unit, v1 * per_unit
 
 
 @merged
@@ -141,7 +143,7 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     x = (memory[PASSED] + h) / unit
     error = 0.0
     if estimated:
-        error = (x / memory[LENGTH]) ** order
+        error = x / memory[LENGTH]  # larger than the estimate of the error, which is a power of it
         if x > memory[LENGTH] * (1.0 + ROUNDING):
             w.notes[STEP_FACTOR] = memory[LENGTH] / x
             return DONE, max(error, 1.0 + ROUNDING)
