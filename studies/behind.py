@@ -1,7 +1,8 @@
 """Where a rival is ahead: steps and time per step of both, and what stands in the way.
 
 A part of `studies.work_precision`. The operations of an evaluation as straight-line code are counted for every
-mechanism; what such code would bring follows from the time of an operation on the four-bar (`studies.limit`).
+mechanism; what runs would take of which nothing is left but these follows from the time of an operation on the four-bar
+(`studies.limit`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -50,7 +51,7 @@ def findings_of(
     operations : mapping
         Operations of an evaluation by mechanism.
     operation_ns : float
-        Time of one as straight-line code.
+        Time of one in the accelerations that `compiled=True` makes.
     """
     worst = []
     for each in found["mechanisms"]:

@@ -269,8 +269,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
         if each["trap"] not in (*found["all_say_so"], *found["all_right"])
     ]
     short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
-    counts = [[name, *(each[what] for what in ORDER)] for name, each in found["counts"].items()]
-    ready = {"cells": table(["trap", *short], cells), "counts": table(["solver", *(x.lower() for x in ORDER)], counts)}
+    shown = [what for what in ORDER if what != NOT_RUN]
+    counts = [[name, *(each[what] for what in shown)] for name, each in found["counts"].items()]
+    ready = {"cells": table(["trap", *short], cells), "counts": table(["solver", *(x.lower() for x in shown)], counts)}
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 

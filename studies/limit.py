@@ -1,12 +1,14 @@
-"""How far an evaluation is from what the machine can do: operations counted, peak measured, and where the rest goes.
+"""How far evaluations and steps are from what the machine can do, without and with code made for the mechanism.
 
 A part of `studies.work_precision`, on the default four-bar. Operations are those of the accelerations as straight-line
 code (`references.straight_line`), every zero left out: what eq. (6) asks for at least. The peak is measured in the same
-run, by a loop of multiply-adds and by a copy within the first cache.
+run, by a loop of multiply-adds and by a copy within the first cache. "alone": the accelerations that `compiled=True`
+makes, called in a loop.
 """
 
 import time
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numba
@@ -14,13 +16,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from references.straight_line import program_of, straight_line
+from references.straight_line import program_of
 from studies.store import KeptRows, Row
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
+from twoloop.straight_code import function_of, own_code
 
 GROUP = "limit"
-METHODS = ("Adams", "DOP853")
+METHODS = ("Adams", "DOP853", "Taylor")
+BY_EVALUATIONS = METHODS[:2]  # a step of Taylor computes series, not accelerations at points
 TOLERANCE = 1e-10
 ROUNDS = 5
 LANES, LENGTH = 32, 256  # accumulators of the loop of multiply-adds; floats copied, which fit into the first cache
@@ -57,17 +61,17 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     """One row a quantity and round; the rounds are interleaved."""
     problem = four_bar()
     q, v, p = problem.q0, problem.v0, problem.system.functions.p
-    y, rate = np.concatenate([q, v]), np.zeros(2 * q.size)
     program, _ = program_of(problem.system, 0.0, q, v)
-    derivative = straight_line(problem.system, 0.0, q, v)
+    equations = own_code(problem.system, 0.0, q).equations
+    accelerations = function_of(equations.graph, equations.there)
     f = problem.system.functions
     kinematics, force = f.kinematics, f.force
 
     @numba.njit
-    def evaluations(n: int, y: Array, rate: Array) -> None:
+    def evaluations(n: int, q: Array, v: Array, a: Array) -> None:
         for _ in range(n):
-            y[0] += 1e-18 * rate[0]  # so that no evaluation is left out
-            derivative(0.0, y, rate)
+            q[0] += 1e-18 * a[0]  # so that no evaluation is left out
+            accelerations((0.0, q, v), (a,))
 
     @numba.njit
     def callbacks(n: int, q: Array, v: Array, p: Array, C: Array, Cq: Array, Ct: Array, Qd: Array, Q: Array) -> None:
@@ -89,7 +93,7 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     }
     multiply_add(lanes, 1)
     copy(source, target, 1)
-    evaluations(1, y.copy(), rate)
+    evaluations(1, q.copy(), v, np.zeros_like(q))
     callbacks(1, q.copy(), v, p, *spaces)
     keys = []
     for repeat in range(1 if quick else ROUNDS):
@@ -100,29 +104,27 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
         row: Row = {"group": GROUP, "case": problem.name, "solver": "", "repeat": repeat, **counts}
         row["gflops"] = 2e-9 * LANES * REPEATED / _seconds(multiply_add, lanes, REPEATED)
         row["gbytes"] = 16e-9 * LENGTH * REPEATED / _seconds(copy, source, target, REPEATED)
-        row["straight_ns"] = 1e9 * _seconds(evaluations, REPEATED, y.copy(), rate) / REPEATED
+        row["alone_ns"] = 1e9 * _seconds(evaluations, REPEATED, q.copy(), v, np.zeros_like(q)) / REPEATED
         row["callbacks_ns"] = 1e9 * _seconds(callbacks, REPEATED, q.copy(), v, p, *spaces) / REPEATED
-        for method in METHODS:
-            solved = [
-                solve_dae(problem.system, (0.0, 10.0), q, v, method=method, rtol=TOLERANCE, atol=TOLERANCE).stats
-                for _ in range(2 if quick else 5)
-            ]
-            cpu = min(stats.cpu_time for stats in solved)
-            row[f"{method}_evaluation_ns"] = 1e9 * cpu / (solved[0].n_evaluations or 1)
-            row[f"{method}_step_ns"] = 1e9 * cpu / (solved[0].n_accepted or 1)
+        for method, compiled in product(METHODS, (False, True)):
+            options: dict[str, Any] = {"method": method, "rtol": TOLERANCE, "atol": TOLERANCE, "compiled": compiled}
+            solved = [solve_dae(problem.system, (0.0, 10.0), q, v, **options).stats for _ in range(2 if quick else 5)]
+            cpu, name = min(stats.cpu_time for stats in solved), f"{method}_compiled" if compiled else method
+            row[f"{name}_step_ns"] = 1e9 * cpu / (solved[0].n_accepted or 1)
+            if method in BY_EVALUATIONS:
+                row[f"{name}_evaluation_ns"] = 1e9 * cpu / (solved[0].n_evaluations or 1)
         kept.add(key, row)
     return pd.DataFrame([kept[key] for key in keys])
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Medians, the share of the peak, and what straight-line code would add."""
+    """Medians, the share of the peak, and what code made for the mechanism adds."""
     numbers = rows.select_dtypes("number").drop(columns="repeat").dropna(axis=1, how="all").median()
     found: dict[str, Any] = {str(name): float(value) for name, value in numbers.items()}
-    best = min(METHODS, key=lambda method: found[f"{method}_evaluation_ns"])
-    own = found[f"{best}_evaluation_ns"]
-    found |= {"best": best, "own_ns": own, "methods": list(METHODS)}
-    found["share"] = found["operations"] / (own * found["gflops"])
-    found["straight_share"] = found["operations"] / (found["straight_ns"] * found["gflops"])
+    best = min(BY_EVALUATIONS, key=lambda method: found[f"{method}_evaluation_ns"])
+    own, compiled = found[f"{best}_evaluation_ns"], found[f"{best}_compiled_evaluation_ns"]
+    found |= {"best": best, "own_ns": own, "compiled_ns": compiled, "methods": list(METHODS)}
+    for name, nanoseconds in (("share", own), ("compiled_share", compiled), ("alone_share", found["alone_ns"])):
+        found[name] = found["operations"] / (nanoseconds * found["gflops"])
     found["memory_share"] = 8.0 * found["moves"] / (own * found["gbytes"])
-    found["callbacks_share"] = found["callbacks_ns"] / own
-    return found | {"straight_faster": own / found["straight_ns"]}
+    return found | {"callbacks_share": found["callbacks_ns"] / own}

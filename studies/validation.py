@@ -300,23 +300,15 @@ def picture(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def lines(found: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
-    """Of the table of solvers."""
+def lines(found: Sequence[dict[str, Any]], steps: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
+    """Of the table of solvers, by their runs and by their steps."""
+    stepped = {line["solver"]: percent(line["deceived"]) for line in steps if line["n"]}
+    keys = ("right", "wrong", "said so", "ratio", "digits_q", "digits_v", "digits_lam")
     for line in found:
-        slopes = line["slope"]
-        yield [
-            line["solver"],
-            *(line[what] for what in ("right", "wrong", "said so", "not run")),
-            "–" if slopes is None else number(slopes[1]),
-            *(line[what] for what in ("ratio", "digits_q", "digits_v", "digits_lam", "energy")),
-            *(line[what] for what in ("violation_q", "evaluations")),
-        ]
+        yield [line["solver"], *(line[key] for key in keys), stepped.get(line["solver"], "–")]
 
 
-HEADER = (
-    *("solver", "right", "wrong", "said so", "not run", "slope", "error/tol", "q", "v", "λ", "energy"),
-    *("max abs C", "evaluations"),
-)
+HEADER = ("solver", "right", "wrong", "said so", "error/tol", "q", "v", "λ", "deceived")
 
 
 def _of_exudyn(line: dict[str, Any] | None) -> str:
@@ -331,17 +323,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     found = findings_of(rows)
     output.save_findings(found)
     figures.save(picture(rows), output, "validation")
-    ready = {"solvers": table(HEADER, lines(found["solvers"]))}
-    stepped = [
-        [
-            line["solver"],
-            percent(line["deceived"]),
-            line["worst"],
-            percent(line["first"]),
-        ]
-        for line in found["steps"]
-        if line["n"]
-    ]
+    ready = {"solvers": table(HEADER, lines(found["solvers"], found["steps"]))}
     ready["models"] = table(
         ("mechanism", *EXUDYN),
         [
@@ -349,8 +331,6 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
             for line in found["models"]
         ],
     )
-    header = ("solver", "deceived", "worst", "first steps")
-    ready["steps"] = table(header, stepped)
     output.write("validation.md", render("validation", found, ready, stamp=line, quick=output.call.quick))
 
 

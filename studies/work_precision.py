@@ -170,7 +170,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
     found, machine = rivals.findings_of(everywhere), limit.findings_of(part(rows, limit.GROUP))
     operations = part(rows, behind.GROUP).set_index("case").get("operations", pd.Series(dtype=float))
-    operation_ns = machine["straight_ns"] / machine["operations"]
+    operation_ns = machine["alone_ns"] / machine["operations"]
     findings = findings_of(medians, known) | {"rivals": found, "machine": machine}
     findings["behind"] = behind.findings_of(found, everywhere, operations.to_dict(), operation_ns)
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import twoloop
-from twoloop import kernels
+from twoloop import kernels, solve_dae
 from twoloop.__main__ import main
 from twoloop.caches import folder_of
 from twoloop.mechanisms import four_bar
@@ -86,6 +86,20 @@ def test_solve_writes_what_the_endings_say(where, tmp_path, capsys):
     assert "<canvas" in Path(files[3]).read_text()
 
 
+def test_solve_compiles_the_equations_when_asked_to(where, capsys, monkeypatch):
+    given = []
+
+    def watched(*words, **more):
+        given.append(more)
+        return solve_dae(*words, **more)
+
+    monkeypatch.setattr("twoloop.__main__.solve_dae", watched)
+    main(["solve", where, "--t-end", "0.1"])
+    main(["solve", where, "--t-end", "0.1", "--compiled"])
+    assert [(more["method"], more["compiled"]) for more in given] == [("auto", False), ("auto", True)]
+    assert capsys.readouterr().out.count("auto: REACHED_END.") == 2
+
+
 def test_a_failed_run_ends_with_one(where, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("twoloop.__main__.solve_dae", lambda *words, **options: stopped)
     problem = four_bar()
@@ -104,6 +118,7 @@ def test_a_failed_run_ends_with_one(where, tmp_path, monkeypatch, capsys):
         (["solve", "{mine}:steep"], "the linkage cannot be assembled"),
         (["solve", "{mine}:linkage", "--rtol", "-1"], "rtol must be positive"),
         (["solve", "{mine}:linkage", "--t-end", "-1"], "t_span"),
+        (["solve", "{mine}:linkage", "--compiled", "--method", "BDF"], "compiled=True goes with"),
         (["solve", "{mine}:linkage", "--out", "run.xls"], "--out takes files that end in .csv, .parquet,"),
         (["solve", "{mine}:linkage", "--out", "nowhere/run.csv"], "--out: there is no folder"),
         (["solve", "{mine}:bare", "--out", "run.html"], "makes a problem without a drawing"),

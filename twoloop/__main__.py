@@ -85,6 +85,7 @@ def solve(given: argparse.Namespace) -> None:
         method=given.method,
         rtol=given.rtol,
         atol=given.atol,
+        compiled=given.compiled,
         progress=sys.stderr.isatty(),
     )
     counts = result.stats
@@ -120,9 +121,10 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("compile", help="compile all kernels now: the first run then starts at once")
     one = commands.add_parser("solve", help="solve a mechanism and write tables, figures, animations")
     one.add_argument("where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem")
-    one.add_argument("--method", default="SunRadau5", choices=list(PRESETS), metavar="NAME", help=", ".join(PRESETS))
+    one.add_argument("--method", default="auto", choices=list(PRESETS), metavar="NAME", help=", ".join(PRESETS))
     one.add_argument("--rtol", type=float, default=1e-8, help="default: 1e-8")
     one.add_argument("--atol", type=float, default=1e-8, help="default: 1e-8")
+    one.add_argument("--compiled", action="store_true", help="make machine code of the equations first")
     one.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     one.add_argument("--out", nargs="+", default=[], metavar="FILE", help=f"files, by ending: {', '.join(ENDINGS)}")
     return made

@@ -177,7 +177,10 @@ def solve_dae(
     interior = plan.interior
     if code is not None:
         if not plan.compilable:
-            raise ValueError(f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}")
+            constant = " with step_size, by which it is implicit" if chosen.name == "auto" else ""
+            raise ValueError(
+                f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
+            )
         plan = replace(plan, inner=code.inner)
     if plan.parts > 1 and interior is None:
         interior = chosen.plan(system.n_q, float(rtol), float(atol.min()), True)

@@ -92,7 +92,8 @@ def sweep(
         Of all runs, s. None: that of each problem.
     **options
         Of `solve_dae`: method, rtol, t_eval, events, time_limit, ... With check_derivatives=False, once the derivatives
-        are known to be right, runs of some milliseconds take about two thirds of the time.
+        are known to be right, runs of some milliseconds take about two thirds of the time. compiled=True compiles
+        anew for other parameters, some 0.1 s, which pays for long runs only.
 
     Returns
     -------

@@ -22,6 +22,7 @@ from tests.bad_input.case import (
     linkage,
     solve,
 )
+from tests.problems import pendulum
 from twoloop import ConstrainedSystem, Newmark, solve_dae
 from twoloop.tableaux import gauss
 
@@ -163,6 +164,39 @@ SOLVE = [
         TypeError,
         "method must be a name .*or an object",
         "write RungeKutta(gauss(2))",
+    ),
+    *argument(
+        "solve_dae",
+        solve,
+        "compiled",
+        [
+            ("yes", TypeError, "must be True or False; given 'yes'", "give True or leave it out"),
+            (1, TypeError, "must be True or False; given 1", "give True or leave it out"),
+        ],
+    ),
+    Case(
+        "solve_dae",
+        "`compiled=True` with an implicit method",
+        lambda: solve(method="RadauIIA5", compiled=True),
+        ValueError,
+        "compiled=True goes with 'auto', .*given method Radau IIA",
+        "leave it out, or take a method that is named",
+    ),
+    Case(
+        "solve_dae",
+        "`compiled=True` with `step_size` and the default method",
+        lambda: solve(step_size=0.1, compiled=True),
+        ValueError,
+        "compiled=True goes with .*given method auto with step_size",
+        "name a method, or leave one of the two out",
+    ),
+    Case(
+        "solve_dae",
+        "`compiled=True` where a callback branches on q",
+        lambda: solve(pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0])), compiled=True),
+        ValueError,
+        "compiled=True needs equations .*force of 'pendulum': it branches",
+        "leave it out, or write the callback without `if`, `abs`, `max`",
     ),
     Case(
         "solve_dae",

@@ -145,7 +145,7 @@ SENTENCES = [
     ("What drifts is not the tableau", f"{ON_ONE}'{SUN}' and variables == 'momenta'", {"slope": 1.0}),
     ("**Symmetry** is what keeps", f"{ON_ONE}'{GAUSS}' and variables == 'velocities'", {"slope": 1.0}),
     ("runs keeps the energy", f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}'", {"slope": 0.0}),
-    ("symmetric tableaux show no drift: ch", f"{FIXED}'{SWITCHING}' and partition == 'symmetric'", {"slope": 1.0}),
+    ("symmetric tableaux show no drift: what ch", f"{FIXED}'{SWITCHING}' and partition == 'symmetric'", {"slope": 1.0}),
     ("is not kept by it", f"{FIXED}'{SWITCHING}' and solver == '{SUN}' and partition == 'symmetric'", {"slope": 0.0}),
     ("symmetric too, shows no drift", f"{ON_ONE}'{NEWMARK}'", {"slope": 1.0}),
     ("is that of a small local error", f"solver == '{IRK}'", {"slope": 0.0}),

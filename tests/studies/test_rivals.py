@@ -151,19 +151,23 @@ def test_a_failed_size_is_a_row_and_no_cost():
 def test_the_limit_is_counted_and_shared():
     problem = four_bar()
     operations = program_of(problem.system, 0.0, problem.q0, problem.v0)[0].operations
-    row = {"repeat": 0, "operations": operations, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "straight_ns": 50.0}
+    row = {"repeat": 0, "operations": operations, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "alone_ns": 50.0}
     row |= {"callbacks_ns": 40.0, "Adams_evaluation_ns": 400.0, "DOP853_evaluation_ns": 200.0}
+    row |= {"Adams_compiled_evaluation_ns": 70.0, "DOP853_compiled_evaluation_ns": 80.0}
     found = limit.findings_of(pd.DataFrame([row]))
-    assert found["best"] == "DOP853" and found["straight_faster"] == 4.0
+    assert found["best"] == "DOP853" and found["compiled_ns"] == 80.0
+    assert found["alone_share"] == pytest.approx(operations / 500.0)
     assert found["share"] == pytest.approx(operations / 2000.0) and found["callbacks_share"] == 0.2
     assert number(found["memory_share"]) == "0.014"
 
 
 def stated(own, heyoka=2.0, python=9.0, **changed):
     """The text of the report, of rows of the four-bar."""
-    machine = {"operations": 700.0, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "straight_ns": 50.0, "repeat": 0}
+    machine = {"operations": 700.0, "moves": 36.0, "gflops": 10.0, "gbytes": 100.0, "alone_ns": 50.0, "repeat": 0}
     machine |= {"callbacks_ns": 40.0, "divisions": 8.0, "functions": 6.0}
-    machine |= {f"{method}_evaluation_ns": 200.0 for method in limit.METHODS}
+    for method in limit.METHODS:
+        machine |= {f"{method}_evaluation_ns": 200.0, f"{method}_compiled_evaluation_ns": 80.0}
+        machine |= {f"{method}_step_ns": 3000.0, f"{method}_compiled_step_ns": 1200.0}
     table = compared(own, heyoka, python=python).assign(n_steps=100.0)
     found = {
         "cases": [],
@@ -195,20 +199,24 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
 def test_sentences_follow_the_rows(own, said, not_said):
     text = stated(own)
     assert all(words in text for words in said) and not any(words in text for words in not_said)
-    assert "4.0 times less" in text and "pairs of solver and mechanism" not in text
+    assert (
+        "With `compiled=True`: 80.0 ns, 88 %" in text
+        and "`Taylor` 3.0 and 1.2 µs" in text
+        and "pairs of solver and mechanism" not in text
+    )
 
 
 def test_sentences_of_the_goals_follow_the_findings():
     long = {"case": "four-bar", "t_end": 100.0, "error": 1e-6, "limit": 0.01, "solver": "Adams", "cpu_s": 0.009}
     beam = {"case": "beam", "errors": [1e-2], "ratios": [1.5], "compared": [1.5], "ahead": True}
-    default = {"limit": 1.3, "n": 5, "n_unreached": 0, "n_within": 5}
+    default = {"solver": "auto", "compiled": False, "limit": 1.3, "n": 5, "n_unreached": 0, "n_within": 5}
     default["worst"] = {"case": "crank", "error": 1e-3, "over": 1.2, "best": "Adams"}
-    made = {"long": long, "stiff": [beam], "violation": {"limit": 1e-12, "largest": 1e-15}, "default": default}
+    made = {"long": long, "stiff": [beam], "violation": {"limit": 1e-12, "largest": 1e-15}, "default": [default]}
     text = stated(1.0, goals=made)
     assert text.count("**Reached**") == 5 and "**Missed**" not in text and "crank" not in text
     worse = {"long": long | {"cpu_s": 0.011}, "stiff": [beam | {"ahead": False}]}
-    worse |= {"violation": {"limit": 1e-12, "largest": 1e-11}, "default": default | {"n_within": 4}}
-    worse["default"]["worst"]["over"] = 1.4
+    worse |= {"violation": {"limit": 1e-12, "largest": 1e-11}, "default": [default | {"n_within": 4}]}
+    worse["default"][0]["worst"]["over"] = 1.4
     text = stated(1.0, goals=worse)
     assert text.count("**Missed**") == 4 and "up to 1.4 times (crank, 1e-3, beside `Adams`)" in text
     assert "none of ours gets there" in stated(1.0, goals=made | {"long": long | {"cpu_s": None}})

@@ -88,7 +88,7 @@ def made_up(**changed):
 
 def text_of(rows):
     found = validation.findings_of(rows)
-    empty = dict.fromkeys(("solvers", "steps", "models"), "")
+    empty = dict.fromkeys(("solvers", "models"), "")
     return render("validation", found, empty, stamp="stamp", quick=False), found
 
 
@@ -154,6 +154,8 @@ def test_sentences_of_steps_and_of_models_follow_their_rows():
     runs = [exudyn | {"h": 1.0 / n, "error_q": 100.0 / n**2} for n in (100, 400)]
     text, found = text_of(pd.concat([made_up(), pd.DataFrame([first, *runs])]))
     assert "`BDF` accepts first steps with too large an error" in text
+    by_solver = {line[0]: line[-1] for line in validation.lines(found["solvers"], found["steps"])}
+    assert by_solver == {"Gauss12": "–", "BDF": "0 %", "LSODA, index 1": "–"}
     assert "with 400 steps, and the order seen between 100 and 400 steps" in text
     assert found["models"][0]["solvers"]["Exudyn, HHT"]["order"] == pytest.approx(2.0)
     text, _ = text_of(pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))
