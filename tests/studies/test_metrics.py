@@ -95,9 +95,11 @@ def test_correct_digits():
 
 def test_multipliers_that_are_not_unique_are_not_compared():
     twice = pendulum(
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)] * 2), jacobian=lambda t, q: np.array([q, q]), gamma=None
+        n_c=2,
+        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)] * 2),
+        jacobian=lambda t, q: np.array([q, q]),
+        gamma=None,
     )
-    twice.n_c = 2
     assert metrics.multipliers(twice, 0.0, np.array([1.0, 0.0]), np.zeros(2)) is None
     one = metrics.multipliers(pendulum(), 0.0, *pendulum_state(0.0)[:2])
     assert one == pytest.approx(pendulum_state(0.0)[2])
