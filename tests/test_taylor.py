@@ -105,7 +105,7 @@ def test_constant_steps_have_the_order_asked_for(order):
 def test_code_compiled_for_a_mechanism_gives_the_same_run(make):
     problem = make()
     start = (problem.system, (0.0, problem.reference.t), problem.q0, problem.v0)
-    runs = [solve_dae(*start, "Taylor", 1e-9, 1e-9, compiled=compiled) for compiled in (False, True)]
+    runs = [solve_dae(*start, Taylor(16), 1e-9, 1e-9, compiled=compiled) for compiled in (False, True)]
     assert abs(runs[1].stats.n_accepted - runs[0].stats.n_accepted) <= 2  # lengths of steps depend on rounding
     per_step = [run.stats.n_evaluations / run.stats.n_outer for run in runs]
     assert abs(per_step[1] - per_step[0]) < 0.5
@@ -130,7 +130,7 @@ def test_compiled_operations_give_the_same_run():
     laws = tuple(FORCES.values())
     system = one_coordinate(lambda t, q, v: sum(law(t, q, v) for law in laws) / 6.0)
     start = (system, (0.0, 2.0), [0.4], [0.7])
-    runs = [solve_dae(*start, "Taylor", 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
+    runs = [solve_dae(*start, Taylor(17), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
     assert abs(runs[1].q[0, -1] - runs[0].q[0, -1]) < 1e-12
 
 
