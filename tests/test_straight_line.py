@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numba import njit
 
 from tests.problems import pendulum, worst
-from twoloop import ConstrainedSystem, ConstraintWarning, callback
+from twoloop import ConstrainedSystem, ConstraintWarning, caches, callback, straight_code
 from twoloop.kernels import calls
 from twoloop.kernels.common import DONE
 from twoloop.llvm_trigonometry import LARGEST_ANGLE
@@ -349,6 +349,18 @@ def test_a_second_process_compiles_nothing():
         for _ in range(2)
     ]
     assert counts[1] == 0
+
+
+def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, tmp_path):
+    monkeypatch.setattr(caches, "MOST_KEPT", 2)
+    monkeypatch.setattr(straight_code, "sources_folder", lambda: tmp_path)
+    monkeypatch.setattr(straight_code, "_INNER", {})
+    for stiffness in (1.0, 2.0, 3.0):
+        system = ConstrainedSystem(
+            n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[stiffness]
+        )
+        assert solve_dae(system, (0.0, 0.1), [1.0], [0.0], "DOP853", compiled=True).success
+    assert len(list(tmp_path.glob("*.nbc"))) == 2
 
 
 def test_the_derivative_of_every_operation():

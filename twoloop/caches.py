@@ -31,6 +31,7 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that can be written"
 )
+MOST_KEPT = 500  # functions made for single mechanisms, of each kind
 CHECKSUM = hashlib.sha256().digest_size
 
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
@@ -43,6 +44,7 @@ def compile_kept(
     watched: tuple[str, str] | None,
     *,
     announcement: str = "",
+    folder: Path | None = None,
     **options: Any,
 ) -> Dispatcher:
     """Compile a function for one signature, or read its machine code from the disk.
@@ -58,6 +60,8 @@ def compile_kept(
         compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
     announcement : str
         Said on stderr, once a process, before it compiles.
+    folder : Path, optional
+        Where the machine code is kept, of the newest MOST_KEPT functions of this name; None: where numba keeps it.
     **options
         Of numba.njit.
     """
@@ -65,7 +69,7 @@ def compile_kept(
     function = dispatcher.py_func
     if watched is not None:
         try:
-            dispatcher._cache = _Cache(function, *watched, announcement)
+            dispatcher._cache = _Cache(function, *watched, announcement, folder)
         except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 say_once(UNWRITABLE)
@@ -110,10 +114,13 @@ def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -
 class _Cache(FunctionCache):
     """Numba's cache of one function, with our stamp; what goes wrong in it costs time and raises nothing."""
 
-    def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
+    def __init__(
+        self, function: Callable[..., Any], stamp: str, key: str, announcement: str, folder: Path | None = None
+    ):
         super().__init__(function)
         source = self._cache_file._source_stamp
-        self._cache_file = _Files(self._cache_path, self._impl.filename_base, (source, stamp))
+        path = self._cache_path if folder is None else str(folder)
+        self._cache_file = _Files(path, self._impl.filename_base, (source, stamp), folder is not None)
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -142,8 +149,8 @@ class _Files:
     write at the same time may lead one function to the machine code of another.
     """
 
-    def __init__(self, folder: str, name: str, stamp: Any):
-        self.folder, self.name = Path(folder), name
+    def __init__(self, folder: str, name: str, stamp: Any, limited: bool):
+        self.folder, self.name, self.limited = Path(folder), name, limited
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
@@ -151,11 +158,21 @@ class _Files:
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
+        self.folder.mkdir(parents=True, exist_ok=True)
         try:
             unfinished.write_bytes(hashlib.sha256(content).digest() + content)
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)
+        if self.limited:
+            kept = sorted(self.folder.glob(f"{glob.escape(self._kind)}*.nbc"), key=_written)
+            for old in kept[:-MOST_KEPT]:
+                old.unlink(missing_ok=True)
+
+    @property
+    def _kind(self) -> str:
+        """What the names of functions that differ in what they enclose alone have in common."""
+        return self.name.partition(".locals.")[0] + ".locals."
 
     def load(self, key: Any) -> Any:
         """What numba made for a key; None if it is missing."""
@@ -175,6 +192,14 @@ class _Files:
 
     def _path(self, key: Any) -> Path:
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+
+
+def _written(path: Path) -> float:
+    """When a file was written; 0 if another process has removed it."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def sources_folder() -> Path:

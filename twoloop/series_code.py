@@ -17,7 +17,7 @@ from numba import types
 from numba.core.dispatcher import Dispatcher
 
 from twoloop import llvm_code, series_groups
-from twoloop.caches import compile_kept
+from twoloop.caches import compile_kept, sources_folder
 from twoloop.callbacks import VECTOR, f8
 from twoloop.llvm_code import INTEGER, ONE, ZERO, Emitter, Quantities, Value, emitted
 from twoloop.series import SeriesProgram
@@ -398,7 +398,8 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
         w.counters[N_EVALUATIONS] += order - 1
         return DONE if is_finite(series, order) else NOT_FINITE, 0.0
 
-    return compile_kept(expand, common.STEP, (_stamp(), key), pipeline_class=KernelCompiler, **common.OPTIONS)
+    options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **common.OPTIONS}
+    return compile_kept(expand, common.STEP, (_stamp(), key), **options)
 
 
 def _stamp() -> str:

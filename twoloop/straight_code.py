@@ -17,7 +17,7 @@ from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
 from twoloop import llvm_code, llvm_trigonometry, straight_line
-from twoloop.caches import compile_kept
+from twoloop.caches import compile_kept, sources_folder
 from twoloop.callbacks import VECTOR
 from twoloop.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, Value
 from twoloop.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
@@ -128,6 +128,9 @@ def function_of(graph: Graph, outputs: Outputs) -> Any:
     return function
 
 
+_INNER: dict[str, Dispatcher] = {}  # by their digests
+
+
 class OwnCode:
     """The inner loop for a system, compiled for its equations, or read from the disk.
 
@@ -147,7 +150,9 @@ class OwnCode:
         for module in (__file__, straight_line.__file__, llvm_code.__file__, llvm_trigonometry.__file__):
             digest.update(Path(str(module)).read_bytes())
         self.digest = digest.hexdigest()
-        self.inner = _inner(equations, (common.stamp("calls"), self.digest))
+        if self.digest not in _INNER:
+            _INNER[self.digest] = _inner(equations, (common.stamp("calls"), self.digest))
+        self.inner = _INNER[self.digest]
 
 
 def own_code(system: ConstrainedSystem, t0: float, q0: Array) -> OwnCode:
@@ -192,6 +197,7 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
     from twoloop.kernels.projection import ABOVE_ROUNDING
     from twoloop.linking import KernelCompiler
 
+    options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **OPTIONS}
     there = function_of(equations.graph, equations.there)
     EVALUATE_THERE, PROJECT = calls.EVALUATE_THERE, calls.PROJECT
     if equations.closer is None or equations.nearer is None:
@@ -205,7 +211,7 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
             w.notes[BY_GENERAL] = 1.0
             return f.general(f, w, task, t, q, v, theta, a, lam)
 
-        return compile_kept(evaluating, INNER, watched, pipeline_class=KernelCompiler, **OPTIONS)
+        return compile_kept(evaluating, INNER, watched, **options)
 
     closer, nearer = (function_of(equations.graph, each) for each in (equations.closer, equations.nearer))
 
@@ -236,4 +242,4 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
             w.notes[BY_GENERAL] = 1.0
         return f.general(f, w, task, t, q, v, theta, a, lam)
 
-    return compile_kept(inner, INNER, watched, pipeline_class=KernelCompiler, **OPTIONS)
+    return compile_kept(inner, INNER, watched, **options)

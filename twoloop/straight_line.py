@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
 RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
 NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
-ROUNDING = 1e-10  # of a pivot
+ROUNDING = 1e-8  # smallest pivot that is not nearly lost to rounding
 MOST = 20_000  # operations
 
 
