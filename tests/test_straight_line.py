@@ -207,6 +207,26 @@ def test_elimination_solves_what_dense_linear_algebra_solves(n, m, seed):
     assert len(factors.conditions) == m
     shares = [evaluated(one, known) / evaluated(other, known) for one, other in factors.conditions]
     assert all(0.0 < share < 1.0 + 1e-9 for share in shares)
+    assert all(evaluated(form, known) > 0.0 for form in factors.positive)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Adams", "Taylor"])
+def test_a_mass_that_is_not_definite_any_more_is_said_as_without(method):
+    """A mass that falls to nothing at t = 1, without a force."""
+
+    def run(compiled):
+        system = ConstrainedSystem.from_python(
+            n_q=2,
+            n_c=0,
+            mass=lambda t, q: np.array([[1.0, 0.1], [0.1, 1.0 - t]]),
+            force=lambda t, q, v: np.zeros(2),
+            name="burning",
+        )
+        return solve_dae(system, (0.0, 2.0), [0.0, 0.0], [1.0, 1.0], method, 1e-6, 1e-6, compiled=compiled)
+
+    general, own = run(False), run(True)
+    assert not own.success and own.status is general.status
+    assert own.t[-1] == pytest.approx(general.t[-1], abs=1e-3)
 
 
 def evaluated(form, known):

@@ -93,6 +93,8 @@ class Factors:
         In the order of elimination.
     conditions : list of (Form, Form)
         Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
+    positive : list of Form
+        Numbers that are positive where the matrix of the first `n` is definite.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Form], size: int, n: int):
@@ -101,6 +103,7 @@ class Factors:
             rows[i][j] = value
         self.blocks: list[Block] = []
         self.conditions: list[tuple[Form, Form]] = []
+        self.positive: list[Form] = []
         alone: dict[int, Any] = {}
         for places in _order(rows, n):
             pivots = [[rows[i].pop(j).value() for j in places] for i in places]
@@ -121,13 +124,17 @@ class Factors:
         """The inverse of one or two pivots; of rows of G, conditions too."""
         own = [None if each is None else each.value() for each in alone]
         a = pivots[0][0]
-        if own[0] is not None:
+        if own[0] is None:
+            self.positive.append(a)
+        else:
             self.conditions.append((-a, -own[0]))
         if len(pivots) == 1:
             return [[a.reciprocal()]]
         b, c = pivots[0][1], pivots[1][1]
         determinant = (a * c - b * b).value()
-        if own[1] is not None:
+        if own[1] is None:
+            self.positive.append(determinant)
+        else:
             self.conditions.append((determinant, (a * own[1]).value()))
         inverse = determinant.reciprocal()
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
@@ -228,6 +235,7 @@ class StraightLine:
         self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
         self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
+        self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
         self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions)
         self.closer: Outputs | None = None
         self.nearer: Outputs | None = None
