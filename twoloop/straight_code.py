@@ -173,7 +173,7 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array) -> OwnCode:
 
 def _described(equations: StraightLine) -> Iterable[Any]:
     yield equations.system.n_q, equations.choice
-    for outputs in (equations.there, equations.closer, equations.nearer):
+    for outputs in (equations.there, equations.closer, equations.nearer, equations.redundant):
         if outputs is not None:
             yield {name: [form.key for form in forms] for name, forms in outputs.arrays.items()}
             yield [(one.key, other.key) for one, other in outputs.conditions]
@@ -214,6 +214,7 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
         return compile_kept(evaluating, INNER, watched, **options)
 
     closer, nearer = (function_of(equations.graph, each) for each in (equations.closer, equations.nearer))
+    redundant, REDUNDANT, TANGENTS = function_of(equations.graph, equations.redundant), calls.REDUNDANT, calls.TANGENTS
 
     def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
         if task == EVALUATE_THERE:
@@ -240,6 +241,10 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
                     break
                 before = max(moved, least)
             w.notes[BY_GENERAL] = 1.0
+        elif task == REDUNDANT and w.notes[BY_GENERAL] == 0.0:
+            if redundant((t, q, v), (a,)):
+                return DONE
+            f.general(f, w, TANGENTS, t, q, v, theta, a, lam)  # the rows there, which this code has not left in w
         return f.general(f, w, task, t, q, v, theta, a, lam)
 
     return compile_kept(inner, INNER, watched, **options)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.common import GIVEN
+from twoloop.kernels.inner import CONTRADICTS
 from twoloop.series import on_symbols
 from twoloop.system import ConstrainedSystem
 from twoloop.tracing import (
@@ -211,6 +212,8 @@ class StraightLine:
         there are rows of A, which leave positions free.
     nearer : Outputs or None
         The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c,) for these.
+    redundant : Outputs
+        No arrays; its conditions are that the rows of C_q that do not count hold, too.
 
     Raises
     ------
@@ -237,6 +240,7 @@ class StraightLine:
         self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
         self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
         self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions)
+        self.redundant = self._redundant(np.concatenate(rates))
         self.closer: Outputs | None = None
         self.nearer: Outputs | None = None
         if n_a == 0:
@@ -249,6 +253,19 @@ class StraightLine:
         for place in np.ndindex(shape):
             made[place] = made[place].value()
         return made
+
+    def _redundant(self, rates: Any) -> Outputs:
+        left = [k for k in range(self.system.n_c) if k not in self.choice.rows]
+        off = self._made("constraint", (self.system.n_c,), self.q)
+        one, conditions = Form(self.graph, 1.0, {}), []
+        size, speed = (sum((x * x for x in state), one) for state in (self.q, self.v))
+        for k in left:
+            row, rate = self.all_rows[k], rates[k]
+            faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
+            allowed = sum((entry * entry for entry in row), self.nothing).times(CONTRADICTS**2)
+            for what, scale in ((off[k], size), (faster, speed)):
+                conditions.append((allowed * scale, what * what))
+        return Outputs({"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Form]:
         n = self.system.n_q

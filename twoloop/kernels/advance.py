@@ -270,12 +270,9 @@ def advance(
             if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
                 return NEAR_SINGULAR
             continue
-        if w.rows_v.size < w.Rate.size:
-            if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # which leaves the rows as they were
-                find_tangents(f, w, t + size, new_state[:n])
-            if check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
-                clock[H_FAILED] = size
-                return ROWS_VIOLATED
+        if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
+            clock[H_FAILED] = size
+            return ROWS_VIOLATED
         w.counters[N_ACCEPTED] += 1
         clock[H_LONG] = max(size, FADING * clock[H_LONG])
         clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
