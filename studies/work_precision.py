@@ -31,7 +31,7 @@ QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 SETTINGS = ("tol", "h", "err_out")
 PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP, behind.GROUP)  # groups of rows that are not of the four cases
-SLOW = 1.0  # s to build: quicker ones are not listed
+SLOW = 3.0  # s to build: quicker ones are not listed
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
