@@ -10,7 +10,8 @@ from twoloop.taylor import Taylor
 MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method
 SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... up to so many operations a coordinate ...
-SIMPLE = 8  # ... or, with many coordinates, at any tolerance up to so many
+SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
+FEW = 5
 # the same of code made for the mechanism, where loops over coordinates and operations cost little:
 SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
 SHORT_FROM = 1e-3
@@ -18,6 +19,7 @@ SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-10  # tolerance, for fewer than
 MANY_COMPILED = 64  # coordinates from which on Adams' method costs less than DOP853
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
+LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
 LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
 LIMIT_SERIES = 0.4  # times the order: the same of a series, whose steps grow with its order
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
@@ -52,12 +54,16 @@ class Auto:
     """Explicit steps where nothing is stiff, Newton's method where stiffness is measured; both ways during a run.
 
     A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
-    coordinate at tolerances below 1e-6, at most 8 at others if there are 16 coordinates or more. Else with `few`, or
-    with `many` for as many coordinates. Every
-    600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where the
-    steps have come near the limit of stability that it sets, the implicit method is tried for 15 steps and kept if a
-    second of motion costs it less, counted in evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, else
-    `tight`. It is left the same way. Counts decide, not times: a run can be repeated.
+    coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
+    coordinates or more. Else with `few`, or with `many` for as many coordinates. With code made for the mechanism
+    (`compiled=True` of `solve_dae`) a series pays below 1e-6, for 16 coordinates or more below 1e-10, with at most 8
+    operations in all below 1e-3, and `many` from 64 coordinates on.
+
+    Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
+    the steps have come near the limit of stability that it sets (with `few` or `series` at two looks in a row), the
+    implicit method is tried for 15 steps and kept if a second of motion costs it less, counted in evaluations and
+    Newton matrices: `loose` at tolerances from 3e-5 on, else `tight`. It is left the same way. Counts decide, not
+    times: a run can be repeated.
 
     While the implicit method runs, errors of positions are within the tolerances; those of velocities are not tested.
     With constant steps it is `fixed` throughout.
@@ -105,7 +111,9 @@ class Auto:
         if self.compiled:
             short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
             return short or tolerance < (SERIES_COMPILED if n_q < MANY else SERIES_COMPILED_MANY)
-        return operations <= INVOLVED if tolerance < SERIES else operations <= SIMPLE and n_q >= MANY
+        if tolerance < SERIES:
+            return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
+        return operations <= SIMPLE and n_q >= MANY
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -118,4 +126,6 @@ class Auto:
             return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW)
         many = n_q >= (MANY_COMPILED if self.compiled else MANY)
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
+        if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
+            limit, looks = LIMIT_FEW_OF_MANY, 1
         return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks)
