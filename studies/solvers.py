@@ -247,7 +247,8 @@ def _all() -> Iterator[Solver]:
         run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
         if preset == TAYLOR or preset in COMPILED:
             run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
-        yield _solver(preset, "two-loop", "compiled", "tol", run)
+        # the default compiles another method at other tolerances
+        yield _solver(preset, "two-loop", "compiled", "tol", run, builds_each=preset in COMPILED)
     newton = RungeKutta(radau_iia(4), "newton")
     yield _solver(NEWTON_4, "two-loop", "compiled", "tol", partial(_preset, newton))
     yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
