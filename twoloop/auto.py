@@ -17,7 +17,8 @@ SHORT = 8  # operations up to which a series costs less than DOP853 at any toler
 SHORT_FROM = 1e-3
 SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-10  # tolerance, for fewer than MANY coordinates and for others
 MANY_COMPILED = 64  # coordinates from which on Adams' method costs less than DOP853
-LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits
+LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
+TIGHTEST = 1e-9  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
 LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
 LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
@@ -46,6 +47,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1)
         first=first.step,
         second=second.step,
         stable_to=None,
+        within_newton=second.within_newton,
     )
 
 
@@ -62,8 +64,8 @@ class Auto:
     Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
     the steps have come near the limit of stability that it sets (with `few` or `series` at two looks in a row), the
     implicit method is tried for 15 steps and kept if a second of motion costs it less, counted in evaluations and
-    Newton matrices: `loose` at tolerances from 3e-5 on, else `tight`. It is left the same way. Counts decide, not
-    times: a run can be repeated.
+    Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way.
+    Counts decide, not times: a run can be repeated.
 
     While the implicit method runs, errors of positions are within the tolerances; those of velocities are not tested.
     With constant steps it is `fixed` throughout.
@@ -74,8 +76,8 @@ class Auto:
         Explicit methods, for few and for many coordinates.
     series : Taylor or None
         None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows.
-    loose, tight : method object
-        Implicit methods, for loose and for tight tolerances.
+    loose, tight, tightest : method object
+        Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
         For constant steps.
     """
@@ -85,6 +87,7 @@ class Auto:
     series: Taylor | None
     loose: Method
     tight: Method
+    tightest: Method
     fixed: Method
     compiled: bool = False  # whether there is code made for the mechanism; solve_dae says so
 
@@ -120,7 +123,8 @@ class Auto:
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
         tolerance = least_tolerance(rtol, atol)
-        second = (self.loose if tolerance >= LOOSE else self.tight).plan(n_q, rtol, atol, False)
+        implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
+        second = implicit.plan(n_q, rtol, atol, False)
         if self.series is not None and self._series_pays(n_q, tolerance):
             series = self.series.plan(n_q, rtol, atol, False)
             return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW)

@@ -3,7 +3,9 @@
 from __future__ import annotations  # ArrayLike stays a word in help()
 
 import warnings
+from collections.abc import Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,8 +47,8 @@ class Interpolator:
         Relative tolerance of the run.
     ranks : (int, int)
         Of C_q, and of C_q and A.
-    plan : Plan, optional
-        How the method makes fixed steps, where `plan.parts` > 1: intervals are divided by these.
+    plans : dict, optional
+        How intervals of a kind are divided into `plan.parts` fixed steps; others are not.
     """
 
     def __init__(
@@ -56,16 +58,18 @@ class Interpolator:
         row: Array,
         rtol: float,
         ranks: tuple[int, int],
-        plan: Plan | None = None,
+        plans: Mapping[int, Plan] = MappingProxyType({}),
     ):
         from twoloop.kernels import advance, dense  # compiled, or read from the cache, when it is first needed
 
         self.kernels = dense
-        self.made_of = (system, t0, row.copy(), rtol, ranks, plan)
-        self.system, self.plan, self.rtol, self.ranks = system, plan, rtol, ranks
-        self.parts = 1 if plan is None else plan.parts
+        self.plans = dict(plans)
+        self.made_of = (system, t0, row.copy(), rtol, ranks, self.plans)
+        self.system, self.rtol, self.ranks = system, rtol, ranks
+        self.parts = max((plan.parts for plan in self.plans.values()), default=1)
         q0 = row[: system.n_q]
-        self.kit = kit_of(system, t0, q0, plan)
+        self.kits = {kind: kit_of(system, t0, q0, plan) for kind, plan in self.plans.items()}
+        self.kit = kit_of(system, t0, q0)
         self.work = workspace(system, self.kit, pattern_of(system, t0, q0), q0, rtol, 0.0, ranks)
         self.work.notes[common.GENERATION] = 1.0  # the ranks are known
         advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
@@ -116,10 +120,11 @@ class Interpolator:
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
         """A table of interior states, the groups of intervals that are in it, and those of others."""
         begins = table.t[groups[:, names.FIRST_OWN]].tolist()
-        if self.plan is not None and len(self.filled) > KEPT:
+        if self.plans and len(self.filled) > KEPT:
             self.filled.clear()
-        missing = (groups[:, names.KIND] == names.ACCELERATIONS) & [t not in self.filled for t in begins]
-        self._fill(table, groups[missing, names.FIRST_OWN])
+        missing = np.array([t not in self.filled for t in begins])
+        for kind in self.plans:
+            self._fill(table, kind, groups[missing & (groups[:, names.KIND] == kind), names.FIRST_OWN])
         filled = np.array([t in self.filled and len(self.filled[t][0]) > 0 for t in begins])
         pairs = [self.filled[t] for t, there in zip(begins, filled, strict=True) if there]
         sizes = np.array([len(t) for t, _ in pairs], dtype=np.int64)
@@ -130,19 +135,19 @@ class Interpolator:
         states = np.concatenate([table.states[:0], *(states for _, states in pairs)])
         return Table(t, states, table.kinds), own, groups[~filled]
 
-    def _fill(self, table: Table, intervals: Groups) -> None:
-        """Find the interior states of these intervals; where that fails, with fewer of them."""
-        if self.plan is None or len(intervals) == 0:
+    def _fill(self, table: Table, kind: int, intervals: Groups) -> None:
+        """Find the interior states of these intervals of a kind; where that fails, with fewer of them."""
+        if len(intervals) == 0:
             return
         n = self.system.n_q
         tolerances = np.zeros(common.ATOL + n)  # without an estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
-        plan = self.plan
+        plan, kit = self.plans[kind], self.kits[kind]
         vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
-        for parts in range(self.parts, 1, -1):
+        for parts in range(plan.parts, 1, -1):
             rows = parts + 1
             out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
-            direct(self.kernels.fill)(self.kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            direct(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
             times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
             found = np.isfinite(times[:, 0])
             for k in np.flatnonzero(found):
@@ -160,9 +165,9 @@ class Interpolator:
         """
         shape = (len(table.t) - 1, self.parts + 1)
         t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
-        for i in np.flatnonzero(table.kinds == names.ACCELERATIONS):
+        for i in np.flatnonzero(np.isin(table.kinds, list(self.plans))):
             if table.t[i] not in self.filled:
-                self._fill(table, np.array([i]))
+                self._fill(table, int(table.kinds[i]), np.array([i]))
             own_t, own = self.filled[table.t[i]]
             t[i, : len(own_t)], states[i, : len(own)] = own_t, own
         return t, states

@@ -22,6 +22,7 @@ NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no er
 # highest order for which a step is divided into so many parts: with fewer the error between steps is more than a few
 # times that at the steps (four-bar linkage, tolerances of 1e-4 to 1e-12)
 PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
+UNDIVIDED = 6  # the highest order for which this holds of steps by Newton's method, whose accelerations are of no use
 NEWMARK_OUTER_SHARE = 1e-3  # of err_out; its fixed-point iterations converge so fast that this costs next to nothing
 
 
@@ -172,19 +173,23 @@ class RungeKutta:
         tableau = self.tableau
         extra = newton.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
         n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
-        return replace(
+        made = replace(
             plan,
             step=newton.newton_step,
             options=np.concatenate([plan.options, extra]),
             memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
             exponent=1.0 / (tableau.stages + 1),
         )
+        if tableau.order <= UNDIVIDED:
+            return made
+        return replace(made, within_newton=replace(made, memory=made.memory.copy(), parts=tableau.stages - 1))
 
     def _parts(self) -> int:
         """Parts of a step whose states carry the solution between its ends to the accuracy of the method."""
         if self.outer != "fixed-point":
             return 1
         return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
+
 
 
 @dataclass(frozen=True)
@@ -337,12 +342,13 @@ PRESETS: dict[str, Method] = {
         many=Adams(),
         series=Taylor(),
         loose=ESDIRK("TRBDF2"),
-        tight=RungeKutta(radau_iia(3), outer="newton", tested="positions"),
+        tight=RungeKutta(radau_iia(5), outer="newton", tested="positions"),
+        tightest=RungeKutta(radau_iia(7), outer="newton", tested="positions"),
         fixed=RungeKutta(sun_radau_iib(3), outer="auto"),
     ),
     "SunRadau5": RungeKutta(sun_radau_iib(3), outer="auto"),
     **{f"Gauss{2 * s}": RungeKutta(gauss(s)) for s in range(2, 9)},
-    "RadauIIA5": RungeKutta(radau_iia(3), outer="newton"),
+    **{f"RadauIIA{2 * s - 1}": RungeKutta(radau_iia(s), outer="newton") for s in (3, 5, 7)},
     "TRBDF2": ESDIRK("TRBDF2"),
     "ESDIRK4": ESDIRK("ESDIRK4"),
     "Newmark": Newmark(),

@@ -2,7 +2,9 @@
 
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -64,14 +66,14 @@ class Run:
         rtol: float,
         atol: Array,
         step_size: float | None,
-        interior: Plan | None = None,
+        interiors: Mapping[int, Plan] = MappingProxyType({}),
     ):
         from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
 
         self.a = advance
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
-        self.rtol, self.reuse, self.interior = rtol, plan.reuse, interior
+        self.rtol, self.reuse, self.interiors = rtol, plan.reuse, interiors
         self.kit = kit_of(system, t0, q0, plan)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
@@ -316,7 +318,7 @@ class Run:
         n, interpolator = self.system.n_q, None
         if wanted.between_steps:
             ranks = (len(self.work.rows), len(self.work.rows_v))
-            interpolator = Interpolator(self.system, self.t0, self.state[: 3 * n], self.rtol, ranks, self.interior)
+            interpolator = Interpolator(self.system, self.t0, self.state[: 3 * n], self.rtol, ranks, self.interiors)
         return Recorder(wanted, interpolator, n, self.t0, self.state)
 
     def _kinds(self, steps: Array, across: bool) -> NDArray[np.int64]:

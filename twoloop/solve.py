@@ -22,6 +22,7 @@ from twoloop.checks import (
 )
 from twoloop.consistency import check_start, check_system
 from twoloop.events import check_events
+from twoloop.kernels.intervals import ACCELERATIONS, VELOCITIES
 from twoloop.methods import PRESETS
 from twoloop.plan import Method
 from twoloop.recorder import Wanted
@@ -174,7 +175,10 @@ def solve_dae(
     if hasattr(chosen, "for_system"):
         chosen = chosen.for_system(system, code)
     plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-    interior = plan.interior
+    interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
+    if plan.parts > 1:
+        always = (system.n_q, float(rtol), float(atol.min()), True)
+        interiors[ACCELERATIONS] = chosen.plan(*always) if plan.interior is None else plan.interior
     if code is not None:
         if not plan.compilable:
             constant = " with step_size, by which it is implicit" if chosen.name == "auto" else ""
@@ -182,9 +186,7 @@ def solve_dae(
                 f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
             )
         plan = replace(plan, inner=code.inner)
-    if plan.parts > 1 and interior is None:
-        interior = chosen.plan(system.n_q, float(rtol), float(atol.min()), True)
-    run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interior)
+    run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
     if step_size is None:
         run.set_sizes(first_step, float(max_step), t1)
     if max_steps is not None:
