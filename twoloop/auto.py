@@ -7,7 +7,9 @@ from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
 from twoloop.taylor import Taylor
 
-MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method
+MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method ...
+CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
+VERY_MANY = 64  # ... or so many coordinates
 SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... up to so many operations a coordinate ...
 SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
@@ -16,21 +18,21 @@ FEW = 5
 SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
 SHORT_FROM = 1e-3
 SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-10  # tolerance, for fewer than MANY coordinates and for others
-MANY_COMPILED = 64  # coordinates from which on Adams' method costs less than DOP853
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
 TIGHTEST = 1e-9  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
 LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
 LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
 LIMIT_SERIES = 0.4  # times the order: the same of a series, whose steps grow with its order
+DEARER = 4.0  # evaluations by code made for the mechanism that one without costs, about
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
 
 
-def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1) -> Plan:
+def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1, dearer: float = 1.0) -> Plan:
     """The plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
     `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried, if it is found at so many
-    `looks` in a row.
+    `looks` in a row. `dearer`: what an evaluation of `second` costs, in those of `first`.
     """
     from twoloop.kernels import switching as kernels
 
@@ -42,7 +44,9 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1)
     return replace(
         first,
         step=kernels.switching_step,
-        options=kernels.switching_options(limit, looks, MATRIX_COST + n_q / 8.0, each, first.options, second.options),
+        options=kernels.switching_options(
+            limit, looks, MATRIX_COST + n_q / 8.0, dearer, each, first.options, second.options
+        ),
         memory=kernels.switching_memory(n_q, first.memory, second.memory),
         first=first.step,
         second=second.step,
@@ -57,9 +61,9 @@ class Auto:
 
     A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
-    coordinates or more. Else with `few`, or with `many` for as many coordinates. With code made for the mechanism
-    (`compiled=True` of `solve_dae`) a series pays below 1e-6, for 16 coordinates or more below 1e-10, with at most 8
-    operations in all below 1e-3, and `many` from 64 coordinates on.
+    coordinates or more. Else with `few`; with `many` for 64 coordinates, or for 16 and at most a quarter as many
+    constraints. With code made for the mechanism (`compiled=True` of `solve_dae`) a series pays below 1e-6, for 16
+    coordinates or more below 1e-10, with at most 8 operations in all below 1e-3, and `many` from 64 coordinates on.
 
     Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
     the steps have come near the limit of stability that it sets (with `few` or `series` at two looks in a row), the
@@ -89,7 +93,8 @@ class Auto:
     tight: Method
     tightest: Method
     fixed: Method
-    compiled: bool = False  # whether there is code made for the mechanism; solve_dae says so
+    n_rows: int = 0  # constraints of the system, and whether there is code made for it; solve_dae says so
+    compiled: bool = False
 
     @property
     def name(self) -> str:
@@ -98,7 +103,7 @@ class Auto:
 
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
-        chosen = replace(self, compiled=code is not None)
+        chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
         if self.series is None or (code is None and system.called_in_python):
             return replace(chosen, series=None)
         try:
@@ -125,11 +130,13 @@ class Auto:
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = implicit.plan(n_q, rtol, atol, False)
+        dearer = DEARER if self.compiled else 1.0
         if self.series is not None and self._series_pays(n_q, tolerance):
             series = self.series.plan(n_q, rtol, atol, False)
-            return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW)
-        many = n_q >= (MANY_COMPILED if self.compiled else MANY)
+            return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
+        loose_ones = not self.compiled and n_q >= MANY and self.n_rows <= CONSTRAINED * n_q
+        many = loose_ones or n_q >= VERY_MANY
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
         if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1
-        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks)
+        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks, dearer)

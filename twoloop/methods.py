@@ -191,7 +191,6 @@ class RungeKutta:
         return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
 
 
-
 @dataclass(frozen=True)
 class Newmark:
     """Two-loop procedure with Newmark's method, the outer loop by fixed point on the independent accelerations.

@@ -13,7 +13,7 @@ Both methods are called by their addresses, f.first and f.second, and are compil
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.calls import PROJECT, evaluate
+from twoloop.kernels.calls import PROJECT, evaluate, renew_partition
 from twoloop.kernels.common import (
     DONE,
     ESTIMATE,
@@ -42,6 +42,11 @@ NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
 SEED = 1e-3  # what a component of a direction begins with, of the largest
 SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
 EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
+TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
+AFFORDED = 2.0  # trials that the run has cost so far, before one that may be in vain
+APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
+WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
+INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
 BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
 STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
 MEAN = 0.8  # weight of the steps before in the mean step
@@ -54,7 +59,8 @@ EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 
 # places in `options`: of the pair, then SAFETY ... REUSE_OF of the first and of the second method; then their options
 # LIMIT: h rho from which on the implicit method is tried, found at so many LOOKS in a row
-LIMIT, LOOKS, MATRIX_COST, SIZE_1, N_PAIR = range(5)
+# DEARER: evaluations of the first method that one of the second costs
+LIMIT, LOOKS, MATRIX_COST, DEARER, SIZE_1, N_PAIR = range(6)
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, LEAST_ERROR, N_OF_EACH = range(7)  # LEAST_ERROR 0: no trend
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
@@ -83,11 +89,17 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
 
 def switching_options(
-    limit: float, looks: int, matrix_cost: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
+    limit: float,
+    looks: int,
+    matrix_cost: float,
+    dearer: float,
+    each: ArrayLike,
+    first: ArrayLike,
+    second: ArrayLike,
 ) -> NDArray[np.float64]:
     """`options`: of the pair, the cost of a Newton matrix in evaluations, then six numbers of each, then their own."""
     first = np.asarray(first, dtype=np.float64)
-    scalars = [limit, float(looks), matrix_cost, float(first.size)]
+    scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
 
@@ -107,6 +119,14 @@ def _memories(memory, n):
 
 
 @compiled
+def _evaluate(f, w, t, Q, V, A):
+    """Accelerations A at a state (Q, V) near the constraints, which is moved there."""
+    if f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size:  # cheaper, to the nearest state on the constraints
+        return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
+    return evaluate(f, w, t, Q, V, INNER_TOL, A)
+
+
+@compiled
 def _along(f, w, t, state, direction, by_v, Q, V, A):
     """How much larger dF/dq or dF/dv makes a direction of the independents, whose image of length 1 replaces it."""
     n = Q.size
@@ -121,11 +141,7 @@ def _along(f, w, t, state, direction, by_v, Q, V, A):
     moved = V if by_v else Q
     for i in places:
         moved[i] += size * direction[i]
-    if f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size:  # cheaper, to the nearest state on the constraints
-        code = f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
-    else:
-        code = evaluate(f, w, t, Q, V, INNER_TOL, A)
-    if code != DONE:
+    if _evaluate(f, w, t, Q, V, A) != DONE:
         return 0.0
     image, size = 0.0, 0.0
     for i in places:
@@ -145,6 +161,9 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     squared = damping = 0.0
+    # code made for the mechanism has no use for the partition, which may be an old one whose independents hardly move
+    if f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
+        return 0.0
     for _ in range(ITERATIONS):
         squared = _along(f, w, t, state, by_q, False, Q, V, A)
     for _ in range(ITERATIONS):
@@ -160,9 +179,36 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 
 @compiled
+def _shown_rate(f, w, t, state, rate, Q, V, A):
+    """The rate at which the motion changes its velocities, or its accelerations, 1/s; infinite where it is unknown."""
+    n = Q.size
+    instant = INSTANT / rate
+    fastest = largest = change = 0.0
+    for m in range(n):
+        Q[m] = state[m] + instant * state[n + m]
+        V[m] = state[n + m] + instant * state[2 * n + m]
+    if _evaluate(f, w, t + instant, Q, V, A) != DONE:
+        return np.inf
+    for i in w.independent_v:
+        fastest = max(fastest, abs(state[n + i]))
+        largest = max(largest, abs(state[2 * n + i]))
+        change = max(change, abs(A[i] - state[2 * n + i]))
+    if fastest == 0.0 or largest == 0.0:
+        return np.inf
+    return max(largest / fastest, change / (instant * largest))
+
+
+@compiled
 def _cost(w, options):
     """What the run has cost so far, in evaluations."""
     return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
+
+
+@compiled
+def _price(w, options, memory, t):
+    """What a second of motion has cost since the price was last begun, in evaluations of the first method."""
+    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    return price if memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL) else options[DEARER] * price
 
 
 @compiled
@@ -182,7 +228,7 @@ def _settle_trial(w, options, memory, n, t):
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     if memory[STEPS] < SETTLE + WINDOW:
         return -1
-    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    price = _price(w, options, memory, t)
     keeps = price * GAIN <= memory[PRICE]
     memory[WAIT] = PATIENCE if keeps else 2.0 * memory[WAIT]
     memory[LOOKS_TO_WAIT] = memory[WAIT]
@@ -194,9 +240,10 @@ def _settle_trial(w, options, memory, n, t):
 @compiled
 def _look(f, w, options, memory, t, state, new_state):
     """Whether the other method is due for a trial; returns the phase to begin, or -1."""
+    n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
-    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
-    memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    price, cost = _price(w, options, memory, t), _cost(w, options)
+    memory[T_BEGIN], memory[COST_BEGIN] = t, cost
     memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
     memory[LOOKS_TO_WAIT] -= 1.0
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
@@ -204,8 +251,13 @@ def _look(f, w, options, memory, t, state, new_state):
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
-    cheap = f.flags[FORCE_BY_Q_GIVEN] == 1 or _cost(w, options) > EARN * w.independent.size
-    due = share > SURELY or (memory[NEAR] >= options[LOOKS] and cheap)
+    trial = TRIAL * options[DEARER]
+    cheap = cost > AFFORDED * trial and (f.flags[FORCE_BY_Q_GIVEN] == 1 or cost > EARN * w.independent.size)
+    hidden = False
+    if memory[PHASE] == EXPLICIT and cheap and share > WORTH:
+        Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
+        hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
+    due = share > SURELY or hidden or (memory[NEAR] >= options[LOOKS] and cheap)
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
