@@ -9,7 +9,8 @@ from twoloop.taylor import Taylor
 
 MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method ...
 CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
-VERY_MANY = 64  # ... or so many coordinates
+TIGHT_MANY = 1e-10  # ... or the tolerance is below this ...
+VERY_MANY = 64  # ... or there are so many coordinates
 SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... up to so many operations a coordinate ...
 SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
@@ -17,7 +18,7 @@ FEW = 5
 # the same of code made for the mechanism, where loops over coordinates and operations cost little:
 SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
 SHORT_FROM = 1e-3
-SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-10  # tolerance, for fewer than MANY coordinates and for others
+SERIES_COMPILED = 1e-6  # tolerance, for fewer than MANY coordinates; TIGHT_MANY for others
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
 TIGHTEST = 1e-9  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
@@ -62,7 +63,7 @@ class Auto:
     A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
     coordinates or more. Else with `few`; with `many` for 64 coordinates, or for 16 and at most a quarter as many
-    constraints. With code made for the mechanism (`compiled=True` of `solve_dae`) a series pays below 1e-6, for 16
+    constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a series pays below 1e-6, for 16
     coordinates or more below 1e-10, with at most 8 operations in all below 1e-3, and `many` from 64 coordinates on.
 
     Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
@@ -118,7 +119,7 @@ class Auto:
         operations = self.series.program.n_operations / n_q
         if self.compiled:
             short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
-            return short or tolerance < (SERIES_COMPILED if n_q < MANY else SERIES_COMPILED_MANY)
+            return short or tolerance < (SERIES_COMPILED if n_q < MANY else TIGHT_MANY)
         if tolerance < SERIES:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
         return operations <= SIMPLE and n_q >= MANY
@@ -134,8 +135,9 @@ class Auto:
         if self.series is not None and self._series_pays(n_q, tolerance):
             series = self.series.plan(n_q, rtol, atol, False)
             return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
-        loose_ones = not self.compiled and n_q >= MANY and self.n_rows <= CONSTRAINED * n_q
-        many = loose_ones or n_q >= VERY_MANY
+        many = n_q >= VERY_MANY
+        if n_q >= MANY and not self.compiled:
+            many = many or self.n_rows <= CONSTRAINED * n_q or tolerance < TIGHT_MANY
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
         if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1
