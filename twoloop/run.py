@@ -209,16 +209,12 @@ class Run:
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
         code = a.PAUSED
+        out_t, out_state, out_steps = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
         while code == a.PAUSED:
             across = plan is not self.plan
-            filled[:] = 0  # whatever Ctrl-C comes between
             began = time.process_time()
-            most = int(control[a.MAX_ATTEMPTS])  # each fills at most one row
-            n_rows, n_steps = min(most, BUFFER_ROWS), min(most, BUFFER_STEPS)
-            out_t, out_state = np.empty(n_rows), np.empty((n_rows, len(self.state)))
-            out_steps = np.empty((n_steps, a.N_STEP_COLUMNS))
             try:
                 code = advance(
                     kit,
@@ -241,18 +237,24 @@ class Run:
             except Exception as error:  # of a callback; beyond a terminal event it does not matter
                 code, raised = INTERRUPTED, error
             n_rows, n_steps = filled.tolist()
-            steps = _filled(out_steps, n_steps)
+            t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
+            sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
+            if sparse:
+                t, rows, steps = t.copy(), rows.copy(), steps.copy()
             step_parts.append(steps)
             kinds = self._kinds(steps, across) if wanted.between_steps else NO_KINDS
-            recorder.add(_filled(out_t, n_rows), _filled(out_state, n_rows), kinds)
+            recorder.add(t, rows, kinds)
             spent = time.process_time() - began
             cpu += spent
+            filled[:] = 0  # for Ctrl-C before the next chunk begins
             if recorder.ended is not None:
                 break
             if code == a.PAUSED and not across:
                 looks.take(float(self.clock[a.T]), self.state, system.n_q, steps[:, a.H])
             if spent < CHUNK_TIME:
                 self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
+            if code == a.PAUSED and (not sparse or len(out_t) < self.control[a.MAX_ATTEMPTS]):
+                out_t, out_state, out_steps = self._buffers()
             limited = self.control[a.MAX_STEPS] < np.inf
             if pace.stagnates(self.clock[a.T], steps[:, a.H], t1) and code == a.PAUSED and not limited:
                 code = STAGNATED
@@ -312,6 +314,12 @@ class Run:
             v_events=v_events,
             system=system,
         )
+
+    def _buffers(self) -> tuple[Array, Array, Array]:
+        """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
+        most = int(self.control[self.a.MAX_ATTEMPTS])
+        n_rows, n_steps = min(most, BUFFER_ROWS), min(most, BUFFER_STEPS)
+        return np.empty(n_rows), np.empty((n_rows, len(self.state))), np.empty((n_steps, self.a.N_STEP_COLUMNS))
 
     def _recorder(self, wanted: Wanted) -> Recorder:
         """What takes the states; where some are to lie between steps, with what finds them."""
@@ -518,11 +526,6 @@ class Run:
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
-
-
-def _filled(buffer: Array, n: int) -> Array:
-    """The first n rows; a copy where the buffer is largely empty, as it would be kept with them."""
-    return buffer[:n] if 2 * n >= len(buffer) else buffer[:n].copy()
 
 
 class _Pace:

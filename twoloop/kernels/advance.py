@@ -266,7 +266,7 @@ def advance(
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1
             clock[FAILURE_CODE] = DONE
-            clock[H_NEXT] = proposal
+            clock[H_NEXT] = min(proposal, size - np.spacing(t + size))  # a tiny one may else be rounded to what it was
             if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
                 return NEAR_SINGULAR
             continue
