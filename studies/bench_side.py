@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-METHODS = ("Taylor", "Adams", "DOP853", "Gauss12", "SunRadau5", "RadauIIA5", "BDF", "TRBDF2", "auto")
+METHODS = ("Taylor", "Adams", "DOP853", "Gauss12", "SunRadau5", "RadauIIA5", "RadauIIA9", "BDF", "TRBDF2", "auto")
 TOLERANCE = 1e-8
 T_END = 10.0  # s of motion
 WARM_UP = 0.1

@@ -42,8 +42,8 @@ GEOMETRIES: dict[str, Callable[[], Problem]] = {
 }
 QUICK = ("four-bar", "knife edge")
 QUICK_SOLVERS = (TAYLOR, "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
-TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
-BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
+TOLERANCES = (1e-1, 1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
+BUILT = (1e-1, 1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
 STEPS = (100, 300, 1000)  # of those of fixed steps
 QUICK_TOLERANCES = (1e-3, 1e-5)
 REPEATS = 3

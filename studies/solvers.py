@@ -16,7 +16,7 @@ from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.plan import Method
-from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
+from twoloop.tableaux import gauss, sun_radau_iib
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of all solvers that have one
 ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
@@ -28,7 +28,7 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
-CANONICAL, NEWTON_4 = "Gauss6, momenta, symmetric", "RadauIIA7, Newton"
+CANONICAL = "Gauss6, momenta, symmetric"
 ADAMS, TAYLOR = "Adams", "Taylor"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 DEFAULT = "auto"  # of solve_dae
@@ -39,12 +39,13 @@ COMPILED = {
     "Adams, compiled": ADAMS,
     "DOP853, compiled": "DOP853",
 }
-IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", "RadauIIA5", "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
+RADAU = ("RadauIIA5", "RadauIIA9", "RadauIIA13")
+IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", *RADAU, "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
 PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
 # of ours, beside the rivals
 OWN = (
     *(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT),
-    *("Gauss12", "Gauss16", "RadauIIA5", "TRBDF2", OWN_BDF),
+    *("Gauss12", "Gauss16", *RADAU, "TRBDF2", OWN_BDF),
 )
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
@@ -249,8 +250,6 @@ def _all() -> Iterator[Solver]:
             run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
         # the default compiles another method at other tolerances
         yield _solver(preset, "two-loop", "compiled", "tol", run, builds_each=preset in COMPILED)
-    newton = RungeKutta(radau_iia(4), "newton")
-    yield _solver(NEWTON_4, "two-loop", "compiled", "tol", partial(_preset, newton))
     yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
     own: dict[str, Any] = {"own_accelerations": True}
     for form in IDA_FORMS:

@@ -19,13 +19,13 @@ from studies.bench import Case, Run, row_of
 from studies.cli import StudyError
 from studies.compare import runs_of
 from studies.render import number, power, render, table
-from studies.solvers import COMPARED, DEFAULT, IDA_C_ORDER_2, IDA_FORMS, IRK_LINE, NEWTON_4, QUARTER, TOLERANCES
+from studies.solvers import COMPARED, DEFAULT, IDA_C_ORDER_2, IDA_FORMS, IRK_LINE, QUARTER, RADAU, TOLERANCES
 from studies.store import Output
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
-STIFF = ("TRBDF2", NEWTON_4, IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
+STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others

@@ -68,6 +68,7 @@ def test_between_the_steps_as_good_as_at_them(default_four_bar, exact, method, t
         (RungeKutta(lobatto_iiie(3)), 4, 0.02),
         (RungeKutta(gauss(3), variables="momenta", partition="symmetric"), 6, 0.02),
         ("RadauIIA5", 5, 0.01),
+        ("RadauIIA9", 9, 0.04),
         ("Newmark", 2, 0.01),
         ("BDF", 5, 0.005),
         ("DOP853", 8, 0.04),

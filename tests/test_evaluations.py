@@ -26,6 +26,8 @@ BOUNDS = {  # on the four-bar, on Andrews' mechanism
     "Gauss14": (670, 50_000),
     "Gauss16": (820, 56_000),
     "RadauIIA5": (510, 38_000),
+    "RadauIIA9": (530, 33_000),
+    "RadauIIA13": (440, 37_500),
     "Newmark": (1_600, 94_000),
     "BDF": (470, 65_000),
     "DOP853": (290, 25_000),

@@ -55,7 +55,7 @@ def test_steps_at_the_limit_of_stability_are_said_to_be(make, end, tol, method, 
     assert result.success
     assert result.message.count(STIFF) == 1
     assert re.search(what, result.message), result.message
-    for name in ("'auto'", "'RadauIIA5'", "'TRBDF2'"):
+    for name in ("'auto'", "'RadauIIA9'", "'TRBDF2'"):
         assert name in result.message
 
 

@@ -63,12 +63,14 @@ class Auto:
     A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
     coordinates or more. Else with `few`; with `many` for 64 coordinates, or for 16 and at most a quarter as many
-    constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a series pays below 1e-6, for 16
-    coordinates or more below 1e-10, with at most 8 operations in all below 1e-3, and `many` from 64 coordinates on.
+    constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a series
+    pays below 1e-6, for 16 coordinates or more below 1e-10, with at most 8 operations in all below 1e-3, and `many`
+    from 64 coordinates on.
 
     Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
-    the steps have come near the limit of stability that it sets (with `few` or `series` at two looks in a row), the
-    implicit method is tried for 15 steps and kept if a second of motion costs it less, counted in evaluations and
+    the steps have come near the limit of stability that it sets (with `few` or `series` at two looks in a row), or the
+    motion itself is thirty times as slow as that rate, and the run has cost twice as much as a trial, the implicit
+    method is tried for 15 steps and kept if a second of motion costs it less, counted in evaluations and
     Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way.
     Counts decide, not times: a run can be repeated.
 

@@ -73,8 +73,9 @@ def solve_dae(
         Consistent initial coordinates and velocities (see `consistent_state`).
     method : str or method object
         "auto" (default: explicit where nothing is stiff, Newton's method where stiffness is measured, see `Auto`),
-        "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "TRBDF2", "ESDIRK4", "BDF",
-        "Newmark", "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`, `ESDIRK(...)`, `Newmark(...)`, ...
+        "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13",
+        "TRBDF2", "ESDIRK4", "BDF", "Newmark", "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`,
+        `ESDIRK(...)`, `Newmark(...)`, ...
     rtol : float
     atol : float or array_like (n_q,)
         A step is accepted when the largest component of its estimated error over atol + rtol |value| is at most 1:

@@ -77,7 +77,7 @@ def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
     what = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
     return (
         f" The problem looks stiff: steps of {h:.2g} s are about as long as they can be for {what} to remain stable. "
-        "If these need not be resolved, take method='auto', 'RadauIIA5', or 'TRBDF2' for few digits."
+        "If these need not be resolved, take method='auto', 'RadauIIA9', or 'TRBDF2' for few digits."
     )
 
 

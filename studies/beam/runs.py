@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,18 +19,17 @@ from studies.solvers import (
     IRK,
     IRK_LINE,
     NEWMARK,
-    NEWTON_4,
     OWN_EXPLICIT,
     PAPER_TOL,
     QUARTER,
+    RADAU,
 )
-from twoloop import ConstrainedSystem, Result, RungeKutta, solve_dae
+from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.ancf_beam import tip_height
-from twoloop.tableaux import radau_iia
 
 PAPER = IRK
-NEWTON, NEWTON_5, DIFFERENCES = "RadauIIA5", "RadauIIA9, Newton", "RadauIIA7, Newton, by differences"
+NEWTON, DIFFERENCES = "RadauIIA5", "RadauIIA5, by differences"
 EXPLICIT = "DOP853, projected"  # SciPy's
 EXUDYN = "Exudyn, GeneralizedAlpha, its own cable"
 OURS = ("auto", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", OWN_EXPLICIT)
@@ -47,7 +46,7 @@ OWN_VALUES = {  # of those that do not take the tolerances of the case
 EXUDYN_STEPS = (1000, 2000, 5000, 10_000, 20_000, 50_000)
 EXUDYN_FINE = (100_000, 200_000)  # of the motion against which Exudyn is judged: its own
 INSTANTS = 1000
-QUICK = (PAPER, NEWTON, NEWTON_4, "BDF", "Gauss6", OWN_EXPLICIT)  # IDA takes seconds to compile
+QUICK = (PAPER, *RADAU[:2], "BDF", "Gauss6", OWN_EXPLICIT)  # IDA takes seconds to compile
 QUICK_TOLERANCES = (1e-1, 1e-3)
 
 
@@ -61,10 +60,9 @@ def without_tangent(problem: Problem) -> ConstrainedSystem:
     return ConstrainedSystem(**sizes, **f, constant_mass=True, name=problem.name)  # type: ignore[arg-type]
 
 
-def _newton(stages: int, tangent: bool, case: Case, tol: float, repeat: int) -> Result:
-    problem, method = case.problem, RungeKutta(radau_iia(stages), "newton")
-    system = problem.system if tangent else without_tangent(problem)
-    return solve_dae(system, (0.0, case.t_end), problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
+def _differenced(case: Case, tol: float, repeat: int) -> Result:
+    problem = case.problem
+    return solve_dae(without_tangent(problem), (0.0, case.t_end), problem.q0, problem.v0, NEWTON, tol, tol)
 
 
 def _exudyn(case: Case, step: float, repeat: int) -> Result:
@@ -77,9 +75,8 @@ def _exudyn(case: Case, step: float, repeat: int) -> Result:
 def solvers() -> dict[str, Solver]:
     """The line-up by name: the catalogue's, and those that only this study has."""
     made: list[Solver] = [replace(CATALOGUE[IRK_LINE], name=PAPER)]
-    made += [CATALOGUE[name] for name in (NEWMARK, QUARTER, NEWTON, NEWTON_4)]
-    for name, run in ((NEWTON_5, partial(_newton, 5, True)), (DIFFERENCES, partial(_newton, 4, False))):
-        made.append(Solver(name, "two-loop", "compiled", True, "tol", run))
+    made += [CATALOGUE[name] for name in (NEWMARK, QUARTER, *RADAU)]
+    made.append(Solver(DIFFERENCES, "two-loop", "compiled", True, "tol", _differenced))
     made += [CATALOGUE[name] for name in (*OURS, *OTHERS)]
     made.append(Solver(EXUDYN, "Exudyn", "compiled, base in Python", True, "h", _exudyn))
     return {solver.name: solver for solver in made}

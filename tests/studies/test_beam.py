@@ -19,7 +19,7 @@ from studies.cases import load
 from studies.cases.beam import MAKE, SOFT, STIFF
 from studies.cli import Call, StudyError
 from studies.render import number_of_words
-from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, NEWTON_4, OWN_EXPLICIT, PAPER_TOL, QUARTER
+from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
 from studies.store import Output
 from studies.tables import medians
 from twoloop import solve_dae
@@ -223,7 +223,7 @@ def test_the_reference_is_that_of_three_ways():
 
 def test_newton_by_differences_is_the_same_run_but_for_its_jacobians():
     case = cases(True)[STIFF]
-    own, other = (attempt(Run(case, beam_runs.solvers()[name], 1e-1), 0)[0] for name in (NEWTON_4, DIFFERENCES))
+    own, other = (attempt(Run(case, beam_runs.solvers()[name], 1e-1), 0)[0] for name in (NEWTON, DIFFERENCES))
     assert own.success and other.success
     more = other.stats.n_evaluations - own.stats.n_evaluations
     assert more > case.problem.q0.size * own.stats.n_jacobians / 4  # differences by groups of columns

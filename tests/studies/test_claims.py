@@ -88,7 +88,7 @@ def beam():
             ),
             *(
                 (name, 1e-3, 1e-6, 0.05)
-                for name in ("DOP853, projected", "DOP853 (two-loop)", "RadauIIA7, Newton, by differences")
+                for name in ("DOP853, projected", "DOP853 (two-loop)", "RadauIIA5, by differences")
             ),
         ):
             row = {"group": "run", "case": case, "solver": solver, "tol": tol, "error_tip": error, "cpu_s": cpu * slow}
