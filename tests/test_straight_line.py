@@ -294,6 +294,18 @@ def test_near_a_singular_position_the_general_inner_loop_takes_over():
     assert inner(run, calls.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[-1] == 1.0
 
 
+def test_stages_that_the_code_leaves_to_the_general_one():
+    """Angles that are too large for its sines, so that none of its values is taken: the steps are the same."""
+    problem = four_bar()
+    q0 = problem.q0.copy()
+    q0[2::3] += 2e8 * np.pi
+    runs = [
+        solve_dae(problem.system, (0.0, 1.0), q0, problem.v0, "DOP853", 1e-4, 1e-4, compiled=compiled)
+        for compiled in (False, True)
+    ]
+    assert np.array_equal(runs[0].q, runs[1].q)
+
+
 @pytest.mark.parametrize("method", ["Gauss4", "RadauIIA5", "PaperIRK", "BDF"])
 def test_methods_that_make_no_use_of_it_refuse(method):
     problem = four_bar()

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+from twoloop.dop853 import DOP853
 from twoloop.plan import Method, Plan, least_tolerance
 from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
@@ -107,6 +108,8 @@ class Auto:
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
+        if code is not None and isinstance(self.few, DOP853):
+            chosen = replace(chosen, few=self.few.for_system(system, code))
         if self.series is None or (code is None and system.called_in_python):
             return replace(chosen, series=None)
         try:

@@ -1,12 +1,15 @@
 """DOP853(...): an explicit method in the two-loop procedure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from twoloop.checks import check_choice
 from twoloop.plan import INNER_TOL, LARGEST_MOVE, Plan, check_tolerances, least_tolerance
+from twoloop.stage_code import compiled_stages
+from twoloop.straight_code import OwnCode
+from twoloop.system import ConstrainedSystem
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
@@ -55,6 +58,7 @@ class DOP853:
 
     stages: Literal["free", "restored"] = "free"
     inner_tol: float | None = None
+    code: OwnCode | None = None  # made for one system; solve_dae puts it in
 
     def __post_init__(self) -> None:
         check_choice("stages", self.stages, ("free", "restored"))
@@ -65,6 +69,10 @@ class DOP853:
         """Shown in messages and tables."""
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "DOP853":
+        """The method with what is compiled for this system."""
+        return replace(self, code=code)
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         import scipy.integrate
@@ -73,7 +81,7 @@ class DOP853:
 
         source = scipy.integrate.DOP853
         s, free = len(source.B), self.stages == "free"
-        return Plan(
+        plan = Plan(
             kernels.explicit_step,
             kernels.options_array(
                 source.A,
@@ -94,4 +102,14 @@ class DOP853:
             stable_to=lambda memory: STABLE_TO,
             compilable=free,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
+        )
+        if self.code is None or not free:
+            return plan
+        made = compiled_stages(self.code, s)
+        return replace(
+            plan,
+            step=kernels.compiled_explicit_step,
+            memory=np.zeros(max(plan.memory.size, made.memory_size)),
+            own=made.function,
+            instead=kernels.explicit_step,
         )

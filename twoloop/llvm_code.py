@@ -23,7 +23,8 @@ Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 FLAGS = tuple(sorted(OPTIONS["fastmath"]))
 DOUBLE, INTEGER, WORD = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
 ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
-ALIGNMENT = 64  # bytes, of the widest vector: none lies in two lines of the cache
+ALIGNMENT = 64  # bytes, of a line of the cache, in two of which no vector lies
+SLACK = ALIGNMENT // 8  # doubles that are lost where vectors begin at the next such place
 # functions of LLVM; others are those of libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "fabs")}
 
@@ -100,7 +101,7 @@ class Emitter:
 
         Slow just after they were stored one by one, because the processor then waits until they are in its cache.
         """
-        pointer = self.builder.bitcast(self.pointer(base, place), _vector_type(width).as_pointer())
+        pointer = self.builder.bitcast(self.pointer(base, place), vector_type(width).as_pointer())
         return self.builder.load(pointer, align=8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
@@ -112,7 +113,7 @@ class Emitter:
         """Numbers side by side; one number as it is."""
         if len(values) == 1:
             return values[0]
-        vector = _vector_type(len(values))(ir.Undefined)
+        vector = vector_type(len(values))(ir.Undefined)
         for place, value in enumerate(values):
             vector = self.builder.insert_element(vector, value, WORD(place))
         return vector
@@ -222,5 +223,6 @@ def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
     return intrinsic(typing)
 
 
-def _vector_type(width: int) -> ir.Type:
+def vector_type(width: int) -> ir.Type:
+    """Of so many doubles; one is a double."""
     return DOUBLE if width == 1 else ir.VectorType(DOUBLE, width)

@@ -45,8 +45,8 @@ class Plan:
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
     inner: Any = None  # ... that code; None: the inner loop is the general one
-    expand: Any = None  # Taylor series made for the mechanism, and what solves for an order where it cannot
-    solve_order: Any = None
+    own: Any = None  # a part of the step made for the mechanism, and what is called instead where it cannot serve
+    instead: Any = None
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
     within_newton: "Plan | None" = None  # the same, parts included, of steps by Newton's method; None: not divided

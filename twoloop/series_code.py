@@ -19,7 +19,7 @@ from numba.core.dispatcher import Dispatcher
 from twoloop import llvm_code, series_groups
 from twoloop.caches import compile_kept, sources_folder
 from twoloop.callbacks import VECTOR, f8
-from twoloop.llvm_code import INTEGER, ONE, ZERO, Emitter, Quantities, Value, emitted
+from twoloop.llvm_code import INTEGER, ONE, SLACK, ZERO, Emitter, Quantities, Value, emitted
 from twoloop.series import SeriesProgram
 from twoloop.series_groups import WIDTH, Group, Groups, rounded
 from twoloop.straight_code import OwnCode, function_of
@@ -60,7 +60,7 @@ class SeriesCode:
 
     def scratch_size(self, order: int) -> int:
         """Length of `scratch` for a series of this order."""
-        return WIDTH + self.table + 2 * self.width * (order + 1)
+        return SLACK + self.table + 2 * self.width * (order + 1)
 
     def begin(
         self,
@@ -393,7 +393,7 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
         for k in range(1, order):
             find_order(scratch, series, r, c, t, unit, k)
             if not own_factors or not solve((r, c, kept), (a, lam)):  # M a + G^T lam = r, G a = c
-                f.solve_order(f, w, r, c, t, unit, tolerances, a, lam)
+                f.instead(f, w, r, c, t, unit, tolerances, a, lam)
             take_order(scratch, series, a, lam, unit, k)
         w.counters[N_EVALUATIONS] += order - 1
         return DONE if is_finite(series, order) else NOT_FINITE, 0.0

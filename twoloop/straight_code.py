@@ -5,7 +5,7 @@ take seconds for some hundred of them. The code is kept on disk as that of the k
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,33 @@ class Written:
         self._known.define(quantity, value)
 
 
+def results_of(
+    emit: Emitter, graph: Graph, outputs: Outputs, inputs: Sequence[Value]
+) -> tuple[Written, list[list[Value]]]:
+    """Arrays that code computes from the inputs of a graph, in their order."""
+    written = Written(emit)
+    for quantity, value in enumerate(inputs):
+        written.define(quantity, value)
+    for i in outputs.quantities(graph):
+        operation = graph.operations[i]
+        assert operation is not None
+        written.operation(i, *operation)
+    return written, [[written.form(form) for form in forms] for forms in outputs.arrays.values()]
+
+
+def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: Sequence[Value]) -> Value:
+    """Whether what was written holds: its conditions, angles that are not too large, and values that are finite."""
+    builder, total = emit.builder, ZERO
+    for value in values:  # what is not finite becomes NaN
+        total = emit.add(total, emit.multiply(value, ZERO))
+    holds = builder.fcmp_ordered("==", total, ZERO)
+    pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
+    pairs += [(DOUBLE(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
+    for one, other in pairs:
+        holds = builder.and_(holds, builder.fcmp_ordered(">", one, other))
+    return holds
+
+
 def function_of(graph: Graph, outputs: Outputs) -> Any:
     """A function of the inputs, a tuple of numbers and vectors, and of vectors to fill, for code that numba compiles.
 
@@ -94,29 +121,15 @@ def function_of(graph: Graph, outputs: Outputs) -> Any:
             return make_array(VECTOR)(context, builder, builder.extract_value(vectors, k)).data
 
         given, filled = arguments
-        emit = Emitter(builder)
-        written, quantity = Written(emit), 0
+        emit, inputs = Emitter(builder), []
         for k, (kind, size) in enumerate(zip(signature.args[0], graph.sizes, strict=True)):
             for j in range(size):
                 is_vector = kind == VECTOR
-                value = emit.load(pointer(given, k), j) if is_vector else builder.extract_value(given, k)
-                written.define(quantity, value)
-                quantity += 1
-        for i in outputs.quantities(graph):
-            operation = graph.operations[i]
-            assert operation is not None
-            written.operation(i, *operation)
-        results = {name: [written.form(form) for form in forms] for name, forms in outputs.arrays.items()}
-        total = ZERO
-        for value in next(iter(results.values())):  # what is not finite becomes NaN
-            total = emit.add(total, emit.multiply(value, ZERO))
-        holds = builder.fcmp_ordered("==", total, ZERO)
-        pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
-        pairs += [(DOUBLE(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
-        for one, other in pairs:
-            holds = builder.and_(holds, builder.fcmp_ordered(">", one, other))
+                inputs.append(emit.load(pointer(given, k), j) if is_vector else builder.extract_value(given, k))
+        written, results = results_of(emit, graph, outputs, inputs)
+        holds = conditions_hold(emit, written, outputs, results[0])
         with builder.if_then(holds):
-            for k, values in enumerate(results.values()):
+            for k, values in enumerate(results):
                 for j, value in enumerate(values):
                     emit.store(value, pointer(filled, k), j)
         return holds

@@ -123,8 +123,8 @@ class Taylor:
             plan,
             step=taylor.compiled_taylor_step,
             memory=np.zeros(code.memory_size(highest)),
-            expand=code.function,
-            solve_order=taylor.solve_order,
+            own=code.function,
+            instead=taylor.solve_order,
             interior=interior,
         )
 

@@ -42,7 +42,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
         return common.Kit(functions, inner_loop)
     flags[common.STRAIGHT] = plan.inner is not None
     steps = (plan.step, plan.first, plan.second)
-    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, plan.expand, plan.solve_order)
+    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, plan.own, plan.instead)
 
 
 def workspace(

@@ -22,7 +22,7 @@ from twoloop.kernels.common import (
     STEP,
     kernel,
 )
-from twoloop.kernels.explicit import COARSE, FINE, INNER_TOL, STAGE, _error, _move, _slopes, _tableau, _vector
+from twoloop.kernels.explicit import COARSE, FINE, INNER_TOL, STAGE, _error, _move, _slopes, _vector, tableau_of
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import keep_predicted
 
@@ -32,7 +32,7 @@ NEARER = 0.5  # of the smallest pivot at the start of a step, which there must b
 @kernel(STEP)
 def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt; `options` and `memory` are those of explicit_step."""
-    s, A, b, c, fine, coarse = _tableau(options)
+    s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, y, y1 = state[:n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

@@ -178,8 +178,8 @@ class Kit:
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
     chooses between two others has these as `first` and `second`. An inner loop made for the mechanism leaves to
-    `general` what it does not do itself; `expand` is a Taylor series made for it, and `solve_order` what it calls where
-    factors are those of the general inner loop.
+    `general` what it does not do itself; `own` is a part of the step made for it, Taylor series or stages, and
+    `instead` what is called where that does not serve.
     """
 
     def __init__(
@@ -190,11 +190,11 @@ class Kit:
         first: Any = None,
         second: Any = None,
         general: Any = None,
-        expand: Any = None,
-        solve_order: Any = None,
+        own: Any = None,
+        instead: Any = None,
     ):
         self.functions, self.inner, self.step, self.first, self.second = functions, inner, step, first, second
-        self.general, self.expand, self.solve_order = general, expand, solve_order
+        self.general, self.own, self.instead = general, own, instead
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -211,7 +211,7 @@ for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
 # (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
 STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-for _name in ("step", "first", "second", "expand", "solve_order"):
+for _name in ("step", "first", "second", "own", "instead"):
     KIT.add_function(_name, STEP)
 
 

@@ -66,10 +66,10 @@ def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
 
 @merged
 def _find_series(f, w, options, memory, t, state, unit, which, by_code):
-    """The series about a state, into one of the two places; by f.expand, code made for the mechanism, if there is."""
+    """The series about a state, into one of the two places; by f.own, code made for the mechanism, if there is."""
     memory[TARGET] = which
     if by_code:
-        code, _ = f.expand(f, w, options, memory, t, unit, state, state, state)
+        code, _ = f.own(f, w, options, memory, t, unit, state, state, state)
         return code
     return expand(f, w, options, memory, t, state, unit)
 
@@ -183,5 +183,5 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @kernel(STEP, vectorized=True)
 def compiled_taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """The step with series found by f.expand, code made for the mechanism, which calls f.second for each solution."""
+    """The step with series found by f.own, code made for the mechanism; f.instead solves where its factors cannot."""
     return _step(f, w, options, memory, t, h, tolerances, state, new_state, True)
