@@ -19,7 +19,7 @@ FEW = 5
 # the same of code made for the mechanism, where loops over coordinates and operations cost little:
 SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
 SHORT_FROM = 1e-3
-SERIES_COMPILED = 1e-6  # tolerance, for fewer than MANY coordinates; TIGHT_MANY for others
+SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-8  # tolerance, for fewer than MANY coordinates and for others
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
 TIGHTEST = 1e-9  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
@@ -65,7 +65,7 @@ class Auto:
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
     coordinates or more. Else with `few`; with `many` for 64 coordinates, or for 16 and at most a quarter as many
     constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a series
-    pays below 1e-6, for 16 coordinates or more below 1e-10, with at most 8 operations in all below 1e-3, and `many`
+    pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8 operations in all below 1e-3, and `many`
     from 64 coordinates on.
 
     Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
@@ -124,7 +124,7 @@ class Auto:
         operations = self.series.program.n_operations / n_q
         if self.compiled:
             short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
-            return short or tolerance < (SERIES_COMPILED if n_q < MANY else TIGHT_MANY)
+            return short or tolerance < (SERIES_COMPILED if n_q < MANY else SERIES_COMPILED_MANY)
         if tolerance < SERIES:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
         return operations <= SIMPLE and n_q >= MANY
