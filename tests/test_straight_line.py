@@ -14,7 +14,7 @@ from numba import njit
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, caches, callback, straight_code
 from twoloop.kernels import calls
-from twoloop.kernels.common import DONE
+from twoloop.kernels.common import BY_GENERAL, DONE
 from twoloop.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.mechanisms import (
     andrews,
@@ -107,7 +107,7 @@ def test_a_state_is_moved_to_the_nearest_on_the_constraints(make):
     q0 = problem.q0 + 1e-6 * rng.standard_normal(problem.q0.size)
     v0 = problem.v0 + 1e-3 * rng.standard_normal(problem.q0.size)
     code, q, v, a, lam = inner(run, calls.PROJECT, 0.0, q0, v0)
-    assert code == DONE and run.work.notes[-1] == 0.0  # not by the general inner loop
+    assert code == DONE and run.work.notes[BY_GENERAL] == 0.0  # not by the general inner loop
     M, G = system.mass(0.0, q), system.jacobian(0.0, q)
     assert np.abs(system.constraint(0.0, q)).max() < 1e-13 * max(1.0, np.abs(q).max())
     assert np.abs(system.velocity_constraint(0.0, q, v)).max() < 1e-11 * max(1.0, np.abs(G).max() * np.abs(v).max())
@@ -290,8 +290,8 @@ def test_near_a_singular_position_the_general_inner_loop_takes_over():
 
     q = v = np.zeros(3)
     run = run_from(system(1.0), q, v, True)
-    assert inner(run, calls.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[-1] == 0.0
-    assert inner(run, calls.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[-1] == 1.0
+    assert inner(run, calls.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 0.0
+    assert inner(run, calls.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 1.0
 
 
 def test_stages_that_the_code_leaves_to_the_general_one():

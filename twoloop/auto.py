@@ -26,7 +26,8 @@ LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP
 LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
 LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
 LIMIT_SERIES = 0.4  # times the order: the same of a series, whose steps grow with its order
-DEARER = 4.0  # evaluations by code made for the mechanism that one without costs, about
+DEARER = 4.0  # evaluations by code made for the mechanism that one without costs, about ...
+DEARER_HEAVY, HEAVY = 2.0, 17  # ... or, from so many operations of the callbacks a coordinate on, as these cost both
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
 
 
@@ -63,17 +64,19 @@ class Auto:
 
     A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
-    coordinates or more. Else with `few`; with `many` for 64 coordinates, or for 16 and at most a quarter as many
-    constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a series
-    pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8 operations in all below 1e-3, and `many`
-    from 64 coordinates on.
+    coordinates or more. Else with `few`; with `many` from 64 coordinates on, or from 16 on with at most a quarter as
+    many constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a
+    series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8 operations in all below 1e-3, and
+    `many` from 64 coordinates on.
 
-    Every 600 evaluations the largest rate of the motion is estimated, from the derivatives of the accelerations. Where
-    the steps have come near the limit of stability that it sets (with `few` or `series` at two looks in a row), or the
-    motion itself is thirty times as slow as that rate, and the run has cost twice as much as a trial, the implicit
-    method is tried for 15 steps and kept if a second of motion costs it less, counted in evaluations and
-    Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way.
-    Counts decide, not times: a run can be repeated.
+    After 100 evaluations, and then every 600, the largest rate of the motion is estimated, from the derivatives of the
+    accelerations. The implicit method is tried for 15 steps where the steps have come near the limit of stability that
+    this rate sets (at two looks in a row; at one with `many`, and with `few` from 16 coordinates on), or are above 5 %
+    of it and the rate is more than thirty times that of the motion itself. Unless they are far beyond that limit, this
+    waits until the run has cost three trials, and 64 evaluations for each independent coordinate if tangents have to be
+    differenced. The implicit method is kept if a second of motion costs it less, counted in evaluations and Newton
+    matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way. Counts
+    decide, not times: a run can be repeated.
 
     While the implicit method runs, errors of positions are within the tolerances; those of velocities are not tested.
     With constant steps it is `fixed` throughout.
@@ -129,6 +132,11 @@ class Auto:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
         return operations <= SIMPLE and n_q >= MANY
 
+    def _dearer(self, n_q: int) -> float:
+        """What an implicit method's evaluation costs, in evaluations by code made for the mechanism."""
+        program = None if self.series is None else self.series.program
+        return DEARER_HEAVY if program is not None and program.n_operations >= HEAVY * n_q else DEARER
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         if fixed:
@@ -136,7 +144,7 @@ class Auto:
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = implicit.plan(n_q, rtol, atol, False)
-        dearer = DEARER if self.compiled else 1.0
+        dearer = self._dearer(n_q) if self.compiled else 1.0
         if self.series is not None and self._series_pays(n_q, tolerance):
             series = self.series.plan(n_q, rtol, atol, False)
             return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)

@@ -159,26 +159,27 @@ class Interpolator:
             self.filled[float(table.t[i])] = (table.t[:0], table.states[:0])
 
     def interiors(self, table: Table) -> tuple[Array, Array]:
-        """The interior states of all intervals, (n - 1, parts + 1) and (n - 1, parts + 1, 3 n_q), for `keep`.
+        """The interior states of all m divided intervals, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
 
-        NaN where there are none.
+        NaN where an interval has fewer.
         """
-        shape = (len(table.t) - 1, self.parts + 1)
+        divided = [i for i in range(len(table.t) - 1) if table.t[i] in self.filled or table.kinds[i] in self.plans]
+        shape = (len(divided), self.parts + 1)
         t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
-        for i in np.flatnonzero(np.isin(table.kinds, list(self.plans))):
+        for row, i in enumerate(divided):
             if table.t[i] not in self.filled:
                 self._fill(table, int(table.kinds[i]), np.array([i]))
             own_t, own = self.filled[table.t[i]]
-            t[i, : len(own_t)], states[i, : len(own)] = own_t, own
+            t[row, : len(own_t)], states[row, : len(own)] = own_t, own
         return t, states
 
-    def keep(self, table: Table, t: Array, states: Array) -> None:
+    def keep(self, t: Array, states: Array) -> None:
         """Take interior states as they were found before; no others can be found."""
         self.parts = t.shape[1] - 1
         self._make_room()
         there = np.isfinite(t)
-        pairs = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True)]
-        self.filled = dict(zip(table.t[:-1].tolist(), pairs, strict=True))
+        divided = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True) if here[0]]
+        self.filled = {float(own_t[0]): (own_t, own) for own_t, own in divided}
 
     def complete(self, times: Array, states: Array) -> Array:
         """Rows [a, lam] at rows [q, v] on the constraints."""
@@ -243,10 +244,10 @@ class DenseSolution:
     and a of four neighbouring states (order 12), where Newton's method was at work in the outer loop through q and v
     (order 8: a has the noise of vibrations that are stepped over); of `BDF` and `Newmark` v has a polynomial of its
     own, through v and a (order 8). `RungeKutta` of order 6 and
-    more with outer="fixed-point" takes steps that are too long for this: each is divided into 2 to 6 equal steps of the
-    method, when the first time within it is asked for, which costs about as much as the run has cost; where these steps
-    do not converge, next to a singular position, neighbouring states are all there is. Evaluations for this, and for
-    restoring, are counted nowhere.
+    more, by Newton's method of order 7 and more, and `Taylor` take steps that are too long for this, in `auto` too:
+    each is divided into 2 to 6 equal steps of the method, when the first time within it is asked for, which costs about
+    as much as the run has cost; where these steps do not converge, next to a singular position, neighbouring states are
+    all there is. Evaluations for this, and for restoring, are counted nowhere.
 
     It takes 8 (2 + 3 n_q) bytes of memory a step.
 

@@ -186,7 +186,7 @@ class RungeKutta:
 
     def _parts(self) -> int:
         """Parts of a step whose states carry the solution between its ends to the accuracy of the method."""
-        if self.outer != "fixed-point":
+        if self.outer in ("newton", "paper"):
             return 1
         return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
 

@@ -253,7 +253,7 @@ class Run:
                 looks.take(float(self.clock[a.T]), self.state, system.n_q, steps[:, a.H])
             if spent < CHUNK_TIME:
                 self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
-            if code == a.PAUSED and (not sparse or len(out_t) < self.control[a.MAX_ATTEMPTS]):
+            if not sparse or len(out_t) < min(self.control[a.MAX_ATTEMPTS], BUFFER_ROWS):
                 out_t, out_state, out_steps = self._buffers()
             limited = self.control[a.MAX_STEPS] < np.inf
             if pace.stagnates(self.clock[a.T], steps[:, a.H], t1) and code == a.PAUSED and not limited:

@@ -113,5 +113,5 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str
     rank, rank_v = words["sol_ranks"]
     interpolator = Interpolator(system, float(table.t[0]), table.states[0], words["sol_rtol"], (rank, rank_v))
     if "sol_interior_t" in arrays:
-        interpolator.keep(table, arrays["sol_interior_t"], arrays["sol_interior_states"])
+        interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])
     return DenseSolution(interpolator, table, words["sol_end"])

@@ -227,7 +227,8 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
         return compile_kept(evaluating, INNER, watched, **options)
 
     closer, nearer = (function_of(equations.graph, each) for each in (equations.closer, equations.nearer))
-    redundant, REDUNDANT, TANGENTS = function_of(equations.graph, equations.redundant), calls.REDUNDANT, calls.TANGENTS
+    redundant, MULTIPLIERS = function_of(equations.graph, equations.redundant), calls.MULTIPLIERS
+    REDUNDANT, TANGENTS = calls.REDUNDANT, calls.TANGENTS
 
     def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
         if task == EVALUATE_THERE:
@@ -258,6 +259,8 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
             if redundant((t, q, v), (a,)):
                 return DONE
             f.general(f, w, TANGENTS, t, q, v, theta, a, lam)  # the rows there, which this code has not left in w
+        elif task <= MULTIPLIERS:  # of methods that need a good partition at every step
+            w.notes[BY_GENERAL] = 1.0
         return f.general(f, w, task, t, q, v, theta, a, lam)
 
     return compile_kept(inner, INNER, watched, **options)

@@ -79,3 +79,27 @@ def test_a_cusp_ends_the_run_and_is_named(method):
     before = result.t < 0.95 * CUSP_TIME
     q, _ = m.states(result.t[before])
     assert np.abs(result.q[:, before] - q).max() < 1e-6
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("method", ["DOP853", "auto"])
+def test_states_stay_as_they_were_stored_when_a_step_goes_across(method, compiled):
+    """With a terminal event chunks are short, and one may end, half full, at a singular position."""
+    m = mechanism("A02, N = 1")
+
+    def never(t, q, v):
+        return 1.0
+
+    never.terminal = True
+    crossed = 0
+    for tol in (1e-5, 1e-7, 1e-8):
+        options = {"check_derivatives": False, "compiled": compiled}
+        runs = [
+            solve_dae(m.system(), (0.0, 10.0), *m.start, method, tol, tol, events=events, **options)
+            for events in (None, never)
+        ]
+        assert runs[0].status is runs[1].status
+        crossed += "across" in runs[1].message
+        assert (runs[0].t == runs[1].t).all() and (runs[0].q == runs[1].q).all()
+        assert (np.diff(runs[1].t) > 0.0).all()
+    assert crossed > 0

@@ -69,6 +69,24 @@ def test_stiffness_is_found_where_steps_are_shorter_than_stability_asks_for():
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7
 
 
+def test_what_is_chosen_does_not_depend_on_where_time_begins():
+    """A trial that is due at the first look is priced from the start of the run."""
+    runs = [
+        solve_dae(spring(lambda t: 1e6), (t0, t0 + 0.5), *START, "auto", 1e-3, 1e-3, check_derivatives=False)
+        for t0 in (0.0, -5.0, -0.02, 1000.0)
+    ]
+    assert len({run.stats.n_jacobians for run in runs}) == 1 and runs[0].stats.n_jacobians > 5
+
+
+def test_steps_that_are_explicit_again_are_not_divided_by_newtons_method():
+    """As the solution between steps would take longer than the run."""
+    problem = moderately_stiff_beam()
+    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "auto", 1e-7, 1e-7, dense_output=True)
+    assert result.stats.n_jacobians > 0
+    divided, _ = result.sol.interpolator.interiors(result.sol.table)
+    assert 0 < len(divided) < 0.1 * result.h.size
+
+
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("tol", [1e-3, 1e-7])
 def test_no_implicit_method_is_tried_where_nothing_is_stiff(tol, compiled):

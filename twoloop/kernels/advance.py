@@ -18,6 +18,7 @@ from twoloop.kernels.common import (
     BY_GENERAL,
     DEPARTURE,
     DONE,
+    EXPLICIT_STEP,
     FAULT_KIND,
     FORM,
     GAMMA_GIVEN,
@@ -94,7 +95,8 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     N_CONTROL,
 ) = range(18)
 
-# places in a row of `out_steps`: the size of an accepted step, and the counters so far
+# places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
+# explicit step of a method that switches
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # places in `clock`, carried from call to call
@@ -209,7 +211,7 @@ def advance(
                 size = 0.5 * left  # two equal steps rather than a long and a tiny one
             size = representable(t, size)
             if size > control[MAX_STEP]:
-                size = representable(t, size - np.spacing(t + size))
+                size = representable(t, size - np.spacing(abs(t + size)))
         if lands:
             size = left
         elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
@@ -266,7 +268,9 @@ def advance(
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1
             clock[FAILURE_CODE] = DONE
-            clock[H_NEXT] = min(proposal, size - np.spacing(t + size))  # a tiny one may else be rounded to what it was
+            clock[H_NEXT] = min(
+                proposal, size - np.spacing(abs(t + size))
+            )  # a tiny one may else be rounded to what it was
             if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
                 return NEAR_SINGULAR
             continue
@@ -287,7 +291,7 @@ def advance(
         out_steps[filled[1], ERRORS] = w.counters[N_REJECTED_ERROR]
         out_steps[filled[1], FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
         out_steps[filled[1], PARTITIONS] = w.counters[N_PARTITIONS]
-        out_steps[filled[1], JACOBIANS] = w.counters[N_JACOBIANS]
+        out_steps[filled[1], JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
         filled[1] += 1
         if lands or control[STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[T]

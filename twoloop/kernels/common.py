@@ -156,8 +156,9 @@ def _type_of_work(value: Any, context: Any) -> Any:
     FACTORED,  # 1: its factors belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
+    EXPLICIT_STEP,  # 1: a method that switches took an explicit step
     N_NOTES,
-) = range(24)
+) = range(25)
 
 # what a kernel returns: DONE, or why it could not
 (

@@ -83,7 +83,8 @@ def _vector(memory, n, which):
 @inlined
 def _slopes(memory, s, n):
     """Velocities and accelerations of the stages, side by side."""
-    return memory[1 + N_VECTORS * _width(n) :].reshape((s, _width(n)))
+    begin = 1 + N_VECTORS * _width(n)
+    return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
 
 
 @compiled

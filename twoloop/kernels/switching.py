@@ -4,8 +4,11 @@ Now and then the largest rate of the motion, rho, the root of the largest eigenv
 the accelerations, is found by a few power iterations, one evaluation each. While the explicit method takes steps of
 h rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be
 the reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
-second of motion costs it less. It is left in the same way, after a trial of the explicit method, where its own steps
-have come below that limit. What is not kept is next tried after twice as many looks.
+second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows:
+what decays so fast may keep the estimate of the error from longer steps. A trial that may be in vain waits until the
+run has cost a few times as much. Costs are counted in evaluations of the explicit method; with code made for the
+mechanism one of the implicit method counts several times. This is left in the same way, after a trial of the explicit
+method, where its own steps have come below that limit. What is not kept is next tried after twice as many looks.
 
 Both methods are called by their addresses, f.first and f.second, and are compiled once, where they are.
 """
@@ -17,6 +20,7 @@ from twoloop.kernels.calls import PROJECT, evaluate, renew_partition
 from twoloop.kernels.common import (
     DONE,
     ESTIMATE,
+    EXPLICIT_STEP,
     FORCE_BY_Q_GIVEN,
     N_EVALUATIONS,
     N_JACOBIANS,
@@ -43,7 +47,7 @@ SEED = 1e-3  # what a component of a direction begins with, of the largest
 SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
 EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
 TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
-AFFORDED = 2.0  # trials that the run has cost so far, before one that may be in vain
+AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain
 APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
 WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
 INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
@@ -97,7 +101,7 @@ def switching_options(
     first: ArrayLike,
     second: ArrayLike,
 ) -> NDArray[np.float64]:
-    """`options`: of the pair, the cost of a Newton matrix in evaluations, then six numbers of each, then their own."""
+    """`options`: of the pair, see LIMIT and what follows; then six numbers of each; then their own."""
     first = np.asarray(first, dtype=np.float64)
     scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
@@ -107,7 +111,7 @@ def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[n
     """`memory` for methods with these memories."""
     first, second = np.asarray(first), np.asarray(second)
     scalars = np.zeros(N_SCALARS)
-    scalars[LOOK_AT], scalars[WAIT], scalars[FIRST_MEMORY] = EARLY, PATIENCE, first.size
+    scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
     directions = np.concatenate([0.3 + 0.1 * (np.arange(n_q) % 7)] * 2)
     return np.concatenate([scalars, directions, first, second])
 
@@ -162,7 +166,8 @@ def _largest_rate(f, w, memory, t, state, new_state):
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     squared = damping = 0.0
     # code made for the mechanism has no use for the partition, which may be an old one whose independents hardly move
-    if f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
+    explicit = memory[PHASE] == EXPLICIT
+    if explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
     for _ in range(ITERATIONS):
         squared = _along(f, w, t, state, by_q, False, Q, V, A)
@@ -247,7 +252,8 @@ def _look(f, w, options, memory, t, state, new_state):
     memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
     memory[LOOKS_TO_WAIT] -= 1.0
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
-    memory[NEAR] = memory[NEAR] + 1.0 if share > 1.0 else 0.0
+    if share > 1.0:
+        memory[NEAR] += 1.0
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
@@ -258,6 +264,8 @@ def _look(f, w, options, memory, t, state, new_state):
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
         hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
     due = share > SURELY or hidden or (memory[NEAR] >= options[LOOKS] and cheap)
+    if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
+        memory[NEAR] = 0.0
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
@@ -293,6 +301,9 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """
     n = w.Q.size
     first, second = _memories(memory, n)
+    if np.isnan(memory[T_BEGIN]):  # of a run, or of what is left of it beyond a singular position
+        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+        memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY
     memory[STEPS] += memory[LAST_ACCEPTED]
     if memory[LAST_ACCEPTED] == 1.0:
         memory[H_BEFORE], memory[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
@@ -309,6 +320,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if was_explicit != is_explicit:
                 _restart(first if is_explicit else second)
     explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
+    w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
     each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
     w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
@@ -318,6 +330,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0:  # a constant step cannot become shorter
             _enter(w, options, memory, n, IMPLICIT, t)
             _restart(second)
+            w.notes[EXPLICIT_STEP] = 0.0
             code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
         second[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
