@@ -28,7 +28,7 @@ from studies.energy_runs import (
 from studies.render import number
 from studies.solvers import IDA_C, IRK, OWN_EXPLICIT
 from studies.study import Series, Study, key
-from studies.tables import setting
+from studies.tables import setting, unfinished
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
@@ -142,6 +142,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "n_controlled_drift": int(controlled.sum()),
         "newmark": {name: told(pick(rows, motion, NEWMARK)) for name, motion in both.items()},
         "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
+        "failed": unfinished(rows),
         "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
     }
 

@@ -241,6 +241,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
         alike = [[outcome], [NOT_RUN]]
         found[key] = [each["trap"] for each in found["cells"] if all(each[name] in alike for name in names)]
+    found["one_says_so"] = []
+    for each in found["cells"]:
+        said = [name for name in names if each[name] == [SAID]]
+        if len(said) == 1 and all(each[name] in ([RIGHT], [NOT_RUN]) for name in names if name not in said):
+            found["one_says_so"].append({"trap": each["trap"], "solver": said[0]})
     found |= {"solvers": names, "looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
     ran = rows[rows["outcome"] != NOT_RUN]
     found["missed_by_all"] = [
@@ -263,10 +268,11 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings and report."""
     found = findings_of(rows)
     output.save_findings(found)
+    alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
     cells = [
         [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in found["solvers"])]
         for each in found["cells"]
-        if each["trap"] not in (*found["all_say_so"], *found["all_right"])
+        if each["trap"] not in alike
     ]
     short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
     shown = [what for what in ORDER if what != NOT_RUN]

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -77,9 +78,7 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     """The line of a largest position error."""
     line: dict[str, Any] = {"accuracy": power(at["error"]), "ida": at["ida"], **dict.fromkeys(WHOSE)}
     for which in (which for which in WHOSE if at[which]):
-        best = at[which]
-        energy = "not conserved" if best["energy"] is None else number(abs(best["energy"]))
-        line[which] = {key: best[key] for key in COSTS} | {"solver": best["solver"], "energy": energy}
+        line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
     return line
 
 
@@ -90,9 +89,7 @@ def _at_energy(at: dict[str, Any], *kinds: str) -> dict[str, Any]:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:
             best = min(runs, key=lambda run: float(run["cpu_s"]))
-            drift = "no drift" if best["calm"] else "drifts" if best["drifts"] else "irregular"
-            energy = f"{number(best['energy'])} ({drift})"
-            line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "energy": energy}
+            line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": best["drifts"]}
     return line
 
 
@@ -119,6 +116,14 @@ def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
         same = [(pick["solver"], *pick["accuracies"]) for pick in entry["picks"]]
         groups.setdefault((entry["class"], *same), []).append(entry)
     return list(groups.values())
+
+
+def overall(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Solvers that are the cheapest of all at any error of any entry, and at how many; the most frequent first."""
+    chosen: Counter[str] = Counter()
+    for pick in (pick for entry in entries for pick in entry["picks"]):
+        chosen[pick["solver"]] += len(pick["accuracies"])
+    return [{"solver": solver, "n": n} for solver, n in chosen.most_common()]
 
 
 def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
@@ -148,7 +153,12 @@ def first_screen(folder: Path, quick: bool) -> str:
         studies.append({"name": name, "about": about, "file": files[0] if files else None})
     figure = (folder / "energy_cost.png").is_file()
     found = findings(folder)
-    more = {"studies": studies, "energy_figure": figure, "times": per_evaluation(classes(found))}
+    entries = classes(found)
+    more = {"studies": studies, "energy_figure": figure, "times": per_evaluation(entries), "overall": overall(entries)}
+    told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
+    more["drifting"] = any(best["drifts"] for best in told)
+    more["n_errors"] = sum(len(entry["at"]) for entry in entries)
+    more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]
     return _render("index", found, quick=quick, **more)
 
 

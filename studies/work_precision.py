@@ -5,7 +5,7 @@ at is judged in `studies.goals`, where a rival is ahead in `studies.behind`; how
 `studies.scaling`, how far it is from what the machine can do in `studies.limit`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
@@ -216,21 +216,7 @@ def ready(findings: dict[str, Any]) -> dict[str, str]:
         "ratios": table(["mechanism", *(power(e) for e in rivals.IN_TABLE)], rivals.lines(findings["rivals"])),
         "behind": table(profile, behind.lines(findings["behind"])),
         "scaling": scaling.pivot(findings["scaling"]),
-        "cases": table(["motion", *(power(error) for error in ERRORS)], case_lines(findings["cases"])),
     }
-
-
-def case_lines(listed: Sequence[dict[str, Any]]) -> Iterator[list[str]]:
-    """Of the table of cases: seconds of the cheapest of ours, how many times those of others and of the default."""
-    for case in listed:
-        cells = []
-        for at in case["at"]:
-            if not at["ours"]:
-                cells.append("–")
-                continue
-            over = number(at["others"]["cpu_s"] / at["ours"]["cpu_s"]) if at["others"] else "–"
-            cells.append(f"{number(at['ours']['cpu_s'])}; {over}; {number(at['default_over'])}")
-        yield [f"{case['name']}, {number(case['t_end'])} s", *cells]
 
 
 def main(words: Sequence[str] | None = None) -> None:

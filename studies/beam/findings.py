@@ -7,12 +7,12 @@ import pandas as pd
 
 from studies import tables
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI
-from studies.beam.runs import DIFFERENCES, EXPLICIT, EXUDYN, PAPER, by_tip
-from studies.beam.sensitivity import MESH, PARAMETERS, START
+from studies.beam.runs import DIFFERENCES, EXUDYN, PAPER, by_tip
+from studies.beam.sensitivity import MESH
 from studies.cases.beam import SOFT, STIFF
 from studies.cli import StudyError
 from studies.render import number
-from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
+from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, PAPER_TOL, QUARTER
 
 TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
 PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
@@ -65,17 +65,15 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     found["newmark_cheaper"] = [line["error"] for line in known if line["newmark_over_paper"] < 1.0]
     found["newmark_dearer"] = [line["error"] for line in known if line["newmark_over_paper"] >= 1.0]
     changes = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
-    parameter, mesh, start = float(changes[list(PARAMETERS)].max()), float(changes[MESH]), float(changes[START])
-    found |= {"changes": changes.to_dict(), "mesh_change": mesh, "mesh_more": mesh > parameter}
-    return found | {"start_more": start > parameter, "below_mesh": [error for error in TARGETS if error < mesh]}
+    below_mesh = [error for error in TARGETS if error < changes[MESH]]
+    return found | {"changes": changes.to_dict(), "below_mesh": below_mesh}
 
 
 def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
-    """Who is cheapest at one error on one beam: of all, of ours, of others, among implicit methods; and the paper's."""
+    """Who is cheapest at one error on one beam: of all, of ours, of others; and the paper's."""
     ranked = tables.ranking(runs, error)
     seconds = dict(zip(ranked["solver"], ranked["cpu_s"], strict=True)) if len(ranked) else {}
-    implicit = ranked if ranked.empty else ranked[~ranked["solver"].isin((OWN_EXPLICIT, EXPLICIT))]
-    found: dict[str, Any] = {"error": error, "best": tables.best(ranked), "implicit": tables.best(implicit)}
+    found: dict[str, Any] = {"error": error, "best": tables.best(ranked)}
     found |= {**tables.of_both(ranked), "differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
     found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
     ida, newmark = (

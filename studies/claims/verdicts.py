@@ -92,7 +92,7 @@ def _text(value: Any) -> str:
     if not isinstance(value, list):
         return number(value)
     low, high = (number(x) for x in value)
-    return low if low == high else f"{low} to {high}"
+    return low if low == high else f"{low}–{high}"
 
 
 def load() -> list[Claim]:

@@ -343,11 +343,11 @@ def test_circular_and_stand_in_limit_the_verdict():
 def test_report_rows_and_findings(folder):
     text = (folder / "claims.md").read_text()
     rows = pd.read_csv(folder / "claims.csv", comment="#")
-    assert len(text.split()) < 1200
+    assert len(text.split()) < 1000
     for claim in load():
         assert f" {claim.statement.removesuffix('.')}" in text
         row = rows[rows["claim"] == claim.key].iloc[0]
-        assert row["verdict"] in text and row["number"] in text and row["criterion"] == claim.criterion
+        assert row["verdict"].capitalize() in text and row["number"] in text and row["criterion"] == claim.criterion
     assert "nan" not in text and (folder / "errata.md").exists()
 
 
@@ -363,8 +363,8 @@ SENTENCES = [  # claim, what is printed, verdict after a flip of the list above,
     ("symplectic_stable", "Symplectic, so stable: does not hold", HOLDS, "Symplectic, so stable: holds"),
     ("jacobian_difficult", "Jacobians are difficult: does not hold", HOLDS, "Jacobians are difficult: holds"),
     ("stiff_applicable", "so for stiff systems: does not hold", HOLDS, "so for stiff systems: holds"),
-    ("newmark_star", "to this end: claims 20 and 22.", FAILS, "to this end: claim 20."),
-    ("irk_star", "**No evidence**", CIRCULAR, "the one with this outcome is taken: claim 23."),
+    ("newmark_star", "of claims 20 and 22: err_out", FAILS, "of claim 20: err_out"),
+    ("irk_star", "**No evidence**", CIRCULAR, "of claim 23: of the readings"),
     ("limit_reset_34", "Because (34) forgets h_max", HOLDS, ""),
 ]
 STAYS = ("irk_star", "more_efficient")  # what is printed before may be printed then, too

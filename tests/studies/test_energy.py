@@ -184,7 +184,7 @@ def test_failed_and_lost_runs_are_shown(rows, text_of):
     gone = {"status": "NOT_CONVERGED", "t_reached": 0.1, "slope": math.nan, "slope_error": math.nan}
     rows = changed(rows, f"{ON_ONE}'{RADAU}'", energy=math.nan, swing=math.nan, **gone)
     text = text_of(changed(rows, "solver == 'LSODA, index 1'", lost=True))
-    assert "not converged at 0.1 s |" in text and "## Runs that did not reach the end" in text
+    assert "not converged at 0.1 s |" in text and "Did not reach the end: Radau IIA(3) (h 2e-2)." in text
     assert "| `LSODA, index 1, tol 1e-10` (Python) | lost |" in text
 
 

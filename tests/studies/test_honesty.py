@@ -109,8 +109,13 @@ def test_sentences_turn_with_the_rows():
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
     assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
+    assert "run but one are right" not in text(rows)
+    rows.loc[3, "outcome"] = honesty.SAID
+    told = text(rows)
+    assert "All that are run but one are right, and it says so: b (LSODA, index 1)." in told and "are right: a." in told
     rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
     told = text(rows)
-    assert "Runs of ours that are wrong and silent, or hang: 1." in told
+    assert "or hang: 1. BDF (two-loop) on *b*, chain of 2: wrong and silent, error 1e-9 m." in told
+    assert "run but one are right" not in told
     assert "All that are run are right: a." in told and "All that are run say so" not in told
     assert "No solver notices: b" in told

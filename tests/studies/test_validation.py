@@ -95,7 +95,7 @@ def text_of(rows):
 def test_sentences_turn_with_the_rows():
     text, found = text_of(made_up())
     assert "Right on every problem at 1e-10: `Gauss12` and `BDF`" in text
-    assert "There is no problem on which another solver is right and none of ours" in text
+    assert "On no problem is another solver right and none of ours" in text
     assert "Reached everywhere" in text
     assert found["solvers"][0]["slope"] == pytest.approx([1.0, 1.0, 1.0])
     stopped = {"status": "STEP_TOO_SMALL", "outcome": "said so", "error_q": np.nan, "digits_q": np.nan}
@@ -156,7 +156,7 @@ def test_sentences_of_steps_and_of_models_follow_their_rows():
     assert "`BDF` accepts first steps with too large an error" in text
     by_solver = {line[0]: line[-1] for line in validation.lines(found["solvers"], found["steps"])}
     assert by_solver == {"Gauss12": "–", "BDF": "0 %", "LSODA, index 1": "–"}
-    assert "with 400 steps, and the order seen between 100 and 400 steps" in text
+    assert "with 400 steps, and the order seen between 100 and 400 " in text
     assert found["models"][0]["solvers"]["Exudyn, HHT"]["order"] == pytest.approx(2.0)
     text, _ = text_of(pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))
     assert "first steps with too large an error" not in text
