@@ -84,7 +84,8 @@ def solve_idas(
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
-    options = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": STEPS_A_RUN}
+    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": STEPS_A_RUN}
+    options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
     return _solved(system, "idas", t0, np.array([t1]), times, q0, v0, options, time_limit)
 
 
