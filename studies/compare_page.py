@@ -47,7 +47,7 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
             continue
         try:
             first, rest = path.read_text().split("\n", 1)
-            rows = pd.read_csv(StringIO(rest)).rename(columns=columns)
+            rows = pd.read_csv(StringIO(rest), low_memory=False).rename(columns=columns)
             rows = tables.medians(rows) if "repeat" in rows else rows
             parts.append(rows.assign(mechanism=rows["case"].astype(str), study=name))
         except (ValueError, KeyError) as error:

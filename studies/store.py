@@ -117,7 +117,7 @@ class Output:
             raise StudyError(f"there is no {path} to redraw from; {rerun}")
         try:
             first, rest = path.read_text().split("\n", 1)
-            rows = pd.read_csv(StringIO(rest))
+            rows = pd.read_csv(StringIO(rest), low_memory=False)
         except (ValueError, UnicodeDecodeError) as error:
             raise StudyError(f"{path} is damaged ({error}); {rerun}") from None
         if not first.startswith(f"# {self._kind()}; "):

@@ -36,7 +36,9 @@ def read(folder: Path) -> dict[str, pd.DataFrame]:
         path = folder / f"{name}.csv"
         if path.is_file():
             try:
-                found[name] = _one_a_run(name, pd.read_csv(StringIO(path.read_text().split("\n", 1)[1])))
+                found[name] = _one_a_run(
+                    name, pd.read_csv(StringIO(path.read_text().split("\n", 1)[1]), low_memory=False)
+                )
             except (ValueError, IndexError) as error:
                 raise StudyError(f"{path} is damaged ({error}); make it again by python -m studies.{name}") from None
     return found
