@@ -129,7 +129,7 @@ def test_the_saved_rows_of_the_reports_can_be_shown(tmp_path):
     path = made(tmp_path)
     data = compare_page.page_data(*compare_page.read(tmp_path))
     assert len(data["mechanisms"]) > 20 and path.stat().st_size < 1_000_000
-    names = [each["name"] for each in data["mechanisms"]]
+    names = [each["name"] for each in data["mechanisms"]][::4]
     acts = "".join(f"change('mechanism', {json.dumps(name)});" for name in names)
     for name, shown in zip(names, played(path, acts)[1:], strict=True):
         assert circles(shown), name
