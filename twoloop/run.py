@@ -31,6 +31,7 @@ FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functi
 SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
 CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
+LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
@@ -87,27 +88,31 @@ class Run:
         self.tolerances[common.LEAST] = least_tolerance(rtol, float(atol.min()))
         self.tolerances[common.ATOL :] = atol
         self.control = np.zeros(advance.N_CONTROL)
-        self.control[advance.SAFETY] = plan.safety
-        self.control[advance.FACTOR_MIN] = plan.factor_min
-        self.control[advance.FACTOR_MAX] = plan.factor_max
-        self.control[advance.EXPONENT] = plan.exponent
         self.control[advance.MAX_STEP] = np.inf
         self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
-        self.control[advance.LIMIT_START] = plan.limit_start
-        self.control[advance.LIMIT_FACTOR] = plan.limit_factor
-        self.control[advance.LIMIT_MEMORY] = plan.limit_memory
-        self.control[advance.SYMMETRIC] = plan.symmetric
-        self.control[advance.PREDICTIVE] = plan.predictive
-        self.control[advance.LEAST_ERROR] = plan.least_error
         self.control[advance.MAX_STEPS] = np.inf
         self.control[advance.BRIDGE] = 1.0
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.control[advance.MAX_ATTEMPTS] = max(1, first_chunk // max(1, system.n_q // SMALL))
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
-        self.clock[advance.H_LIMIT] = plan.limit_start
+        self._control_by(plan)
+        self.substituted = False  # whether another plan has taken over, for good
         self.crossings: list[float] = []  # times near which steps went across a singular position
         self._begin()
+
+    def _control_by(self, plan: Plan) -> None:
+        """Step-size control as a plan wants it."""
+        a, control = self.a, self.control
+        control[a.SAFETY], control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.safety, plan.factor_min, plan.factor_max
+        control[a.EXPONENT], control[a.PREDICTIVE], control[a.LEAST_ERROR] = (
+            plan.exponent,
+            plan.predictive,
+            plan.least_error,
+        )
+        control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
+        control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
+        self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
@@ -176,7 +181,13 @@ class Run:
         first = min(self._first_step(span) if first_step is None else first_step, span)
         self.clock[self.a.H_NEXT] = first
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
-        self.control[self.a.MAX_STEP] = max_step
+        self.max_step, self.gap = max_step, LONGEST_UNSEEN * span
+        self.tolerances[common.GAP] = self.gap
+        self._limit_steps()
+
+    def _limit_steps(self) -> None:
+        """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
+        self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
 
     def _first_step(self, span: float) -> float:
         """A share of the time in which the initial velocities and accelerations change the coordinates as a whole."""
@@ -260,6 +271,8 @@ class Run:
                 code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
+            if code == a.STEP_TOO_SMALL and self._substituted(t1):
+                plan, kit, code = self.plan, self.kit, a.PAUSED
             if code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
                 kit = common.Kit(self.functions, self.kit.general, plan.step)
@@ -335,7 +348,26 @@ class Run:
             return np.full(len(steps), intervals.ACROSS)
         if self.plan.apart:
             return np.full(len(steps), intervals.APART)
-        return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, intervals.ACCELERATIONS)
+        explicit = intervals.ACROSS if self.substituted else intervals.ACCELERATIONS
+        return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)
+
+    def _substituted(self, t1: float) -> bool:
+        """Whether the plan that goes on where values of this one are not finite has taken over."""
+        substitute = self.plan.substitute
+        if substitute is None or int(self.clock[self.a.FAILURE_CODE]) != common.NOT_FINITE:
+            return False
+        t, n = float(self.clock[self.a.T]), self.system.n_q
+        self.plan = replace(substitute, inner=self.plan.inner)
+        self.kit = kit_of(self.system, t, self.state[:n], self.plan)
+        self.memory = self.plan.memory.copy()
+        self.substituted = True
+        self._control_by(self.plan)
+        self._limit_steps()
+        clock = self.clock
+        clock[self.a.FAILURE_CODE] = common.DONE
+        clock[self.a.H_NEXT] = min(self._first_step(t1 - t), t1 - t)
+        clock[self.a.H_BEFORE] = clock[self.a.ERROR_BEFORE] = 0.0
+        return True
 
     def _bridge(self) -> tuple[Plan, Array]:
         """The plan and the controls for steps across a singular position, see kernels/bridge.py."""
@@ -349,6 +381,8 @@ class Run:
         control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
         control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.factor_min, plan.factor_max
         control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+        if control[a.FIXED_STEP] == 0.0:
+            control[a.MAX_STEP] = min(self.max_step, self.gap)
         clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
         self.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
         clock[a.H_NEXT] = self.lengths.pop(0)

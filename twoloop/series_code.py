@@ -332,7 +332,7 @@ class CompiledSeries(NamedTuple):
 
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
-        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order)
+        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order) + n
 
 
 _COMPILED: dict[str, CompiledSeries] = {}  # by their digests

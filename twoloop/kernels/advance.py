@@ -16,15 +16,18 @@ from twoloop.kernels.calls import (
 from twoloop.kernels.common import (
     AUGMENTED,
     BY_GENERAL,
+    DEFECT,
     DEPARTURE,
     DONE,
     EXPLICIT_STEP,
     FAULT_KIND,
     FORM,
     GAMMA_GIVEN,
+    GAP,
     INNER_DIVERGED,
     INTEGERS,
     KIT,
+    LARGEST_DEFECT,
     MATRIX,
     N_ACCEPTED,
     N_JACOBIANS,
@@ -41,7 +44,9 @@ from twoloop.kernels.common import (
     SINGULAR,
     STEP_FACTOR,
     STRAIGHT,
+    UNCHECKED,
     VECTOR,
+    WIDEST_GAP,
     WORK,
     f8,
     i8,
@@ -221,6 +226,7 @@ def advance(
         if clock[FAILURE_CODE] == DONE:
             w.notes[FAULT_KIND] = -1.0
         w.notes[STEP_FACTOR] = 0.0
+        w.notes[DEFECT] = -1.0
         code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
             code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
@@ -278,6 +284,12 @@ def advance(
             clock[H_FAILED] = size
             return ROWS_VIOLATED
         w.counters[N_ACCEPTED] += 1
+        if w.notes[DEFECT] >= 0.0:
+            w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
+        else:
+            w.notes[UNCHECKED] += 1.0
+        gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
+        w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
         clock[H_LONG] = max(size, FADING * clock[H_LONG])
         clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
         clock[N_FIXED] += in_grid

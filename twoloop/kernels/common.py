@@ -157,8 +157,12 @@ def _type_of_work(value: Any, context: Any) -> Any:
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step
+    DEFECT,  # largest that this attempt found of itself, over what the tolerances allow; -1: it did not look
+    LARGEST_DEFECT,  # of the accepted steps
+    UNCHECKED,  # accepted steps that did not look
+    WIDEST_GAP,  # between two places at which accepted steps looked at the equations, s
     N_NOTES,
-) = range(25)
+) = range(29)
 
 # what a kernel returns: DONE, or why it could not
 (
@@ -221,9 +225,10 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance; from
-# ATOL on stands the absolute tolerance of each coordinate and its velocity
-RTOL, ESTIMATE, LEAST, ATOL = range(4)
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP the
+# time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of each
+# coordinate and its velocity
+RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
 
 
 @cache
