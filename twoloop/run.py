@@ -325,8 +325,15 @@ class Run:
             t_events=t_events,
             q_events=q_events,
             v_events=v_events,
+            defect=self._defect(),
+            widest_gap=float(self.work.notes[common.WIDEST_GAP]),
             system=system,
         )
+
+    def _defect(self) -> float | None:
+        """The largest defect of the steps, if all looked for it."""
+        checked = self.work.counters[common.N_ACCEPTED] > 0 and self.work.notes[common.UNCHECKED] == 0.0
+        return float(self.work.notes[common.LARGEST_DEFECT]) if checked else None
 
     def _buffers(self) -> tuple[Array, Array, Array]:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
@@ -553,10 +560,13 @@ class Run:
             found = not_finite(self.system, instant, q, v)
             if found is not None:
                 return f"{found} at t = {instant:.10g}"
-        return (
-            "the state became larger than floating-point numbers can be, or a callback returned a value that is not "
-            "finite at a state within the step; none does at its start"
-        )
+        if self.plan.looks_within:
+            return (
+                "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "
+                "no derivatives at this state (a root of zero, a norm of zero velocity), or its argument is too large "
+                "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
+            )
+        return "the callbacks are finite at the start of the step, but not at a state within it"
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns

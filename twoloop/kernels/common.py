@@ -225,8 +225,8 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP the
-# time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of each
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP
+# the time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of each
 # coordinate and its velocity
 RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
 

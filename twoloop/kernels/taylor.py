@@ -64,7 +64,7 @@ from twoloop.kernels.series import (
 ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
 ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
 LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
-NEAR_BEGIN = 0.01  # of the step
+NEAR_BEGIN = 1e-5  # of the step: no force changes within it
 GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly between 0 and 1
 MOST_SHORTENED = 0.1  # a step that is refused for its defect
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
