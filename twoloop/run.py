@@ -112,6 +112,7 @@ class Run:
         )
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
+        control[a.GIVES_WAY] = plan.substitute is not None
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
@@ -271,8 +272,9 @@ class Run:
                 code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
-            if code == a.STEP_TOO_SMALL and self._substituted(t1):
-                plan, kit, code = self.plan, self.kit, a.PAUSED
+            if code == a.HAS_TO_GIVE_WAY:
+                self._give_way()
+                plan, control, kit, code = self.plan, self.control, self.kit, a.PAUSED
             if code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
                 kit = common.Kit(self.functions, self.kit.general, plan.step)
@@ -358,23 +360,19 @@ class Run:
         explicit = intervals.ACROSS if self.substituted else intervals.ACCELERATIONS
         return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)
 
-    def _substituted(self, t1: float) -> bool:
-        """Whether the plan that goes on where values of this one are not finite has taken over."""
-        substitute = self.plan.substitute
-        if substitute is None or int(self.clock[self.a.FAILURE_CODE]) != common.NOT_FINITE:
-            return False
+    def _give_way(self) -> None:
+        """Go on with the plan that takes over where values of this one are not finite."""
+        assert self.plan.substitute is not None
         t, n = float(self.clock[self.a.T]), self.system.n_q
-        self.plan = replace(substitute, inner=self.plan.inner)
+        self.plan = replace(self.plan.substitute, inner=self.plan.inner)
         self.kit = kit_of(self.system, t, self.state[:n], self.plan)
         self.memory = self.plan.memory.copy()
         self.substituted = True
         self._control_by(self.plan)
         self._limit_steps()
-        clock = self.clock
-        clock[self.a.FAILURE_CODE] = common.DONE
-        clock[self.a.H_NEXT] = min(self._first_step(t1 - t), t1 - t)
-        clock[self.a.H_BEFORE] = clock[self.a.ERROR_BEFORE] = 0.0
-        return True
+        self.clock[self.a.FAILURE_CODE] = common.DONE
+        self.clock[self.a.H_NEXT] = self.clock[self.a.H_FAILED]
+        self.clock[self.a.H_BEFORE] = self.clock[self.a.ERROR_BEFORE] = 0.0
 
     def _bridge(self) -> tuple[Plan, Array]:
         """The plan and the controls for steps across a singular position, see kernels/bridge.py."""
@@ -388,6 +386,7 @@ class Run:
         control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
         control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.factor_min, plan.factor_max
         control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+        control[a.GIVES_WAY] = 0.0
         if control[a.FIXED_STEP] == 0.0:
             control[a.MAX_STEP] = min(self.max_step, self.gap)
         clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0

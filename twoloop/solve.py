@@ -92,7 +92,9 @@ def solve_dae(
     first_step : float, optional
         First step to try, s. None: chosen from the velocities and accelerations at the start.
     max_step : float
-        Largest step, s. A force that acts for less than a step may be passed over unseen: give its duration.
+        Largest step, s. Methods that do not look at the equations between the ends and stages of their steps, all but
+        "Taylor", take none that is longer than a hundredth of the run in any case. A force that acts for a shorter time
+        than `result.widest_gap` may be passed over unseen: give its duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run whose steps have become a thousand times shorter
         than before, so that the rest would take more than ten million of them, ends with the status STAGNATED.

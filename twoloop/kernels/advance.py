@@ -67,7 +67,8 @@ from twoloop.kernels.partition import CHANGED, partition_is_poor
     MAX_STEPS_REACHED,
     ROWS_VIOLATED,
     NEAR_SINGULAR,
-) = range(8)
+    HAS_TO_GIVE_WAY,
+) = range(9)
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
@@ -97,8 +98,9 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
     BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
     SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
+    GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on
     N_CONTROL,
-) = range(18)
+) = range(19)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -242,6 +244,8 @@ def advance(
             w.counters[N_REJECTED_CONVERGENCE] += 1
             clock[FAILURE_CODE] = code
             clock[H_FAILED] = size
+            if code == NOT_FINITE and control[GIVES_WAY] == 1.0:
+                return HAS_TO_GIVE_WAY
             if fixed:
                 # the step keeps its size; only a partition that went bad within it may be the reason
                 if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
