@@ -98,6 +98,9 @@ class Interpolator:
         groups = np.empty((len(which), names.N_COLUMNS), dtype=np.int64)
         groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
         groups[:, names.KIND] = table.kinds[which]
+        jumps = np.flatnonzero(table.kinds == names.JUMP)
+        groups[:, names.LOW] = np.append(0, jumps + 1)[np.searchsorted(jumps, which)]
+        groups[:, names.HIGH] = np.append(jumps, len(table.t) - 1)[np.searchsorted(jumps, which)]
         groups[:, names.FIRST_TIME], groups[:, names.END_TIME] = first, np.append(first[1:], len(times))
         out = np.empty((len(times), 2 * self.system.n_q))
         failures = 0

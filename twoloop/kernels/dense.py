@@ -32,8 +32,11 @@ from twoloop.kernels.intervals import (
     END_TIME,
     FIRST_OWN,
     FIRST_TIME,
+    HIGH,
+    JUMP,
     KIND,
     LAST_OWN,
+    LOW,
     WINDOW,
 )
 from twoloop.kernels.linalg import copy
@@ -43,12 +46,12 @@ TABLE = types.int64[:, ::1]
 
 
 @merged
-def _window(n, i, last):
-    """First and last of the n rows that the polynomial of the interval from row i goes through: centred but at ends."""
+def _window(low, high, i, last):
+    """First and last of the rows that the polynomial of the interval from row i goes through: centred but at ends."""
     if last > i + 1:  # the interval has states of its own
         return i, last
-    size = min(WINDOW, n)
-    lo = max(0, min(i + 1 - size // 2, n - size))
+    size = min(WINDOW, high - low + 1)
+    lo = max(low, min(i + 1 - size // 2, high + 1 - size))
     return lo, lo + size - 1
 
 
@@ -111,7 +114,7 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
         h = t[last] - t[i]
-        lo, hi = _window(t.size, i, last)
+        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
         order = 3 if kind >= ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
@@ -121,6 +124,9 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
             q, v = out[p, :n], out[p, n : 2 * n]
             if times[p] == t[i] or times[p] == t[last]:
                 copy(states[i if times[p] == t[i] else last, : 2 * n], out[p])
+                continue
+            if kind == JUMP:
+                copy(states[i, : 2 * n], out[p])
                 continue
             s = (times[p] - t[i]) / h
             _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
