@@ -19,7 +19,6 @@ ROUNDING = 1e-12  # of C_t: what its eighth difference may be for rounding's sak
 BY_TIME = 300.0  # the same, times the rounding of t and the slope
 STEEP = 4.0  # times the mean slope over the step: a ramp that the step is too long for, unless it is at most ...
 SHORT = 0.125  # ... this share of it
-NARROW = 0.1  # of the tolerances of positions: what they change by within a ramp that is as good as a jump
 NEAREST = 8.0  # spacings of floating-point numbers: no interval is halved below this length
 SMOOTH, RAMP, JUMP = range(3)
 
@@ -77,7 +76,7 @@ def unexplained(tolerances, h, state, new_state, n):
 @compiled
 def find_kink(f, w, t, end, q, v, way, tolerances):
     """SMOOTH, RAMP or JUMP, and the interval in which the row that is least smooth rises, from t to `end`."""
-    begin, first, last = t, t, end
+    begin = t
     h = end - t
     _sample(f, w, t, q, way, begin, end)
     row, limit, mean, most = -1, 0.0, 0.0, 1.0
@@ -89,8 +88,7 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
             row, limit, mean, most = i, least, slope, bend / least
     if row < 0:
         return SMOOTH, t, end
-    moved = NARROW * _allowed(w, tolerances, q, row)
-    narrow = False
+    steepest, low, high = 0.0, begin, end
     for _ in range(HALVINGS):
         if end - begin <= NEAREST * np.spacing(abs(end)):
             break
@@ -106,16 +104,11 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
             _sample(f, w, t, q, way, begin, end)
         else:
             end = middle
-        rise = abs(w.rates[PARTS, row] - w.rates[0, row])
-        if rise > limit and (rise * (end - begin) <= moved or narrow):
-            narrow = True
-            first, last = begin, end
-    _sample(f, w, t, q, way, begin, end)
-    rise = abs(w.rates[PARTS, row] - w.rates[0, row])
-    if narrow:
-        return JUMP, first, last
-    if rise > limit and end - begin <= NEAREST * np.spacing(abs(end)):
-        return JUMP, begin, end
-    slope, _ = _slope_and_size(w, row, end - begin)
-    steep = rise > limit and end - begin <= SHORT * h and slope > STEEP * mean
-    return (RAMP if steep else SMOOTH), begin, end
+        slope, _ = _slope_and_size(w, row, end - begin)
+        if slope > steepest and end - begin <= SHORT * h and slope * (end - begin) > limit:
+            steepest, low, high = slope, begin, end
+    if end - begin <= NEAREST * np.spacing(abs(end)):
+        _sample(f, w, t, q, way, begin, end)
+        if abs(w.rates[PARTS, row] - w.rates[0, row]) > limit:
+            return JUMP, begin, end
+    return (RAMP if steepest > STEEP * mean else SMOOTH), low, high
