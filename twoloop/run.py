@@ -333,7 +333,8 @@ class Run:
         n, interpolator = self.system.n_q, None
         if wanted.between_steps:
             ranks = (len(self.work.rows), len(self.work.rows_v))
-            interpolator = Interpolator(self.system, self.t0, self.state[: 3 * n], self.rtol, ranks, self.interiors)
+            start, atol = self.state[: 3 * n], self.tolerances[common.ATOL :]
+            interpolator = Interpolator(self.system, self.t0, start, self.rtol, atol, ranks, self.interiors)
         return Recorder(wanted, interpolator, n, self.t0, self.state)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:

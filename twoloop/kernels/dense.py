@@ -9,6 +9,7 @@ from numba import types
 
 from twoloop.kernels.calls import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.common import (
+    ATOL,
     DONE,
     FORM,
     GAMMA_INACCURATE,
@@ -17,6 +18,7 @@ from twoloop.kernels.common import (
     KIT,
     MATRIX,
     NULL_SPACE,
+    RTOL,
     SINGULAR,
     VECTOR,
     WORK,
@@ -37,12 +39,15 @@ from twoloop.kernels.intervals import (
     KIND,
     LAST_OWN,
     LOW,
+    VELOCITIES,
     WINDOW,
 )
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.partition import partition_is_poor
 
 TABLE = types.int64[:, ::1]
+PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
+LOOKS = len(PLACES)
 
 
 @merged
@@ -143,6 +148,95 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
                 failures += 1
                 _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
     return failures
+
+
+@merged
+def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
+    """Largest difference of two states, in positions and velocities, over the tolerances."""
+    n = q.size
+    rtol, largest = tolerances[RTOL], 0.0
+    for m in range(n):
+        atol = tolerances[ATOL + m]
+        largest = max(largest, scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m])))
+        largest = max(largest, scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m])))
+    return largest
+
+
+@merged
+def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
+    """The accelerations that the polynomials have, into `a`."""
+    for m in range(a.size):
+        value, slope, bend = c[size - 1, m], 0.0, 0.0
+        for r in range(size - 2, -1, -1):
+            bend = bend * (s - z[r]) + 2.0 * slope
+            slope = slope * (s - z[r]) + value
+            value = value * (s - z[r]) + c[r, m]
+        a[m] = bend / (h * h)
+    if kind == APART:
+        for m in range(a.size):
+            value, slope = c_v[size_v - 1, m], 0.0
+            for r in range(size_v - 2, -1, -1):
+                slope = slope * (s - z_v[r]) + value
+                value = value * (s - z_v[r]) + c_v[r, m]
+            a[m] = slope / h
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
+def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
+    """How far the polynomials of these intervals are off, over the tolerances, into `out`; 0 where that is soon seen.
+
+    Where its last node changes a polynomial by less than the tolerances, it is taken as it is. Else it is held against
+    the constraints and the equations, at places within the interval: what its accelerations are off, times the time in
+    which a polynomial of its degree can turn, is off in velocity. Accelerations that hold the noise of stiff modes say
+    nothing; of those the change by the last node counts alone.
+    """
+    n = w.Q.size
+    half = z.size // 2
+    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    q, v, q_1, v_1 = rows[0, :n], rows[0, n:], rows[1, :n], rows[1, n:]
+    for g in range(groups.shape[0]):
+        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        h = t[last] - t[i]
+        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
+        order = 3 if kind >= ACCELERATIONS else 2
+        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        out[g] = 0.0
+        if hi - lo > 1:
+            for k in range(LOOKS):
+                s = PLACES[k]
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                shorter = size_v - 2 if kind == APART else 0
+                _interpolate(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
+                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
+            if out[g] <= 1.0 or kind == VELOCITIES:
+                continue
+        out[g] = 0.0
+        for k in range(LOOKS):
+            s = PLACES[k]
+            time = t[i] + s * h
+            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            _slope_of_velocity(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
+            copy(rows[0], rows[2])
+            code = renew_partition(f, w, t[i], states[i, :n])
+            if code == DONE:
+                code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+            if code != DONE:
+                copy(rows[0], rows[2])
+                code = renew_partition(f, w, time, q)
+                if code == DONE:
+                    code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+            if code == DONE:
+                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
+                code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)
+            if code != DONE:
+                out[g] = np.inf
+                break
+            turn = h / size
+            out[g] = max(out[g], _off(tolerances, turn * turn, turn, states, i, v_1, v_1, q_1, q_1))
+        if not np.isfinite(out[g]):
+            out[g] = np.inf
+    return DONE
 
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
