@@ -124,8 +124,10 @@ class Interpolator:
         return out
 
     def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
-        arrays = (np.ascontiguousarray(groups), times, self.nodes, self.room, out)
-        return int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, table.t, table.states, *arrays))
+        known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+        return int(
+            direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, times, self.nodes, self.room, out)
+        )
 
     def _settle(self, table: Table, groups: Groups) -> None:
         """See to it that each interval has interior states, or is known to need none."""
@@ -142,18 +144,19 @@ class Interpolator:
         for kind, plan in self.plans.items():
             of_kind = groups[:, names.KIND] == kind
             self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, names.FIRST_OWN]))
-        begins = table.t[groups[:, names.FIRST_OWN]]
-        groups = groups[[t not in self.filled for t in begins.tolist()]]
-        off = self._judged(table, groups)
-        self.sound.update(table.t[groups[off <= OFF, names.FIRST_OWN]].tolist())
-        for group, worst in zip(groups[~(off <= OFF)], off[~(off <= OFF)].tolist(), strict=True):
-            self._mend(table, group, worst)
+        inner = np.array([t in self.filled for t in table.t[groups[:, names.FIRST_OWN]].tolist()], dtype=bool)
+        divided, own, rest = self._divided(table, groups)
+        off = np.zeros(len(groups))
+        off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
+        self.sound.update(table.t[groups[~inner & (off <= OFF), names.FIRST_OWN]].tolist())
+        for k in np.flatnonzero(~(off <= OFF)):
+            self._mend(table, groups[k], float(off[k]))
 
     def _judged(self, table: Table, groups: Groups) -> Array:
         """How far the polynomials of these intervals are off, over the tolerances."""
         out = np.zeros(len(groups))
-        arrays = (table.t, table.states, np.ascontiguousarray(groups), self.nodes, self.room, self.rows, out)
-        direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, self.tolerances, *arrays)
+        arrays = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups), self.nodes, self.room, self.rows, out)
+        direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
     def _mend(self, table: Table, group: Groups, worst: float) -> None:

@@ -48,6 +48,8 @@ from twoloop.kernels.partition import partition_is_poor
 TABLE = types.int64[:, ::1]
 PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
 LOOKS = len(PLACES)
+EPS = 2.0**-52
+NOISY = 10.0  # of the tolerances of velocities
 
 
 @merged
@@ -105,8 +107,19 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
             v[m] = value + states[i, n + m]
 
 
-@kernel(i8(KIT, WORK, f8, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
-def between(f, w, tolerance, t, states, groups, times, z, room, out):
+@merged
+def _kind(kind, tolerances, h, states, i):
+    """APART also where an interval is so short that rounding of q is more than the tolerances of its slope."""
+    n = tolerances.size - ATOL
+    for m in range(n):
+        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
+        if EPS * abs(states[i, m]) > NOISY * h * (atol + rtol * abs(states[i, n + m])):
+            return APART
+    return kind
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
+def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
     """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found.
 
     There q and v are those of the polynomials. `z` and `room` hold nodes and coefficients of two polynomials.
@@ -119,6 +132,7 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
         h = t[last] - t[i]
+        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
         lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
         order = 3 if kind >= ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
@@ -197,6 +211,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
         h = t[last] - t[i]
+        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
         lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
         order = 3 if kind >= ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
