@@ -38,6 +38,7 @@ class Status(IntEnum):
     WRONG_DERIVATIVE = -9
     TIME_LIMIT = -10
     ROWS_CONTRADICT = -11
+    RATE_JUMPS = -12
 
 
 MEANINGS: dict[Status, str] = {
@@ -54,6 +55,7 @@ MEANINGS: dict[Status, str] = {
     Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong at a state of the run",
     Status.TIME_LIMIT: "the run reached its time_limit",
     Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
+    Status.RATE_JUMPS: "constraint_rate jumps, and no impulse gives velocities that the constraints allow",
 }
 
 

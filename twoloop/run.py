@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
 from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
+from twoloop.impulse import beyond_jump
 from twoloop.kernels import common, intervals
 from twoloop.linking import direct
 from twoloop.plan import Plan, least_tolerance
@@ -92,13 +93,17 @@ class Run:
         self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[advance.MAX_STEPS] = np.inf
         self.control[advance.BRIDGE] = 1.0
+        rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
+        self.control[advance.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
         self._control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
+        self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
         self.crossings: list[float] = []  # times near which steps went across a singular position
+        self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self._begin()
 
     def _control_by(self, plan: Plan) -> None:
@@ -179,7 +184,7 @@ class Run:
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""
         span = t1 - self.t0
-        first = min(self._first_step(span) if first_step is None else first_step, span)
+        first = min(self._first_step(span, self.state) if first_step is None else first_step, span)
         self.clock[self.a.H_NEXT] = first
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
         self.max_step, self.gap = max_step, LONGEST_UNSEEN * span
@@ -190,10 +195,10 @@ class Run:
         """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
         self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
 
-    def _first_step(self, span: float) -> float:
-        """A share of the time in which the initial velocities and accelerations change the coordinates as a whole."""
+    def _first_step(self, span: float, state: Array) -> float:
+        """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
-        q, v, a = (float(np.abs(self.state[k * n : (k + 1) * n]).max()) for k in range(3))
+        q, v, a = (float(np.abs(state[k * n : (k + 1) * n]).max()) for k in range(3))
         q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
         scales = [span]
         if v > 0.0:
@@ -227,7 +232,7 @@ class Run:
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
         while code == a.PAUSED:
-            across = plan is not self.plan
+            across, leaps = plan is not self.plan, self.clock[a.LEAPS] == 1.0
             self.control[a.MAX_ATTEMPTS] = min(self.chunk, max(0, next_look - self._attempts()))
             began = time.process_time()
             try:
@@ -257,7 +262,7 @@ class Run:
             if sparse:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             step_parts.append(steps)
-            kinds = self._kinds(steps, across) if wanted.between_steps else NO_KINDS
+            kinds = self._kinds(steps, across, leaps) if wanted.between_steps else NO_KINDS
             recorder.add(t, rows, kinds)
             spent = time.process_time() - began
             cpu += spent
@@ -282,7 +287,9 @@ class Run:
             if code == a.HAS_TO_GIVE_WAY:
                 self._give_way()
                 plan, control, kit, code = self.plan, self.control, self.kit, a.PAUSED
-            if code == a.NEAR_SINGULAR:
+            elif code == a.AT_JUMP and not across and self._leap(t1):
+                code = a.PAUSED
+            elif code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
                 kit = common.Kit(self.functions, self.kit.general, plan.step)
                 code = a.PAUSED
@@ -354,11 +361,14 @@ class Run:
         n, interpolator = self.system.n_q, None
         if wanted.between_steps:
             ranks = (len(self.work.rows), len(self.work.rows_v))
-            interpolator = Interpolator(self.system, self.t0, self.state[: 3 * n], self.rtol, ranks, self.interiors)
+            start, atol = self.state[: 3 * n], self.tolerances[common.ATOL :]
+            interpolator = Interpolator(self.system, self.t0, start, self.rtol, atol, ranks, self.interiors)
         return Recorder(wanted, interpolator, n, self.t0, self.state)
 
-    def _kinds(self, steps: Array, across: bool) -> NDArray[np.int64]:
+    def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""
+        if leaps:
+            return np.full(len(steps), intervals.JUMP)
         if across:
             return np.full(len(steps), intervals.ACROSS)
         if self.plan.apart:
@@ -417,15 +427,36 @@ class Run:
         self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
         return self.plan, self.control, a.PAUSED
 
-    def _crossed(self) -> str:
-        """What a run that succeeded has to say of singular positions."""
-        if not self.crossings:
-            return ""
-        times = ", ".join(f"{t:.4g}" for t in self.crossings[:3]) + (", ..." if len(self.crossings) > 3 else "")
-        return (
-            f" Near t = {times} steps went across positions where the constraints lose rank: beyond these, errors may "
-            "exceed the tolerances."
-        )
+    def _leap(self, t1: float) -> bool:
+        """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
+        a, clock, n = self.a, self.clock, self.system.n_q
+        end = float(clock[a.JUMP_TO])
+        beyond = beyond_jump(self.system, end, self.state[:n], self.state[n : 2 * n])
+        if beyond is None:
+            return False
+        self.new_state[: 2 * n] = beyond
+        self.work.notes[common.KINK_BEFORE], self.work.notes[common.KINK_AFTER] = end, np.inf
+        if a.start(self.kit, self.work, end, self.new_state) != common.DONE:
+            return False
+        self.jumps.append(end)
+        self.plan.memory[:] = self.memory
+        clock[a.LEAPS] = 1.0
+        clock[a.H_LIMIT], clock[a.LIMIT_AGE] = self.plan.limit_start, 0.0
+        if end < t1:
+            clock[a.H_NEXT] = min(clock[a.H_NEXT], self._first_step(t1 - end, self.new_state))
+        return True
+
+    def _said_of_events(self) -> str:
+        """What a run that succeeded has to say of jumps and of singular positions."""
+        said = ""
+        if self.jumps:
+            said = f" At t = {_times(self.jumps)} C_t or b jumps: velocities changed there as by an impulse."
+        if self.crossings:
+            said += (
+                f" Near t = {_times(self.crossings)} steps went across positions where the constraints lose rank: "
+                "beyond these, errors may exceed the tolerances."
+            )
+        return said
 
     def _attempts(self) -> int:
         """How many steps were tried so far."""
@@ -454,7 +485,7 @@ class Run:
         failure = int(self.clock[a.FAILURE_CODE])
         if code == a.ALL_OUTPUT_DONE:
             fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
-            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._crossed()}"
+            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._said_of_events()}"
         if code == INTERRUPTED:
             return (
                 Status.INTERRUPTED,
@@ -478,6 +509,12 @@ class Run:
                 f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
                 "singular position or a stiff force near this time, or take another method; with max_steps the run "
                 "goes on up to that number of steps.",
+            )
+        if code == a.AT_JUMP:
+            return (
+                Status.RATE_JUMPS,
+                f"{stopped}: constraint_rate or nonholonomic_rate jumps there, and no impulse gives velocities that "
+                "the constraints allow beyond it. Correct the drives, or end t_span before.",
             )
         if code == a.ROWS_VIOLATED:
             return Status.ROWS_CONTRADICT, self._contradiction()
@@ -577,6 +614,10 @@ class Run:
                 "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
             )
         return "the callbacks are finite at the start of the step, but not at a state within it"
+
+
+def _times(times: list[float]) -> str:
+    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns

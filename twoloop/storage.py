@@ -111,7 +111,9 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str
     t, states = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("sol_t", "sol_states"))
     table = Table(t, states, arrays["sol_kinds"])
     rank, rank_v = words["sol_ranks"]
-    interpolator = Interpolator(system, float(table.t[0]), table.states[0], words["sol_rtol"], (rank, rank_v))
+    rtol = words["sol_rtol"]
+    atol = np.full(system.n_q, rtol)
+    interpolator = Interpolator(system, float(table.t[0]), table.states[0], rtol, atol, (rank, rank_v))
     if "sol_interior_t" in arrays:
         interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])
     return DenseSolution(interpolator, table, words["sol_end"])
