@@ -181,13 +181,11 @@ class Interpolator:
         divided = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True) if here[0]]
         self.filled = {float(own_t[0]): (own_t, own) for own_t, own in divided}
 
-    def complete(self, times: Array, states: Array) -> Array:
-        """Rows [a, lam] at rows [q, v] on the constraints."""
-        out = np.empty((len(times), self.system.n_q + self.system.n_c + self.system.n_a))
+    def complete(self, times: Array, states: Array, out: Array) -> None:
+        """Fill rows [a, lam] at rows [q, v] on the constraints."""
         failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
         if failures > 0:
             _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
-        return out
 
 
 def _warn(what: str) -> None:
@@ -223,7 +221,10 @@ class DenseState:
 
     @cached_property
     def _completed(self) -> Array:
-        return self._interpolator.complete(np.atleast_1d(self.t)[self._order], self._rows)
+        system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
+        out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
+        self._interpolator.complete(times, self._rows, out)
+        return out
 
     @property
     def a(self) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
 from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
+from twoloop.interrupts import Interrupts
 from twoloop.kernels import common, intervals
 from twoloop.linking import direct
 from twoloop.plan import Plan, least_tolerance
@@ -192,7 +193,15 @@ class Run:
             scales.append(v / a)
         return FIRST_STEP * min(scales)
 
-    def go(self, t1: float, wanted: Wanted, report: Any, time_limit: float | None, check_derivatives: bool) -> Result:
+    def go(
+        self,
+        t1: float,
+        wanted: Wanted,
+        report: Any,
+        time_limit: float | None,
+        check_derivatives: bool,
+        interrupts: Interrupts,
+    ) -> Result:
         """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
         deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         a, system = self.a, self.system
@@ -208,7 +217,7 @@ class Run:
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
-        code = a.PAUSED
+        code = INTERRUPTED if interrupts.asked else a.PAUSED
         out_t, out_state, out_steps = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
@@ -235,7 +244,7 @@ class Run:
             except KeyboardInterrupt:
                 code = INTERRUPTED
             except Exception as error:  # of a callback; beyond a terminal event it does not matter
-                code, raised = INTERRUPTED, error
+                code, raised = INTERRUPTED, None if interrupts.asked else error
             n_rows, n_steps = filled.tolist()
             t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
             sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
@@ -260,6 +269,8 @@ class Run:
                 code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
+            if code == a.PAUSED and (interrupts.asked or recorder.interrupted):
+                code = INTERRUPTED
             if code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
                 kit = common.Kit(self.functions, self.kit.general, plan.step)
@@ -283,14 +294,23 @@ class Run:
                 steps[-1, a.H] = recorder.last_step
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
             statistics = replace(statistics, n_accepted=recorder.n_steps)
-        else:
-            status, message = self._outcome(code, t1, pace)
+        reached = float(self.clock[a.T])
+        if recorder.broken_off is not None:
+            reached, steps = recorder.broken_off, steps[: recorder.n_steps + 1]
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
         n = system.n_q
-        if check_derivatives and code != INTERRUPTED:
-            last = (float(self.clock[a.T]), self.state) if recorder.ended is None else (float(t[-1]), table[-1])
-            status, message = self._check_again(t, table, last, status, message)
-        if status in EXPLAINED_BY_STIFFNESS:
-            message += said_of_stiffness(looks, self.kit, self.work)
+        try:
+            if recorder.ended is None:
+                status, message = self._outcome(code, t1, pace)
+            if check_derivatives and code != INTERRUPTED:
+                last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
+                status, message = self._check_again(t, table, last, status, message)
+            if status in EXPLAINED_BY_STIFFNESS:
+                message += said_of_stiffness(looks, self.kit, self.work)
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        if interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+            status, message = Status.INTERRUPTED, _interrupted(reached, table)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
         t_events, q_events, v_events = recorder.events()
         return Result(
@@ -405,10 +425,7 @@ class Run:
             fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
             return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._crossed()}"
         if code == INTERRUPTED:
-            return (
-                Status.INTERRUPTED,
-                f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.",
-            )
+            return Status.INTERRUPTED, ""
         if code == a.MAX_STEPS_REACHED:
             return (
                 Status.MAX_STEPS,
@@ -526,6 +543,37 @@ class Run:
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
+
+
+def _interrupted(t: float, table: Array) -> str:
+    """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
+    gaps = int(np.isnan(table).any(axis=1).sum())
+    unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
+    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
+
+
+def not_begun(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Result:
+    """What is returned of a run that Ctrl-C ended before the accelerations at its start were known."""
+    n_q, none = system.n_q, np.zeros(0)
+    columns = np.zeros((n_q, 0))
+    found = None if events is None else [none for _ in events]
+    states = None if events is None else [np.zeros((0, n_q)) for _ in events]
+    return Result(
+        t=none,
+        q=columns,
+        v=columns.copy(),
+        a=columns.copy(),
+        lam=np.zeros((system.n_c + system.n_a, 0)),
+        h=none.copy(),
+        status=Status.INTERRUPTED,
+        message=_interrupted(t0, columns.T) + explained(Status.INTERRUPTED),
+        stats=Statistics(n_accepted=0),
+        t_events=found,
+        q_events=states,
+        v_events=states,
+        system=system,
+        method=method,
+    )
 
 
 class _Pace:
