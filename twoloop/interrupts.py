@@ -1,8 +1,8 @@
 """Ctrl-C during a run: it ends the run, which returns what it has, wherever the signal arrives.
 
 An exception that arises between any two instructions of Python finds arrays half written, and machine code between its
-calls of Python that knows no way out. So the signal raises `KeyboardInterrupt` only within the functions of a user, which
-may take long and from which every caller expects exceptions; elsewhere it is kept until the run looks for it.
+calls of Python that knows no way out. So the signal raises `KeyboardInterrupt` only within the functions of a user,
+which may take long and from which every caller expects exceptions; elsewhere it is kept until the run looks for it.
 """
 
 import signal

@@ -171,8 +171,8 @@ class ConstrainedSystem:
         if self._python is not None or self._returning:
             raise TypeError(
                 f"{self.name!r} has no parameters: it is made by from_python, whose functions take none. Make another "
-                "system of functions that enclose other numbers, or give callbacks made by @twoloop.callback, which get "
-                "the parameters as p"
+                "system of functions that enclose other numbers, or give callbacks made by @twoloop.callback, which "
+                "get the parameters as p"
             )
         p, known = _checked_parameters(parameters), self.functions.p
         if p.shape != known.shape:
