@@ -34,6 +34,18 @@ class Table(NamedTuple):
     kinds: NDArray[np.int64]  # see kernels/intervals.py
 
 
+def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
+    """Ranks of C_q, and of C_q and A, by which workspaces are made: the kernels rely on them."""
+    from twoloop.kernels import advance
+
+    kit = kit_of(system, t, q)
+    work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
+    state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
+    if advance.start(kit, work, t, state) != common.RANK_DIFFERS:
+        return system.n_c, system.n_c + system.n_a
+    return int(work.notes[common.RANK]), int(work.notes[common.RANK_V])
+
+
 class Interpolator:
     """Evaluates tables of states of one system; has a workspace of its own.
 

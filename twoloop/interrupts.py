@@ -10,8 +10,15 @@ import threading
 from types import FrameType, TracebackType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from twoloop.adapters import PythonFunctions
 from twoloop.events import Event
+from twoloop.result import Result, Statistics, Status, explained
+from twoloop.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
 
 CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
 IMPATIENCE = 3  # signals after which the next one raises at once, whatever is lost
@@ -55,3 +62,34 @@ def _within_a_users_function(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+def said_of_interrupt(t: float, table: Array) -> str:
+    """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
+    gaps = int(np.isnan(table).any(axis=1).sum())
+    unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
+    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
+
+
+def not_begun(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Result:
+    """What is returned of a run that Ctrl-C ended before the accelerations at its start were known."""
+    n_q, none = system.n_q, np.zeros(0)
+    columns = np.zeros((n_q, 0))
+    found = None if events is None else [none for _ in events]
+    states = None if events is None else [np.zeros((0, n_q)) for _ in events]
+    return Result(
+        t=none,
+        q=columns,
+        v=columns.copy(),
+        a=columns.copy(),
+        lam=np.zeros((system.n_c + system.n_a, 0)),
+        h=none.copy(),
+        status=Status.INTERRUPTED,
+        message=said_of_interrupt(t0, columns.T) + explained(Status.INTERRUPTED),
+        stats=Statistics(n_accepted=0),
+        t_events=found,
+        q_events=states,
+        v_events=states,
+        system=system,
+        method=method,
+    )

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
+from twoloop.crossings import said_of_crossings, singular_ratio
 from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
-from twoloop.interrupts import Interrupts
+from twoloop.interrupts import Interrupts, said_of_interrupt
 from twoloop.kernels import common, intervals
 from twoloop.linking import direct
 from twoloop.plan import Plan, least_tolerance
@@ -107,7 +108,7 @@ class Run:
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
         self.clock[advance.H_LIMIT] = plan.limit_start
-        self.crossings: list[float] = []  # times near which steps went across a singular position
+        self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self._begin()
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
@@ -310,7 +311,7 @@ class Run:
         except KeyboardInterrupt:
             code = INTERRUPTED
         if interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
-            status, message = Status.INTERRUPTED, _interrupted(reached, table)
+            status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
         t_events, q_events, v_events = recorder.events()
         return Result(
@@ -363,7 +364,7 @@ class Run:
         from twoloop.kernels import bridge
 
         a, clock = self.a, self.clock
-        self.crossings.append(float(clock[a.T]))
+        self.crossings.append([(float(clock[a.T]), self.state.copy())])
         plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
         control = self.control.copy()
         control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
@@ -387,19 +388,15 @@ class Run:
             return plan, control, code
         if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
             self.control[a.BRIDGE] = 0.0
+        self.crossings[-1].append((float(self.clock[a.T]), self.state.copy()))
         self.plan.memory[:] = self.memory
         self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
         return self.plan, self.control, a.PAUSED
 
     def _crossed(self) -> str:
         """What a run that succeeded has to say of singular positions."""
-        if not self.crossings:
-            return ""
-        times = ", ".join(f"{t:.4g}" for t in self.crossings[:3]) + (", ..." if len(self.crossings) > 3 else "")
-        return (
-            f" Near t = {times} steps went across positions where the constraints lose rank: beyond these, errors may "
-            "exceed the tolerances."
-        )
+        now = (float(self.clock[self.a.T]), self.state)
+        return said_of_crossings(self.system, self.crossings, now, self.rank)
 
     def _statistics(self, cpu: float) -> Statistics:
         c = self.work.counters
@@ -493,13 +490,12 @@ class Run:
 
     def _near_singular(self) -> str:
         """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
-        rows = self.system.rows(float(self.clock[self.a.T]), self.state[: self.system.n_q])
-        values = np.linalg.svd(rows, compute_uv=False)[: self.rank]
-        if len(values) == 0 or values[-1] > NEARLY_SINGULAR * values[0]:
+        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
+        if ratio > NEARLY_SINGULAR:
             return ""
         return (
             f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-            f"{values[-1] / values[0]:.1g} of the largest. No step led across: end t_span before, take another "
+            f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
             "method, or change the geometry. "
         )
 
@@ -543,37 +539,6 @@ class Run:
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
-
-
-def _interrupted(t: float, table: Array) -> str:
-    """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
-    gaps = int(np.isnan(table).any(axis=1).sum())
-    unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
-    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
-
-
-def not_begun(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Result:
-    """What is returned of a run that Ctrl-C ended before the accelerations at its start were known."""
-    n_q, none = system.n_q, np.zeros(0)
-    columns = np.zeros((n_q, 0))
-    found = None if events is None else [none for _ in events]
-    states = None if events is None else [np.zeros((0, n_q)) for _ in events]
-    return Result(
-        t=none,
-        q=columns,
-        v=columns.copy(),
-        a=columns.copy(),
-        lam=np.zeros((system.n_c + system.n_a, 0)),
-        h=none.copy(),
-        status=Status.INTERRUPTED,
-        message=_interrupted(t0, columns.T) + explained(Status.INTERRUPTED),
-        stats=Statistics(n_accepted=0),
-        t_events=found,
-        q_events=states,
-        v_events=states,
-        system=system,
-        method=method,
-    )
 
 
 class _Pace:

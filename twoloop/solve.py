@@ -22,13 +22,13 @@ from twoloop.checks import (
 )
 from twoloop.consistency import check_start, check_system
 from twoloop.events import check_events
-from twoloop.interrupts import Interrupts
+from twoloop.interrupts import Interrupts, not_begun
 from twoloop.kernels.intervals import ACCELERATIONS, VELOCITIES
 from twoloop.methods import PRESETS
 from twoloop.plan import Method
 from twoloop.recorder import Wanted
 from twoloop.result import Result
-from twoloop.run import Run, not_begun
+from twoloop.run import Run
 from twoloop.straight_code import own_code
 from twoloop.system import ConstrainedSystem
 

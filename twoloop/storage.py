@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks import shown
 from twoloop.consistency import check_system
-from twoloop.dense import DenseSolution, Interpolator, Table
+from twoloop.dense import DenseSolution, Interpolator, Table, ranks_at
 from twoloop.result import Result
 from twoloop.saved_fields import COUNTS, OF_EVENTS, STATES, Fields, check_sum
 from twoloop.system import ConstrainedSystem
@@ -129,12 +129,14 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str, Any]) -> DenseSolution:
     t, states = (np.ascontiguousarray(arrays[name]) for name in ("sol_t", "sol_states"))
     table = Table(t, states, arrays["sol_kinds"])
-    rank, rank_v = words["sol_ranks"]
-    if rank > system.n_c:
+    start, row, rtol = float(t[0]), states[0], words["sol_rtol"]
+    ranks = ranks_at(system, start, row[: system.n_q], row[system.n_q : 2 * system.n_q], rtol)
+    if words["sol_ranks"] != list(ranks):
         raise ValueError(
-            f"system must be the one that was solved, with n_c >= {rank}; {system.name!r} has {system.n_c}"
+            f"system must be the one that was solved: ranks of its constraints are {list(ranks)} at the start of the "
+            f"run; sol_ranks in the file are {words['sol_ranks']}"
         )
-    interpolator = Interpolator(system, float(table.t[0]), table.states[0], words["sol_rtol"], (rank, rank_v))
+    interpolator = Interpolator(system, start, row, rtol, ranks)
     if "sol_interior_t" in arrays:
         interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])
     return DenseSolution(interpolator, table, words["sol_end"])
