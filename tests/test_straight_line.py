@@ -356,10 +356,10 @@ def spring(t, q, v, p, Q):
 
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("method", ["DOP853", "Taylor"])
-def test_parameters_that_change_are_followed(method, compiled):
+def test_other_parameters_are_followed(method, compiled):
     system = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[1.0])
     for stiffness in (1.0, 4.0):
-        system.parameters[0] = stiffness
+        system = system.with_parameters([stiffness])
         result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], method, 1e-10, 1e-10, compiled=compiled)
         assert abs(result.q[0, -1] - math.cos(math.sqrt(stiffness))) < 1e-8
 

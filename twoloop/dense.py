@@ -38,6 +38,18 @@ class Table(NamedTuple):
     kinds: NDArray[np.int64]  # see kernels/intervals.py
 
 
+def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
+    """Ranks of C_q, and of C_q and A, by which workspaces are made: the kernels rely on them."""
+    from twoloop.kernels import advance
+
+    kit = kit_of(system, t, q)
+    work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
+    state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
+    if advance.start(kit, work, t, state) != common.RANK_DIFFERS:
+        return system.n_c, system.n_c + system.n_a
+    return int(work.notes[common.RANK]), int(work.notes[common.RANK_V])
+
+
 class Interpolator:
     """Evaluates tables of states of one system; has a workspace of its own.
 
@@ -247,13 +259,11 @@ class Interpolator:
         divided = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True) if here[0]]
         self.filled = {float(own_t[0]): (own_t, own) for own_t, own in divided}
 
-    def complete(self, times: Array, states: Array) -> Array:
-        """Rows [a, lam] at rows [q, v] on the constraints."""
-        out = np.empty((len(times), self.system.n_q + self.system.n_c + self.system.n_a))
+    def complete(self, times: Array, states: Array, out: Array) -> None:
+        """Fill rows [a, lam] at rows [q, v] on the constraints."""
         failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
         if failures > 0:
             _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
-        return out
 
 
 def _groups(table: Table, which: Groups) -> Groups:
@@ -301,7 +311,10 @@ class DenseState:
 
     @cached_property
     def _completed(self) -> Array:
-        return self._interpolator.complete(np.atleast_1d(self.t)[self._order], self._rows)
+        system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
+        out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
+        self._interpolator.complete(times, self._rows, out)
+        return out
 
     @property
     def a(self) -> Array:

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
+from twoloop.crossings import said_of_crossings, singular_ratio
 from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
 from twoloop.impulse import beyond_jump
+from twoloop.interrupts import Interrupts, said_of_interrupt
 from twoloop.kernels import common, intervals
 from twoloop.linking import direct
 from twoloop.plan import Plan, least_tolerance
@@ -102,7 +104,7 @@ class Run:
         self._control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
-        self.crossings: list[float] = []  # times near which steps went across a singular position
+        self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self._begin()
 
@@ -209,7 +211,15 @@ class Run:
             scales.append(v / a)
         return FIRST_STEP * min(scales)
 
-    def go(self, t1: float, wanted: Wanted, report: Any, time_limit: float | None, check_derivatives: bool) -> Result:
+    def go(
+        self,
+        t1: float,
+        wanted: Wanted,
+        report: Any,
+        time_limit: float | None,
+        check_derivatives: bool,
+        interrupts: Interrupts,
+    ) -> Result:
         """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
         deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         a, system = self.a, self.system
@@ -227,7 +237,7 @@ class Run:
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
-        code = a.PAUSED
+        code = INTERRUPTED if interrupts.asked else a.PAUSED
         out_t, out_state, out_steps = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
@@ -255,7 +265,7 @@ class Run:
             except KeyboardInterrupt:
                 code = INTERRUPTED
             except Exception as error:  # of a callback; beyond a terminal event it does not matter
-                code, raised = INTERRUPTED, error
+                code, raised = INTERRUPTED, None if interrupts.asked else error
             n_rows, n_steps = filled.tolist()
             t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
             sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
@@ -284,6 +294,8 @@ class Run:
                 out_t, out_state, out_steps = self._buffers()
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
+            if code == a.PAUSED and (interrupts.asked or recorder.interrupted):
+                code = INTERRUPTED
             if code == a.HAS_TO_GIVE_WAY:
                 self._give_way()
                 plan, control, kit, code = self.plan, self.control, self.kit, a.PAUSED
@@ -312,14 +324,23 @@ class Run:
                 steps[-1, a.H] = recorder.last_step
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
             statistics = replace(statistics, n_accepted=recorder.n_steps)
-        else:
-            status, message = self._outcome(code, t1, pace)
+        reached = float(self.clock[a.T])
+        if recorder.broken_off is not None:
+            reached, steps = recorder.broken_off, steps[: recorder.n_steps + 1]
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
         n = system.n_q
-        if check_derivatives and code != INTERRUPTED:
-            last = (float(self.clock[a.T]), self.state) if recorder.ended is None else (float(t[-1]), table[-1])
-            status, message = self._check_again(t, table, last, status, message)
-        if status in EXPLAINED_BY_STIFFNESS:
-            message += said_of_stiffness(looks, self.kit, self.work)
+        try:
+            if recorder.ended is None:
+                status, message = self._outcome(code, t1, pace)
+            if check_derivatives and code != INTERRUPTED:
+                last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
+                status, message = self._check_again(t, table, last, status, message)
+            if status in EXPLAINED_BY_STIFFNESS:
+                message += said_of_stiffness(looks, self.kit, self.work)
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        if interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+            status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
         t_events, q_events, v_events = recorder.events()
         return Result(
@@ -396,7 +417,7 @@ class Run:
         from twoloop.kernels import bridge
 
         a, clock = self.a, self.clock
-        self.crossings.append(float(clock[a.T]))
+        self.crossings.append([(float(clock[a.T]), self.state.copy())])
         plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
         control = self.control.copy()
         control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
@@ -423,6 +444,7 @@ class Run:
             return plan, control, code
         if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
             self.control[a.BRIDGE] = 0.0
+        self.crossings[-1].append((float(self.clock[a.T]), self.state.copy()))
         self.plan.memory[:] = self.memory
         self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
         return self.plan, self.control, a.PAUSED
@@ -451,12 +473,8 @@ class Run:
         said = ""
         if self.jumps:
             said = f" At t = {_times(self.jumps)} C_t or b jumps: velocities changed there as by an impulse."
-        if self.crossings:
-            said += (
-                f" Near t = {_times(self.crossings)} steps went across positions where the constraints lose rank: "
-                "beyond these, errors may exceed the tolerances."
-            )
-        return said
+        now = (float(self.clock[self.a.T]), self.state)
+        return said + said_of_crossings(self.system, self.crossings, now, self.rank)
 
     def _attempts(self) -> int:
         """How many steps were tried so far."""
@@ -487,10 +505,7 @@ class Run:
             fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
             return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._said_of_events()}"
         if code == INTERRUPTED:
-            return (
-                Status.INTERRUPTED,
-                f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.",
-            )
+            return Status.INTERRUPTED, ""
         if code == a.MAX_STEPS_REACHED:
             return (
                 Status.MAX_STEPS,
@@ -564,13 +579,12 @@ class Run:
 
     def _near_singular(self) -> str:
         """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
-        rows = self.system.rows(float(self.clock[self.a.T]), self.state[: self.system.n_q])
-        values = np.linalg.svd(rows, compute_uv=False)[: self.rank]
-        if len(values) == 0 or values[-1] > NEARLY_SINGULAR * values[0]:
+        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
+        if ratio > NEARLY_SINGULAR:
             return ""
         return (
             f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-            f"{values[-1] / values[0]:.1g} of the largest. No step led across: end t_span before, take another "
+            f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
             "method, or change the geometry. "
         )
 
