@@ -75,7 +75,16 @@ def compile_kept(
                 say_once(UNWRITABLE)
     dispatcher.compile(signature)
     dispatcher.disable_compile()
+    _N_MADE[0] += 1
     return dispatcher
+
+
+_N_MADE = [0]
+
+
+def n_made() -> int:
+    """How many functions this process has compiled, or read from the disk."""
+    return _N_MADE[0]
 
 
 def folder_of(package: types.ModuleType) -> Path | None:
@@ -221,11 +230,11 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
     names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
     """
-    code, enclosed = _Digest(), _Digest()
+    code, enclosed = Digest(), Digest()
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(_enclosed(function))
-    except _CannotBeWatched:
+    except CannotBeWatched:
         return None
     return code.hash.hexdigest(), enclosed.hash.hexdigest()
 
@@ -247,11 +256,11 @@ def _enclosed(function: Any) -> list[Any]:
     return [cell.cell_contents for cell in function.__closure__ or ()]
 
 
-class _CannotBeWatched(Exception):
+class CannotBeWatched(Exception):
     """A value that may change unseen."""
 
 
-class _Digest:
+class Digest:
     """A hash that takes values of many types, and follows functions to whatever they name."""
 
     def __init__(self) -> None:
@@ -260,6 +269,7 @@ class _Digest:
         self.seen: set[tuple[int, str]] = set()
 
     def add(self, value: Any) -> None:
+        """Add a value."""
         self.hash.update(f"<{type(value).__qualname__}>".encode())
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
             self.hash.update(repr(value).encode())
@@ -286,6 +296,7 @@ class _Digest:
             self._add_name(value)
 
     def add_function(self, function: Any, enclosed: bool = True) -> None:
+        """Add the code of a function, its defaults, and the values of the globals that it names."""
         outer, self.names = self.names, names_in(function.__code__)
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
@@ -316,7 +327,7 @@ class _Digest:
         if type(value) is np.ufunc:
             module, name = "numpy", value.__name__
         if module is None or name is None or not _of_library(module):
-            raise _CannotBeWatched
+            raise CannotBeWatched
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
