@@ -1,8 +1,10 @@
 """Rows of a sweep: kept ones are of the same functions, whatever their names, and none is lost, whatever a run does."""
 
+import gc
 import importlib
 import os
 import sys
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.problems import pendulum as bare_pendulum
-from twoloop import sweep, sweeps, workers
+from twoloop import ConstrainedSystem, callback, stage_code, straight_code, sweep, sweeps, workers
 from twoloop.digests import digest_of
 from twoloop.mechanisms import Problem
 
@@ -20,6 +22,29 @@ GRAVITY = 9.81
 TABLE = np.linspace(0.0, 1.0, 2000)  # its repr leaves most of it out
 QUICK = {"t_span": (0.0, 0.01), "check_derivatives": False}
 RUNS = [{"k": k} for k in range(6)]
+
+
+@callback("mass")
+def unit_mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = 1.0
+
+
+@callback("force")
+def weight(t, q, v, p, Q):
+    Q[1] = -p[0]
+
+
+@callback("constraint")
+def length(t, q, p, C):
+    C[0] = q[0] * q[0] + q[1] * q[1] - 1.0
+
+
+@callback("jacobian")
+def direction(t, q, p, Cq):
+    Cq[0, 0], Cq[0, 1] = 2.0 * q[0], 2.0 * q[1]
+
+
+COMPILED = {"mass": unit_mass, "force": weight, "constraint": length, "jacobian": direction}
 
 
 def swinging(k):
@@ -296,3 +321,31 @@ def test_a_worker_that_cannot_begin_is_an_error(monkeypatch):
     monkeypatch.setattr(sys.modules["__main__"], "fails_when_it_is_read", fails_when_it_is_read, raising=False)
     with pytest.raises(RuntimeError, match=r"ended with exit code 1 before its first run.*if __name__ == '__main__'"):
         sweep(fails_when_it_is_read, RUNS[:3], measure=plain, workers=1, **QUICK)
+
+
+# --- memory
+
+
+def swinging_under(gravity):
+    system = ConstrainedSystem(**COMPILED, n_q=2, n_c=1, parameters=[gravity])
+    return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
+
+
+def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
+    monkeypatch.setattr("twoloop.caches.MOST_HELD", 1)
+    held, made = [], straight_code.OwnCode
+
+    class Watched(made):
+        def __init__(self, equations):
+            super().__init__(equations)
+            held.append(weakref.ref(self.inner))
+            held.append(weakref.ref(self))
+
+    monkeypatch.setattr(straight_code, "OwnCode", Watched)
+    options = {"measure": plain, "parallel": "threads", "workers": 1, "compiled": True, "method": "DOP853", **QUICK}
+    rows = sweep(swinging_under, [{"gravity": 9.0 + k} for k in range(4)], **options)
+    assert set(rows["status"]) == {"REACHED_END"}, rows["message"].tolist()
+    assert len(held) == 8
+    gc.collect()
+    assert sum(each() is not None for each in held) <= 2
+    assert len(straight_code._INNER) == len(stage_code._COMPILED) == 1

@@ -31,7 +31,8 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that can be written"
 )
-MOST_KEPT = 500  # functions made for single mechanisms, of each kind
+MOST_KEPT = 500  # functions made for single mechanisms, of each kind, on disk ...
+MOST_HELD = 50  # ... and in memory; their machine code, some 50 kB, stays there as long as the process lives
 CHECKSUM = hashlib.sha256().digest_size
 
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
@@ -77,6 +78,15 @@ def compile_kept(
     dispatcher.disable_compile()
     _N_MADE[0] += 1
     return dispatcher
+
+
+class Newest(dict[str, Any]):
+    """What was made for single mechanisms, by digests: the newest MOST_HELD, as a sweep makes one for each run."""
+
+    def __setitem__(self, key: str, made: Any) -> None:
+        super().__setitem__(key, made)
+        for old in list(self)[:-MOST_HELD]:
+            self.pop(old, None)
 
 
 _N_MADE = [0]

@@ -10,7 +10,7 @@ from typing import Any
 
 from twoloop.caches import n_made
 
-RENEWED_AFTER = 100  # functions that a worker compiled or read: LLVM keeps some MB of each as long as the process lives
+RENEWED_AFTER = 150  # functions that a worker compiled or read: LLVM keeps some MB of each as long as the process lives
 LOOK_EVERY = 1.0  # s, at workers that say nothing: a process that one of them started may hold its connection open
 
 Task = Callable[[Any], Any]
