@@ -2,7 +2,7 @@
 
 Everything that touches numba's private parts is in this file. Numba watches the file in which a function stands, and
 nothing else: not the helpers in other files, and not the values of globals, which it freezes. It raises when no folder
-can be written and when a file is damaged.
+can be written and when a file is damaged, and runs what others have put into one.
 """
 
 import enum
@@ -14,6 +14,7 @@ import sys
 import types
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,17 @@ from typing import Any
 import numba
 import numpy as np
 from numba import njit
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import FunctionCache, NullCache, UserProvidedCacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import Type
 from numba.misc.appdirs import AppDirs
 
+from twoloop.ownership import make_own, own_folder, read_own, write_own
+
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
-    "that can be written"
+    "that you can write, and nobody else can"
 )
 MOST_KEPT = 500  # functions made for single mechanisms, of each kind, on disk ...
 MOST_HELD = 50  # ... and in memory; their machine code, some 50 kB, stays there as long as the process lives
@@ -106,7 +109,7 @@ def folder_of(package: types.ModuleType) -> Path | None:
     code = anything.__code__.replace(co_filename=str(package.__file__))
     anything.__code__ = code
     try:
-        return Path(FunctionCache(anything).cache_path)
+        return own_folder(Path(FunctionCache(anything).cache_path))
     except RuntimeError:
         return None
 
@@ -136,10 +139,15 @@ class _Cache(FunctionCache):
     def __init__(
         self, function: Callable[..., Any], stamp: str, key: str, announcement: str, folder: Path | None = None
     ):
+        chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+        if chosen:  # numba would make it as the umask has it
+            with suppress(OSError):
+                make_own(Path(chosen, UserProvidedCacheLocator.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
-        path = self._cache_path if folder is None else str(folder)
-        self._cache_file = _Files(path, self._impl.filename_base, (source, stamp), folder is not None)
+        own = own_folder(Path(self._cache_path)) if folder is None else folder
+        self._cache_path = str(own)
+        self._cache_file = _Files(own, self._impl.filename_base, (source, stamp), folder is not None)
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -162,14 +170,14 @@ class _Cache(FunctionCache):
 
 
 class _Files:
-    """The files of one function, one for each key, each behind its checksum.
+    """The files of one function, one for each key, each behind its checksum, and in the hands of the user alone.
 
     A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
     write at the same time may lead one function to the machine code of another.
     """
 
-    def __init__(self, folder: str, name: str, stamp: Any, limited: bool):
-        self.folder, self.name, self.limited = Path(folder), name, limited
+    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool):
+        self.folder, self.name, self.limited = folder, name, limited
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
@@ -177,9 +185,9 @@ class _Files:
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_own(self.folder)
         try:
-            unfinished.write_bytes(hashlib.sha256(content).digest() + content)
+            write_own(unfinished, hashlib.sha256(content).digest() + content)
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)
@@ -196,7 +204,7 @@ class _Files:
     def load(self, key: Any) -> Any:
         """What numba made for a key; None if it is missing."""
         try:
-            content = self._path(key).read_bytes()
+            content = read_own(self._path(key))
         except OSError:
             return None
         if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
@@ -222,10 +230,13 @@ def _written(path: Path) -> float:
 
 
 def sources_folder() -> Path:
-    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are."""
+    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are.
+
+    Where others can write there, it is a folder in which they cannot.
+    """
     chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
-    return Path(folder) / "equations"
+    return own_folder(Path(folder) / "equations")
 
 
 @cache
@@ -247,6 +258,14 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     except CannotBeWatched:
         return None
     return code.hash.hexdigest(), enclosed.hash.hexdigest()
+
+
+def helper(function: Callable[..., Any]) -> Any:
+    """A decorator for what compiled callbacks call: numba's, with our cache."""
+    dispatcher = njit(function)
+    dispatcher.enable_caching()
+    _take_over(dispatcher)
+    return dispatcher
 
 
 def _take_over(helper: Any) -> None:
