@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from twoloop.caches import names_in
+from twoloop.caches import names_in, of_library
 from twoloop.callbacks import KINDS
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+OWN = {"twoloop.bounds", "twoloop.tracing", "twoloop.calls_on_symbols"}
 MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
 
 
@@ -51,7 +52,7 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
         filled = ", ".join(f"{name} has shape {x.shape}" for (name, _), x in zip(KINDS[kind].outputs, out, strict=True))
         sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
         raise ValueError(
-            f"{kind} of {system.name!r} goes out of bounds: {error}{_place(error)}. {', '.join(sizes)}, p has "
+            f"{kind} of {system.name!r} goes out of bounds: {error}{place_of(error)}. {', '.join(sizes)}, p has "
             f"{p.size}, {filled} (n_q = {system.n_q}, n_c = {system.n_c})"
             + (". Give more `parameters`: it reads more of them than there are" if too_short else "")
         )
@@ -119,17 +120,22 @@ class Rewritten:
         self.known[id(helper)] = self.wrap(copy)  # before what it names, which may be itself
         for name in names & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
+        if function.__defaults__ is not None:
+            copy.__defaults__ = self.value(function.__defaults__, names)
         for cell, original in zip(cells, function.__closure__ or (), strict=True):
             cell.cell_contents = self.value(original.cell_contents, names)
 
 
-def _place(error: IndexError) -> str:
-    """Where in the source an error arose, where Python knows it."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
+def place_of(error: BaseException) -> str:
+    """The line of a callback in which an error arose, where Python knows it; its file, but for an index."""
+    trace, frames = error.__traceback__, []
+    while trace is not None:
+        module = trace.tb_frame.f_globals.get("__name__") or ""
+        if module not in OWN and not of_library(module):
+            frames.append((trace.tb_frame.f_code.co_filename, trace.tb_lineno))
         trace = trace.tb_next
-    if trace is None:
+    if not frames:
         return ""
-    file, line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
+    file, line = frames[-1]
     source = linecache.getline(file, line).strip()
-    return f", in `{source}` ({file}, line {line})" if source and file != __file__ else ""
+    return f", in `{source}` ({file}, line {line})" if source else ""

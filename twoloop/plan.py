@@ -49,6 +49,7 @@ class Plan:
     instead: Any = None
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
+    traced: tuple[Any, ...] = ()  # what the callbacks were traced to, where a step goes by that: see traced_values.py
     within_newton: "Plan | None" = None  # the same, parts included, of steps by Newton's method; None: not divided
 
 

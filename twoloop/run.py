@@ -20,6 +20,7 @@ from twoloop.recorder import Recorder, Wanted
 from twoloop.result import Result, Statistics, Status, explained
 from twoloop.stability import Looks, said_of_stiffness
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Sample
 from twoloop.workspace import kit_of, workspace
 
 Array = NDArray[np.float64]
@@ -208,6 +209,7 @@ class Run:
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
+        sample = Sample(self.t0, self.state[: 2 * system.n_q])
         code = a.PAUSED
         out_t, out_state, out_steps = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
@@ -238,6 +240,8 @@ class Run:
                 code, raised = INTERRUPTED, error
             n_rows, n_steps = filled.tolist()
             t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
+            sample.add(t, rows)
+            sample.add(self.clock[a.T : a.T + 1], self.state[None, :])
             sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
             if sparse:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
@@ -289,6 +293,12 @@ class Run:
         if check_derivatives and code != INTERRUPTED:
             last = (float(self.clock[a.T]), self.state) if recorder.ended is None else (float(t[-1]), table[-1])
             status, message = self._check_again(t, table, last, status, message)
+        if self.plan.traced and code != INTERRUPTED:
+            states = sample.up_to(float(self.clock[a.T] if recorder.ended is None else t[-1]))
+            for traced in self.plan.traced:
+                wrong = traced.wrong(system, states)
+                if wrong is not None:
+                    status, message = Status.WRONG_TRACE, f"In the run {wrong}. {message}"
         if status in EXPLAINED_BY_STIFFNESS:
             message += said_of_stiffness(looks, self.kit, self.work)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
