@@ -91,7 +91,7 @@ class Rewritten:
 
     def __init__(self, wrap: Callable[[types.FunctionType], Any]):
         self.wrap = wrap
-        self.known: dict[int, Any] = {}
+        self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
         """What stands in the place of a value; `names` are those in the code that names it."""
@@ -101,14 +101,18 @@ class Rewritten:
             return self.known[id(value)]
         if type(value) is tuple:
             return tuple(self.value(each, names) for each in value)
-        if isinstance(value, types.ModuleType):
-            helpers = {name: vars(value).get(name) for name in names}
-            helpers = {name: each for name, each in helpers.items() if isinstance(each, Dispatcher)}
-            if helpers and not value.__name__.startswith("numba"):
-                module = types.ModuleType(value.__name__)
-                vars(module).update(vars(value) | {name: self.value(each) for name, each in helpers.items()})
-                return module
+        if isinstance(value, types.ModuleType) and not of_library(value.__name__):
+            return self._module(value, names)
         return value
+
+    def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
+        """A copy of a module with other functions in the place of those of these names."""
+        key = (id(module), names)
+        if key not in self.known:
+            self.known[key] = copy = types.ModuleType(module.__name__)
+            vars(copy).update(vars(module))
+            vars(copy).update({name: self.value(vars(module)[name], names) for name in names & set(vars(module))})
+        return self.known[key]  # type: ignore[no-any-return]
 
     def _rewrite(self, helper: Any) -> None:
         function = getattr(helper, "py_func", helper)

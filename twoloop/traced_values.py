@@ -29,9 +29,10 @@ AROUND = 8  # states about the start
 AWAY = 0.3  # of the size of coordinates: how far these are from it
 EACH, MOST = 32, 64  # states of a part of a run, and of a run
 ENTRIES = 20_000  # of all callbacks at all states of a run, about: fewer states of large systems
+LOST = 16.0 * np.finfo(float).eps  # of the largest term of all entries: rounding of what operations cancel exactly
 CLEAR = 1e-6  # of the largest term: a smaller difference is no rounding of the callback's if it stays ...
-NEXT = 1e-13  # ... where the state changes by so little
-NEIGHBOURS = 6
+NEXT = 1e-7  # ... where the state changes by so little
+NEIGHBOURS = 12
 
 
 class Traced:
@@ -124,6 +125,8 @@ class Traced:
         for k, entry in np.argwhere(~same):
             kind = [place for place, (each, _) in enumerate(self.places) if each == self.places[entry][0]]
             size = np.nanmax(np.where(np.isfinite(bounds[:, kind]), bounds[:, kind], 0.0))
+            if off[k, entry] <= LOST * size:
+                continue
             if not off[k, entry] <= CLEAR * size or self._stays(system, states[k], int(entry)):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
@@ -151,8 +154,8 @@ class Traced:
 
     def _stays(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
         """Whether a difference is the same at neighbouring states, as rounding is not."""
-        signs = np.random.default_rng(5).choice((-1.0, 1.0), (NEIGHBOURS, len(state)))
-        _, called, traced, _ = self._both(system, state * (1.0 + NEXT * signs))
+        parts = np.random.default_rng(5).uniform(-1.0, 1.0, (NEIGHBOURS, len(state)))
+        _, called, traced, _ = self._both(system, state * (1.0 + NEXT * parts))
         off = (called - traced)[:, entry]
         return bool(np.abs(off).min() > 0.5 * np.abs(off).max() and np.abs(off.sum()) == np.abs(off).sum())
 
@@ -160,9 +163,10 @@ class Traced:
         kind, place = self.places[entry]
         where = place[0] if len(place) == 1 else tuple(place)
         return (
-            f"{kind} of {self.name!r} is not what was recorded of its operations: at t = {state[0]:.10g} entry {where} is "
-            f"{called:.9g}, and by these {traced:.9g}. It depends on more than its arguments (a variable outside that "
-            "changed after numba compiled it, random numbers, what it keeps from call to call), or branches unseen"
+            f"{kind} of {self.name!r} does not give what its operations give, which were recorded once: at t = "
+            f"{state[0]:.10g} entry {where} is {called:.9g}, and by these {traced:.9g}. It depends on more than its "
+            "arguments (a variable outside that changed after numba compiled it, random numbers, what it keeps from "
+            "call to call), or branches unseen"
         )
 
 

@@ -16,6 +16,8 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 LARGEST_POWER = 1024  # that is made of products
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
+CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
+
 
 class Untraceable(ValueError):
     """Raised for a callback that does not run on symbols; the text says why."""
@@ -247,14 +249,17 @@ class Form:
     def _branches(self, *_: Any) -> Any:
         self.graph.refuse(BRANCHES)
 
-    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __float__ = __int__ = __abs__ = _branches
+    def __float__(self) -> float:
+        self.graph.refuse(CONVERTS)
+
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _branches
     __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = _branches
     __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _branches  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         if self.graph.running:
             self.graph.refuse("it makes text of what depends on t, q or v")
-        return f"<symbol {self.key}>"
+        return "<a symbol of t, q or v, kept from where the callback ran on symbols>"
 
     def __format__(self, specification: str) -> str:
         return repr(self)
