@@ -109,9 +109,7 @@ class Auto:
         """Shown in messages and tables."""
         return "auto"
 
-    def for_system(
-        self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked
-    ) -> "Auto":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
         if code is not None and isinstance(self.few, DOP853):

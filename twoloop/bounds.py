@@ -45,7 +45,13 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
     if system.called_in_python or kind in system.within_bounds:
         return
     function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
-    error = _index_error(function, t, state, p, out)
+    changed: list[int] = []
+    error = _index_error(function, t, state, p, out, changed)
+    if changed:
+        names = " and ".join([*KINDS[kind].state, "p"][i] for i in changed)
+        raise ValueError(
+            f"{kind} of {system.name!r} must not change the arrays that it is given: it changes {names}. Copy first"
+        )
     if error is not None:
         longer = np.concatenate([p, np.ones(MANY)])
         too_short = _index_error(function, t, state, longer, out) is None
@@ -59,19 +65,24 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
     system.within_bounds.add(kind)
 
 
-def _index_error(function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array]) -> IndexError | None:
-    """The first index out of bounds, if there is one."""
+def _index_error(
+    function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array], changed: list[int] | None = None
+) -> IndexError | None:
+    """The first index out of bounds, if there is one. To `changed` goes which of `state` and `p` a callback changes."""
     for wrap in (_in_python, _with_bounds_checked):
+        given = [array.copy() for array in (*state, p)]
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                Rewritten(wrap).value(function)(
-                    t, *(array.copy() for array in state), p.copy(), *(array.copy() for array in out)
-                )
+                Rewritten(wrap).value(function)(t, *given, *(array.copy() for array in out))
         except IndexError as error:
             return error
         except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called
             continue
+        if changed is not None:
+            changed += [
+                i for i, (one, other) in enumerate(zip(given, (*state, p), strict=True)) if (one != other).any()
+            ]
         return None
     return None
 

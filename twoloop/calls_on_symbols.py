@@ -6,11 +6,11 @@ such as a global that is not what it was, `traced_values.py` finds by comparing 
 """
 
 import functools
+import math
 import types
 from collections.abc import Callable
 from typing import Any
 
-import math
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
@@ -47,9 +47,8 @@ def trace(function: Callable[..., Any], t: Form, *arguments: Any) -> Any:
     except Exception as error:  # what a callback makes of symbols is its own
         if not graph.refused:
             said = str(error).partition("\n")[0].replace("twoloop.tracing.Form", "symbol").replace("Form", "symbol")
-            raise Untraceable(
-                f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}{place_of(error)}"
-            ) from error
+            said = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}"
+            raise Untraceable(f"{said}{place_of(error)}") from error
     finally:
         graph.running = False
     if graph.refused:
@@ -78,9 +77,9 @@ class _Traced(Rewritten):
 
     def callback(self, function: Any) -> Any:
         """A callback that may be an object with a method to call it."""
-        call = getattr(type(function), "__call__", None)
-        if isinstance(call, types.FunctionType) and not isinstance(function, Dispatcher):
-            return types.MethodType(self.value(call), function)
+        own = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
+        if isinstance(own, types.FunctionType) and not isinstance(function, Dispatcher):
+            return types.MethodType(self.value(own), function)
         return self.value(function)
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:

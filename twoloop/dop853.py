@@ -70,9 +70,7 @@ class DOP853:
         """Shown in messages and tables."""
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
-    def for_system(
-        self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked
-    ) -> "DOP853":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "DOP853":
         """The method with what is compiled for this system."""
         return replace(self, code=code)
 

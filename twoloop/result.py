@@ -52,7 +52,7 @@ MEANINGS: dict[Status, str] = {
     Status.SOLVER_FAILED: "a solver of another project failed, or reached the time limit of its adapter",
     Status.INTERRUPTED: "the run was interrupted from the keyboard",
     Status.STAGNATED: "the steps became so short that the end is out of reach",
-    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong, or M is not symmetric, at a state of the run",
+    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong, or M not symmetric, at a state of the run",
     Status.TIME_LIMIT: "the run reached its time_limit",
     Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
     Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it",

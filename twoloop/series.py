@@ -152,13 +152,13 @@ def on_symbols(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[
         If it does not run on them.
     """
     out = np.full(shape, 0.0, dtype=object)
-    arguments = (t, *map(symbols, state))
+    arrays, p = [symbols(each) for each in state], system.parameters.copy()
     if 0 not in shape:
         try:
             if not system.called_in_python:
-                trace(getattr(system.functions, kind), *arguments, system.parameters, out)
+                trace(getattr(system.functions, kind), t, *arrays, p, out)
             elif kind in system.python_functions:
-                out = np.array(trace(system.python_functions[kind], *arguments), dtype=object)
+                out = np.array(trace(system.python_functions[kind], t, *arrays), dtype=object)
             out = as_forms(graph, out)
             if out.shape != shape:
                 raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")

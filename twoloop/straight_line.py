@@ -268,7 +268,9 @@ class StraightLine:
         for i, j in matrix:
             if (j, i) not in matrix:
                 name = self.system.name
-                raise Untraceable(f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, its entry {(i, j)} not")
+                raise Untraceable(
+                    f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
+                )
         for k in self.choice.added:
             places = [i for i in range(n) if not _is_zero(self.all_rows[k, i])]
             for i in places:

@@ -73,9 +73,7 @@ class Taylor:
         """Shown in messages and tables."""
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
-    def for_system(
-        self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked
-    ) -> "Taylor":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Taylor":
         """The method with the operations of this system, and with what is compiled for it.
 
         Raises

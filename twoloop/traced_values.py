@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.callbacks import KINDS as ALL_KINDS
 from twoloop.linking import direct
 from twoloop.scales import sizes
 from twoloop.system import ConstrainedSystem
@@ -61,11 +60,11 @@ class Traced:
         needed = graph.needed_by(results)
         node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         nothing = Form(graph, 0.0, {})
-        rows: list[Any] = [(kind, node[i], one, other) for i in needed for kind, one, other in [graph.operations[i]]]
-        rows += [(kernels.RESULT, k, form, None) for k, form in enumerate(results)]
+        rows: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
+        rows += [(kernels.RESULT, form, None, k) for k, form in enumerate(results)]
         terms: list[tuple[int, float]] = []
         program, constants = [], []
-        for kind, made, one, other in rows:
+        for kind, one, other, made in rows:
             begin = len(terms)
             other = nothing if other is None else other
             terms += [(node[i], c) for i, c in one.terms.items()]
@@ -203,9 +202,6 @@ def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
     generic = np.random.default_rng(6)
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
-    times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)
-    moved = [
-        np.concatenate([[t], q + AWAY * size * generic.uniform(-1.0, 1.0, len(q)), speed * generic.uniform(-1.0, 1.0, len(q))])
-        for t in times
-    ]
-    return np.array(moved)
+    times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)[:, None]
+    parts = generic.uniform(-1.0, 1.0, (2, AROUND, len(q)))
+    return np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])

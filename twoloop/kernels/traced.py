@@ -94,9 +94,7 @@ def _differences(called, traced, bounds):
 @kernel(
     i8(KIT, INTEGERS, INTEGERS, MATRIX, types.int64[:, ::1], INTEGERS, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
 )
-def compare(
-    f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds
-):
+def compare(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
     """What callbacks give at states [t, q, v] and what they were traced to, with bounds of rounding, a row a state.
 
     Returns how many numbers differ by more than SAME of the largest at these states and ROUNDED times the bound.
