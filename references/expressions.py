@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 
 from references.driver import check_system
 from twoloop.kernels.common import GAMMA_GIVEN
+from twoloop.series import on_symbols
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Traced
+from twoloop.tracing import Graph, Untraceable
 
 Array = NDArray[np.float64]
 Functions = Mapping[str, Callable[[Any], Any]]  # "sin", "cos", "sqrt" of the package
@@ -46,7 +49,8 @@ class Expressions:
     Raises
     ------
     NotSymbolic
-        If the callbacks are Python functions, Q_d is not given, or the mass stays singular with rows of C_q added.
+        If the callbacks are Python functions, Q_d is not given, they branch on t, q or v or give near the start what
+        their operations do not give, or the mass stays singular with rows of C_q added.
     """
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, v0: Array):
@@ -56,6 +60,7 @@ class Expressions:
         if system.n_c and not system.functions.flags[GAMMA_GIVEN]:
             raise NotSymbolic(f"{system.name!r} does not give Q_d (gamma)")
         self.system = system
+        self._check(t0, q0, v0)
         samples = _samples(system, t0, q0)
         self.rows = _independent_rows(samples[0][1])
         self.mass_pattern = np.any([M != 0.0 for M, _ in samples], axis=0)
@@ -63,6 +68,17 @@ class Expressions:
         self.added = _rows_for_mass(samples[0][0], samples[0][1][self.rows])
         self.pattern = self._matrix_pattern()
         self.order = _order(self.pattern, system.n_q)
+
+    def _check(self, t0: float, q0: Array, v0: Array) -> None:
+        """See that what the callbacks do with symbols is what they do with numbers."""
+        graph, n = Graph(), self.system.n_q
+        (t,), q, v = graph.inputs(1, False), graph.inputs(n, False), graph.inputs(n, True)
+        try:
+            for name, shape, state in _kinds(n, self.system.n_c, q, v):
+                on_symbols(self.system, graph, name, shape, t, *state)
+            Traced(self.system, graph).refuse(self.system, t0, t0 + 1.0, q0, v0)
+        except Untraceable as error:
+            raise NotSymbolic(str(error)) from error
 
     def _matrix_pattern(self) -> NDArray[np.bool_]:
         n, m = self.system.n_q, len(self.rows)
@@ -79,14 +95,7 @@ class Expressions:
         f, n, m = self.system.functions, self.system.n_q, self.system.n_c
         p, positions, velocities = [float(value) for value in f.p], _objects(q), _objects(v)
         made = SimpleNamespace()
-        for name, shape, state in (
-            ("mass", (n, n), (positions,)),
-            ("force", (n,), (positions, velocities)),
-            ("constraint", (m,), (positions,)),
-            ("jacobian", (m, n), (positions,)),
-            ("constraint_rate", (m,), (positions,)),
-            ("gamma", (m,), (positions, velocities)),
-        ):
+        for name, shape, state in _kinds(n, m, positions, velocities):
             out = np.full(shape, 0.0, dtype=object)
             if shape[0]:
                 try:
@@ -120,6 +129,18 @@ class Expressions:
                 if self.jacobian_pattern[k, i]:
                     right[i] = right[i] + Cq[k, i] * gamma[k]
         return _solved(matrix, [*right, *gamma], self.order)[:n]
+
+
+def _kinds(n: int, m: int, q: Any, v: Any) -> list[tuple[str, tuple[int, ...], tuple[Any, ...]]]:
+    """The callbacks that make the equations: name, shape, and what each depends on."""
+    return [
+        ("mass", (n, n), (q,)),
+        ("force", (n,), (q, v)),
+        ("constraint", (m,), (q,)),
+        ("jacobian", (m, n), (q,)),
+        ("constraint_rate", (m,), (q,)),
+        ("gamma", (m,), (q, v)),
+    ]
 
 
 def _objects(values: Sequence[Any]) -> NDArray[Any]:

@@ -29,6 +29,7 @@ def message(case: Case) -> str:
         text = re.sub(r"\s+", " ", str(error))
         text = re.sub(r" at 0x[0-9a-f]+", "", text)
         text = re.sub(r"'\S*/(run\.npz)'", r"'\1'", text)
+        text = re.sub(r", in `[^`]*` \([^()]*, line \d+\)", "", text)
         text = re.sub(r"error of about \S+", "error of about ...", text)
         text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
         return f"`{type(error).__name__}`: {text}"

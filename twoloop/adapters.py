@@ -5,6 +5,7 @@ import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from types import FunctionType
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
@@ -108,6 +109,11 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
         def function(t, q):  # type: ignore[no-untyped-def]
             return matrix
 
+    if not isinstance(function, Dispatcher | FunctionType):
+        raise TypeError(
+            f"{kind}: compile=True takes functions made by def or lambda, with numbers that they enclose; given "
+            f"{function!r} of type {type(function).__name__}. Write such a function, or leave compile=True out"
+        )
     user = function if isinstance(function, Dispatcher) else njit(named_apart(function, watch(function)))
     message = f"{kind} returned an array of the wrong shape"
 

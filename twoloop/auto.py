@@ -7,6 +7,7 @@ from twoloop.plan import Method, Plan, least_tolerance
 from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
 from twoloop.taylor import Taylor
+from twoloop.traced_values import Check, unchecked
 
 MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method ...
 CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
@@ -108,7 +109,7 @@ class Auto:
         """Shown in messages and tables."""
         return "auto"
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Auto":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
         if code is not None and isinstance(self.few, DOP853):
@@ -116,7 +117,7 @@ class Auto:
         if self.series is None or (code is None and system.called_in_python):
             return replace(chosen, series=None)
         try:
-            return replace(chosen, series=self.series.for_system(system, code))
+            return replace(chosen, series=self.series.for_system(system, code, check))
         except ValueError:
             return replace(chosen, series=None)
 

@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from twoloop.caches import names_in
+from twoloop.caches import names_in, of_library
 from twoloop.callbacks import KINDS
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+OWN = {"twoloop.bounds", "twoloop.tracing", "twoloop.calls_on_symbols"}
 MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
 
 
@@ -44,12 +45,12 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
     if system.called_in_python or kind in system.within_bounds:
         return
     function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
-    given = p.copy()
-    error = _index_error(function, t, state, given, out)
-    if (given != p).any():
+    changed: list[int] = []
+    error = _index_error(function, t, state, p, out, changed)
+    if changed:
+        names = " and ".join([*KINDS[kind].state, "p"][i] for i in changed)
         raise ValueError(
-            f"{kind} of {system.name!r} must not change p, in which it wrote entries "
-            f"{np.flatnonzero(given != p).tolist()}: every callback and every run gets the same parameters"
+            f"{kind} of {system.name!r} must not change the arrays that it is given: it changes {names}. Copy first"
         )
     if error is not None:
         longer = np.concatenate([p, np.ones(MANY)])
@@ -57,26 +58,31 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
         filled = ", ".join(f"{name} has shape {x.shape}" for (name, _), x in zip(KINDS[kind].outputs, out, strict=True))
         sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
         raise ValueError(
-            f"{kind} of {system.name!r} goes out of bounds: {error}{_place(error)}. {', '.join(sizes)}, p has "
+            f"{kind} of {system.name!r} goes out of bounds: {error}{place_of(error)}. {', '.join(sizes)}, p has "
             f"{p.size}, {filled} (n_q = {system.n_q}, n_c = {system.n_c})"
             + (". Give more `parameters`: it reads more of them than there are" if too_short else "")
         )
     system.within_bounds.add(kind)
 
 
-def _index_error(function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array]) -> IndexError | None:
-    """The first index out of bounds, if there is one."""
+def _index_error(
+    function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array], changed: list[int] | None = None
+) -> IndexError | None:
+    """The first index out of bounds, if there is one. To `changed` goes which of `state` and `p` a callback changes."""
     for wrap in (_in_python, _with_bounds_checked):
+        given = [array.copy() for array in (*state, p)]
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                Rewritten(wrap).value(function)(
-                    t, *(array.copy() for array in state), p, *(array.copy() for array in out)
-                )
+                Rewritten(wrap).value(function)(t, *given, *(array.copy() for array in out))
         except IndexError as error:
             return error
         except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called
             continue
+        if changed is not None:
+            changed += [
+                i for i, (one, other) in enumerate(zip(given, (*state, p), strict=True)) if (one != other).any()
+            ]
         return None
     return None
 
@@ -96,7 +102,7 @@ class Rewritten:
 
     def __init__(self, wrap: Callable[[types.FunctionType], Any]):
         self.wrap = wrap
-        self.known: dict[int, Any] = {}
+        self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
         """What stands in the place of a value; `names` are those in the code that names it."""
@@ -106,14 +112,18 @@ class Rewritten:
             return self.known[id(value)]
         if type(value) is tuple:
             return tuple(self.value(each, names) for each in value)
-        if isinstance(value, types.ModuleType):
-            helpers = {name: vars(value).get(name) for name in names}
-            helpers = {name: each for name, each in helpers.items() if isinstance(each, Dispatcher)}
-            if helpers and not value.__name__.startswith("numba"):
-                module = types.ModuleType(value.__name__)
-                vars(module).update(vars(value) | {name: self.value(each) for name, each in helpers.items()})
-                return module
+        if isinstance(value, types.ModuleType) and not of_library(value.__name__):
+            return self._module(value, names)
         return value
+
+    def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
+        """A copy of a module with other functions in the place of those of these names."""
+        key = (id(module), names)
+        if key not in self.known:
+            self.known[key] = copy = types.ModuleType(module.__name__)
+            vars(copy).update(vars(module))
+            vars(copy).update({name: self.value(vars(module)[name], names) for name in names & set(vars(module))})
+        return self.known[key]  # type: ignore[no-any-return]
 
     def _rewrite(self, helper: Any) -> None:
         function = getattr(helper, "py_func", helper)
@@ -125,17 +135,22 @@ class Rewritten:
         self.known[id(helper)] = self.wrap(copy)  # before what it names, which may be itself
         for name in names & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
+        if function.__defaults__ is not None:
+            copy.__defaults__ = self.value(function.__defaults__, names)
         for cell, original in zip(cells, function.__closure__ or (), strict=True):
             cell.cell_contents = self.value(original.cell_contents, names)
 
 
-def _place(error: IndexError) -> str:
-    """Where in the source an error arose, where Python knows it."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
+def place_of(error: BaseException) -> str:
+    """The line of a callback in which an error arose, where Python knows it; its file, but for an index."""
+    trace, frames = error.__traceback__, []
+    while trace is not None:
+        module = trace.tb_frame.f_globals.get("__name__") or ""
+        if module not in OWN and not of_library(module):
+            frames.append((trace.tb_frame.f_code.co_filename, trace.tb_lineno))
         trace = trace.tb_next
-    if trace is None:
+    if not frames:
         return ""
-    file, line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
+    file, line = frames[-1]
     source = linecache.getline(file, line).strip()
-    return f", in `{source}` ({file}, line {line})" if source and file != __file__ else ""
+    return f", in `{source}` ({file}, line {line})" if source else ""

@@ -342,7 +342,7 @@ class Digest:
 
     def _add_module(self, module: types.ModuleType) -> None:
         self.hash.update(module.__name__.encode())
-        if not _of_library(module.__name__):
+        if not of_library(module.__name__):
             for name in sorted(self.names & set(vars(module))):
                 if self._is_new(module, name):
                     self.add([name, vars(module)[name]])
@@ -355,7 +355,7 @@ class Digest:
         module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
         if type(value) is np.ufunc:
             module, name = "numpy", value.__name__
-        if module is None or name is None or not _of_library(module):
+        if module is None or name is None or not of_library(module):
             raise CannotBeWatched
         self.hash.update(f"{module}.{name}".encode())
 
@@ -373,5 +373,6 @@ def names_in(code: types.CodeType) -> set[str]:
     return set(code.co_names).union(*map(names_in, inner))
 
 
-def _of_library(module: str) -> bool:
+def of_library(module: str) -> bool:
+    """Whether a module is of Python, or of a package that is told by its version."""
     return module.partition(".")[0] in LIBRARIES

@@ -10,7 +10,7 @@ from scipy.linalg import null_space, qr
 
 from twoloop.bounds import check_bounds
 from twoloop.callbacks import KINDS
-from twoloop.derivatives import check_derivatives
+from twoloop.derivatives import check_derivatives, unsymmetric_mass
 from twoloop.scales import EPS, Scales, scales_of
 from twoloop.system import ConstrainedSystem
 
@@ -47,16 +47,14 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
-    matrix, jacobian = system.mass(t0, q0), system.jacobian(t0, q0)
+    jacobian = system.jacobian(t0, q0)
     rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
     reason = not_finite(system, t0, q0, v0)
     if reason is not None:
         raise ValueError(f"at the start, t = {t0:g}, {reason}")
-    if np.abs(matrix - matrix.T).max() > 1e-10 * np.abs(matrix).max():
-        raise ValueError(
-            f"mass of {system.name!r} must be symmetric; at t = {t0:g} max|M - M^T| is "
-            f"{np.abs(matrix - matrix.T).max():.3g}"
-        )
+    unsymmetric = unsymmetric_mass(system, t0, q0)
+    if unsymmetric is not None:
+        raise ValueError(unsymmetric)
     if system.n_c > 0:
         scales = scales_of(system, t0, q0, jacobian)
         Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")

@@ -1,4 +1,4 @@
-"""Is what a system says about itself true? C_q, C_t, Q_d and tangents against differences, constant M, bandwidth.
+"""Is what a system says about itself true? C_q, C_t, Q_d and tangents against differences, M symmetric, bandwidth.
 
 A wrong sign in one of them often runs to the end and looks like a motion. Every entry is compared at the start, and
 along a run one direction through all of them.
@@ -24,6 +24,7 @@ TIME = 0.1  # s: first guess at how fast constraints move
 NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
+UNSYMMETRIC = 1e-10  # of the largest entry of M
 SAME = 1e-11  # relative: values that two callbacks must share
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
@@ -59,7 +60,7 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
     """
     if system.checked:
         return
-    wrong = _wrong_constraint(system, t, q, FORWARD) or _wrong_tangent(system, t, q)
+    wrong = _wrong_constraint(system, t, q, FORWARD) or _wrong_tangent(system, t, q) or _unsymmetric_near(system, t, q)
     if wrong is not None:
         raise ValueError(wrong)
     _check_kinematics(system, t, q)
@@ -70,13 +71,16 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
 
 
 def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
-    """Say which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold near the start only.
+    """Say which of C_q, C_t, gamma and M is wrong at a state of a run, or None: formulas may hold near the start only.
 
     One direction through all coordinates and time stands for all entries, so that this costs as a rule nine calls of
     `constraint`, ten of `jacobian` and of `constraint_rate` and one of `gamma`, whatever n_q. Only where the direction
     shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they decide
     whether Newton's method converges, not what it converges to.
     """
+    unsymmetric = None if system.constant_mass else unsymmetric_mass(system, t, q)
+    if unsymmetric is not None:
+        return unsymmetric
     jacobian, rate = system.rows(t, q), system.rates(t, q)
     if jacobian.size == 0 or not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
         return None
@@ -179,6 +183,28 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
             if wrong is not None:
                 return wrong
     return None
+
+
+def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """Say which entry of M is not that of its transpose, or None."""
+    mass = system.mass(t, q)
+    off = np.abs(mass - mass.T)
+    if not off.max() > UNSYMMETRIC * np.abs(mass).max():
+        return None
+    i, j = sorted(int(each) for each in np.unravel_index(int(off.argmax()), off.shape))
+    return (
+        f"mass of {system.name!r} must be symmetric; at t = {t:.10g} its entry {(i, j)} is {mass[i, j]:.9g} and its "
+        f"entry {(j, i)} is {mass[j, i]:.9g}"
+    )
+
+
+def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """The same a little off the start, where what is zero there shows."""
+    near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
+    if system.constant_mass or _defined(lambda: system.mass(t, near)) is None:
+        return None
+    wrong = unsymmetric_mass(system, t, near)
+    return None if wrong is None else f"{wrong} (near the start: at q = {near})"
 
 
 def _gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:

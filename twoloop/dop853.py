@@ -10,6 +10,7 @@ from twoloop.plan import INNER_TOL, LARGEST_MOVE, Plan, check_tolerances, least_
 from twoloop.stage_code import compiled_stages
 from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Check, unchecked
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
@@ -69,7 +70,7 @@ class DOP853:
         """Shown in messages and tables."""
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "DOP853":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "DOP853":
         """The method with what is compiled for this system."""
         return replace(self, code=code)
 

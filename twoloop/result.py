@@ -39,6 +39,7 @@ class Status(IntEnum):
     TIME_LIMIT = -10
     ROWS_CONTRADICT = -11
     RATE_JUMPS = -12
+    WRONG_TRACE = -13
 
 
 MEANINGS: dict[Status, str] = {
@@ -52,10 +53,11 @@ MEANINGS: dict[Status, str] = {
     Status.SOLVER_FAILED: "a solver of another project failed, or reached the time limit of its adapter",
     Status.INTERRUPTED: "the run was interrupted from the keyboard",
     Status.STAGNATED: "the steps became so short that the end is out of reach",
-    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong at a state of the run",
+    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong, or M not symmetric, at a state of the run",
     Status.TIME_LIMIT: "the run reached its time_limit",
     Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
     Status.RATE_JUMPS: "constraint_rate jumps, and no impulse gives velocities that the constraints allow",
+    Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it",
 }
 
 

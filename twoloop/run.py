@@ -23,6 +23,7 @@ from twoloop.recorder import Recorder, Wanted
 from twoloop.result import Result, Statistics, Status, explained
 from twoloop.stability import Looks, said_of_stiffness
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Sample
 from twoloop.workspace import kit_of, workspace
 
 Array = NDArray[np.float64]
@@ -77,7 +78,7 @@ class Run:
         self.a = advance
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
-        self.rtol, self.reuse, self.interiors = rtol, plan.reuse, interiors
+        self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
         self.kit = kit_of(system, t0, q0, plan)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
@@ -237,6 +238,7 @@ class Run:
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
+        sample = Sample(self.t0, self.state[: 2 * system.n_q])
         code = INTERRUPTED if interrupts.asked else a.PAUSED
         out_t, out_state, out_steps = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
@@ -268,6 +270,8 @@ class Run:
                 code, raised = INTERRUPTED, None if interrupts.asked else error
             n_rows, n_steps = filled.tolist()
             t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
+            sample.add(t, rows)
+            sample.add(self.clock[a.T : a.T + 1], self.state[None, :])
             sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
             if sparse:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
@@ -335,6 +339,9 @@ class Run:
             if check_derivatives and code != INTERRUPTED:
                 last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
                 status, message = self._check_again(t, table, last, status, message)
+            if code != INTERRUPTED:
+                end = float(self.clock[a.T] if recorder.last is None else recorder.last[0])
+                status, message = self._check_traces(sample.up_to(end), status, message)
             if status in EXPLAINED_BY_STIFFNESS:
                 message += said_of_stiffness(looks, self.kit, self.work)
         except KeyboardInterrupt:
@@ -606,6 +613,14 @@ class Run:
             wrong = wrong_derivative(self.system, instant, q, v)
             if wrong is not None:
                 return Status.WRONG_DERIVATIVE, f"At t = {instant:.10g} of the run {wrong} {message}"
+        return status, message
+
+    def _check_traces(self, states: Any, status: Status, message: str) -> tuple[Status, str]:
+        """Status and message, unless a callback gives other values than what was recorded of it."""
+        for traced in self.traced:
+            wrong = traced.wrong(self.system, states)
+            if wrong is not None:
+                return Status.WRONG_TRACE, f"In the run {wrong}. {message}"
         return status, message
 
     def _not_finite(self) -> str:

@@ -7,16 +7,18 @@ G^T lam + M a are written as few products: terms that share a factor are one pro
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.calls_on_symbols import as_forms, trace
 from twoloop.kernels.common import GIVEN
 from twoloop.system import ConstrainedSystem
-from twoloop.tracing import COSINE, PENDING, SINE, Form, Graph, Untraceable, symbols, trace
+from twoloop.traced_values import Traced
+from twoloop.tracing import COSINE, PENDING, SINE, Form, Graph, Untraceable, symbols
 
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
@@ -69,6 +71,8 @@ class SeriesProgram:
         G v + G_t, but for multiples of v: those that are not zero, and which they are.
     balance, balance_places : Sums, ndarray
         Q - G^T lam - M a, but for multiples of lam and a, likewise.
+    traced : Traced or None
+        What the callbacks gave.
     """
 
     n_q: int
@@ -79,6 +83,7 @@ class SeriesProgram:
     row_places: Integers
     balance: Sums
     balance_places: Integers
+    traced: Traced | None = None
 
     @property
     def n_operations(self) -> int:
@@ -134,7 +139,8 @@ def series_program(system: ConstrainedSystem) -> SeriesProgram:
         factors, others = [-each for each in G[:, i]], list(lam)
         factors += [-each for each in made["mass"][i]]
         balance.append(_sum_of_products(graph, factors, [*others, *a], made["force"][i], reaction_products))
-    return _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
+    program = _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
+    return replace(program, traced=Traced(system, graph))
 
 
 def on_symbols(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any) -> Any:
@@ -146,22 +152,19 @@ def on_symbols(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[
         If it does not run on them.
     """
     out = np.full(shape, 0.0, dtype=object)
-    arguments = (t, *map(symbols, state))
+    arrays, p = [symbols(each) for each in state], system.parameters.copy()
     if 0 not in shape:
         try:
             if not system.called_in_python:
-                trace(getattr(system.functions, kind), *arguments, system.parameters, out)
+                trace(getattr(system.functions, kind), t, *arrays, p, out)
             elif kind in system.python_functions:
-                out = np.array(trace(system.python_functions[kind], *arguments), dtype=object)
+                out = np.array(trace(system.python_functions[kind], t, *arrays), dtype=object)
+            out = as_forms(graph, out)
+            if out.shape != shape:
+                raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
         except Untraceable as error:
             raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
-    if out.shape != shape:
-        raise Untraceable(
-            f"{kind} of {system.name!r}: on symbols it returns an array of shape {out.shape}, not {shape}"
-        )
-    for place in np.ndindex(shape):
-        if not isinstance(out[place], Form):
-            out[place] = Form(graph, float(out[place]), {})
+    graph.traced.setdefault(kind, out.copy())
     return out
 
 

@@ -31,6 +31,7 @@ from twoloop.result import Result
 from twoloop.run import Run
 from twoloop.straight_code import own_code
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Traced
 
 Array = NDArray[np.float64]
 
@@ -176,9 +177,12 @@ def solve_dae(
     with Interrupts() as interrupts:
         check_start(system, t0, q0, v0, derivatives=check_derivatives)
 
-        code = own_code(system, t0, q0) if compiled else None
+        def check(traced: Traced) -> None:
+            traced.refuse(system, t0, t1, q0, v0)
+
+        code = own_code(system, t0, q0, check) if compiled else None
         if hasattr(chosen, "for_system"):
-            chosen = chosen.for_system(system, code)
+            chosen = chosen.for_system(system, code, check)
         plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
         interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
         if plan.parts > 1:
@@ -190,7 +194,7 @@ def solve_dae(
                 raise ValueError(
                     f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
                 )
-            plan = replace(plan, inner=code.inner)
+            plan = replace(plan, inner=code.inner, traced=(*plan.traced, code.equations.traced))
         run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
         if step_size is None:
             run.set_sizes(first_step, float(max_step), t1)

@@ -24,6 +24,7 @@ from twoloop.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, Value
 from twoloop.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.straight_line import Choice, Outputs, StraightLine
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Check, unchecked
 from twoloop.tracing import (
     ARCTANGENT,
     COSINE,
@@ -174,8 +175,8 @@ class OwnCode:
         self.inner: Dispatcher = inner
 
 
-def own_code(system: ConstrainedSystem, t0: float, q0: Array) -> OwnCode:
-    """The code for a system, for a run that starts at a position.
+def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> OwnCode:
+    """The code for a system, for a run that starts at a position; `check` raises where the callbacks are not in it.
 
     Raises
     ------
@@ -185,6 +186,7 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array) -> OwnCode:
     try:
         choice = Choice.at(system, t0, q0)
         made: OwnCode = system.remembered(("code", choice), lambda: OwnCode(StraightLine(system, choice)))
+        check(made.equations.traced)
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
     return made

@@ -23,6 +23,7 @@ from twoloop.kernels.common import GIVEN
 from twoloop.kernels.inner import CONTRADICTS
 from twoloop.series import on_symbols
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Traced
 from twoloop.tracing import (
     ARCTANGENT,
     COSINE,
@@ -64,17 +65,8 @@ class Outputs:
 
     def quantities(self, graph: Graph) -> list[int]:
         """What all of this is made of, inputs apart, in an order in which it can be computed."""
-        found: set[int] = set()
         forms = [*(form for array in self.arrays.values() for form in array)]
-        forms += [form for condition in self.conditions for form in condition]
-        ahead = [i for form in forms for i in form.terms]
-        while ahead:
-            i = ahead.pop()
-            operation = graph.operations[i]
-            if i not in found and operation is not None:
-                found.add(i)
-                ahead += [j for form in operation[1:] if isinstance(form, Form) for j in form.terms]
-        return sorted(found)
+        return graph.needed_by([*forms, *(form for condition in self.conditions for form in condition)])
 
 
 class Block(NamedTuple):
@@ -214,6 +206,8 @@ class StraightLine:
         The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c,) for these.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
+    traced : Traced
+        What the callbacks gave.
 
     Raises
     ------
@@ -247,6 +241,7 @@ class StraightLine:
             self._add_projection()
         if len(self.graph.operations) > MOST:
             raise Untraceable(f"its equations are more than {MOST} operations")
+        self.traced = Traced(system, self.graph)
 
     def _made(self, kind: str, shape: tuple[int, ...], *state: Sequence[Form]) -> Any:
         made = on_symbols(self.system, self.graph, kind, shape, self.t, *state)
@@ -270,6 +265,12 @@ class StraightLine:
     def _matrix(self) -> dict[tuple[int, int], Form]:
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not _is_zero(self.mass[i, j])}
+        for i, j in matrix:
+            if (j, i) not in matrix:
+                name = self.system.name
+                raise Untraceable(
+                    f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
+                )
         for k in self.choice.added:
             places = [i for i in range(n) if not _is_zero(self.all_rows[k, i])]
             for i in places:

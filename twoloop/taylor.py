@@ -13,6 +13,7 @@ from twoloop.series import SeriesProgram, series_program
 from twoloop.series_code import compiled_series
 from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
+from twoloop.traced_values import Check, unchecked
 from twoloop.tracing import Untraceable
 
 Array = NDArray[np.float64]
@@ -72,16 +73,17 @@ class Taylor:
         """Shown in messages and tables."""
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None) -> "Taylor":
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Taylor":
         """The method with the operations of this system, and with what is compiled for it.
 
         Raises
         ------
         ValueError
-            If its callbacks do not run on symbols.
+            If its callbacks do not run on symbols, or `check` finds that they give something else.
         """
         try:
             program = system.remembered("series", lambda: series_program(system))
+            check(program.traced)
         except Untraceable as error:
             raise ValueError(
                 f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
@@ -113,6 +115,7 @@ class Taylor:
             compilable=True,
             looks_within=True,
             parts=min(max(highest // 3, FEWEST), MOST),
+            traced=(program.traced,),
         )
         kept = plan.options.copy()
         kept[series.KEEP] = 1.0

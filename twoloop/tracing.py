@@ -5,34 +5,48 @@ products and functions of such forms. What is computed twice is one quantity.
 """
 
 import math
-import types
+import operator
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
-
-from twoloop.bounds import Rewritten
 
 # kinds of operation; the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM = range(10)
+BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
+
+CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
 
 class Untraceable(ValueError):
     """Raised for a callback that does not run on symbols; the text says why."""
 
 
+class Refusal(BaseException):
+    """Leaves a callback that does not run on symbols: no `except Exception` of its own holds it."""
+
+
 class Graph:
     """Quantities, numbered from 0; `operations[i]` is None for an input, else (kind, first form, second form).
 
-    `sizes`: how many inputs were made at a time.
+    `sizes`: how many inputs were made at a time; `traced`: what callbacks gave on symbols, arrays of forms by kind.
     """
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
         self.operations: list[tuple[int, Form, Form | None] | None] = []
         self.late: list[bool] = []  # whether a quantity depends on more than time and coordinates
+        self.traced: dict[str, Any] = {}
+        self.running = False  # whether a callback runs on its quantities now ...
+        self.refused = ""  # ... and why it cannot, which it may have caught
         self._known: dict[Any, int] = {}
+
+    def refuse(self, reason: str) -> NoReturn:
+        """Leave the callback that runs, and keep the reason."""
+        if not self.running:
+            raise Untraceable(reason)
+        self.refused = self.refused or reason
+        raise Refusal(reason)
 
     def inputs(self, n: int, late: bool) -> list["Form"]:
         """New quantities that are given, as forms."""
@@ -51,6 +65,18 @@ class Graph:
             self.late.append(first.late or (second is not None and second.late))
         return Form(self, 0.0, {self._known[key]: 1.0})
 
+    def needed_by(self, forms: Iterable["Form"]) -> list[int]:
+        """What forms are made of, inputs apart, in an order in which it can be computed."""
+        found: set[int] = set()
+        ahead = [i for form in forms for i in form.terms]
+        while ahead:
+            i = ahead.pop()
+            operation = self.operations[i]
+            if i not in found and operation is not None:
+                found.add(i)
+                ahead += [j for form in operation[1:] if isinstance(form, Form) for j in form.terms]
+        return sorted(found)
+
     def product(self, one: "Form", other: "Form") -> "Form":
         """One form times another, factors taken out so that multiples of a product are one quantity."""
         for a, b in ((one, other), (other, one)):
@@ -63,10 +89,12 @@ class Graph:
 
 
 class Form:
-    """An affine form; does what a number does, but has no size to be compared."""
+    """An affine form; does what a number does, but has no size to be compared.
+
+    While a callback runs on it, whatever could tell it from a number is refused.
+    """
 
     __slots__ = ("constant", "graph", "terms")
-    __array_ufunc__ = None  # numpy's numbers leave arithmetic to it
 
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
@@ -93,12 +121,15 @@ class Form:
         return factor, self.times(1.0 / factor)
 
     def _other(self, other: Any) -> "Form":
-        if isinstance(other, Form):
-            return other
-        return Form(self.graph, float(other), {})
+        if type(other) is not Form:
+            return Form(self.graph, float(other), {})
+        if other.graph is not self.graph:
+            graph = self.graph if self.graph.running else other.graph
+            graph.refuse("it uses t, q or v of another call, which it has kept")
+        return other
 
     def __add__(self, other: Any) -> Any:
-        if isinstance(other, np.ndarray):
+        if type(other) is not Form and isinstance(other, np.ndarray):
             return _each(other, lambda x: x + self)
         other = self._other(other)
         terms = dict(self.terms)
@@ -125,21 +156,32 @@ class Form:
         return -self + other
 
     def __mul__(self, other: Any) -> Any:
-        if isinstance(other, np.ndarray):
+        if type(other) is not Form and isinstance(other, np.ndarray):
             return _each(other, lambda x: x * self)
         return self.graph.product(self, self._other(other))
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Any:
-        if isinstance(other, Form):
+        if type(other) is Form:
             return self * other.reciprocal()
         return self * (1.0 / other)
 
     def __rtruediv__(self, other: Any) -> Any:
         return self.reciprocal() * other
 
-    def __pow__(self, exponent: Any) -> "Form":
+    def __rpow__(self, base: Any) -> Any:
+        if isinstance(base, np.ndarray):
+            return _each(base, lambda x: x**self)
+        if base <= 0.0:
+            self.graph.refuse(f"it raises {base!r} to a power that depends on t, q or v")
+        return (self * math.log(base)).exponential()
+
+    def __pow__(self, exponent: Any) -> Any:
+        if type(exponent) is not Form and isinstance(exponent, np.ndarray):
+            return _each(exponent, lambda x: self**x)
+        if type(exponent) is Form:
+            self.graph.refuse("it raises to a power that depends on t, q or v")
         exponent = float(exponent)
         if exponent != math.floor(exponent):
             if 2.0 * exponent == math.floor(2.0 * exponent):
@@ -204,14 +246,97 @@ class Form:
         return self.graph.operation(ARCTANGENT, self, self * self + 1.0)
 
     def _branches(self, *_: Any) -> Any:
-        raise Untraceable("it branches on, or converts to a number, what depends on t, q or v")
+        self.graph.refuse(BRANCHES)
 
-    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __float__ = __int__ = __abs__ = __index__ = _branches
-    __floordiv__ = __mod__ = __rfloordiv__ = __rmod__ = __rpow__ = __round__ = _branches
-    __hash__ = None  # type: ignore[assignment]
+    def __float__(self) -> float:
+        self.graph.refuse(CONVERTS)
 
-    def __eq__(self, other: object) -> Any:
-        return self._branches()
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _branches
+    __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = _branches
+    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _branches  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        if self.graph.running:
+            self.graph.refuse("it makes text of what depends on t, q or v")
+        return "<a symbol of t, q or v, kept from where the callback ran on symbols>"
+
+    def __format__(self, specification: str) -> str:
+        return repr(self)
+
+    def __copy__(self) -> "Form":
+        return self
+
+    def __deepcopy__(self, memo: Any) -> "Form":
+        return self
+
+    def item(self) -> "Form":
+        """As a number of NumPy has it."""
+        return self
+
+    real = property(item)
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:  # of which isinstance asks
+        if self.graph.running:
+            self.graph.refuse("it asks for the type of what depends on t, q or v")
+        return Form
+
+    def __getattr__(self, name: str) -> Any:
+        if self.graph.running and not name.startswith("__"):
+            self.graph.refuse(f"it asks for .{name} of what depends on t, q or v")
+        raise AttributeError(name)
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
+        function = OPERATORS.get(ufunc.__name__) or FUNCTIONS.get(ufunc.__name__)
+        if ufunc.__name__ in COMPARISONS:
+            self._branches()
+        if function is None or method != "__call__" or options or (out is not None and out[0].dtype != object):
+            self.graph.refuse(f"it calls numpy.{ufunc.__name__} on what depends on t, q or v")
+        made = np.frompyfunc(function, len(inputs), 1)(*map(operand, inputs))
+        if out is None:
+            return made
+        out[0][...] = made
+        return out[0]
+
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "add": operator.add,
+    "subtract": operator.sub,
+    "multiply": operator.mul,
+    "divide": operator.truediv,
+    "power": operator.pow,
+    "float_power": operator.pow,
+    "negative": operator.neg,
+    "positive": operator.pos,
+    "square": lambda x: x * x,
+    "reciprocal": lambda x: 1.0 / x,
+    "hypot": lambda x, y: (x * x + y * y) ** 0.5,
+}
+COMPARISONS = {"less", "less_equal", "greater", "greater_equal", "equal", "not_equal"}
+FUNCTIONS: dict[str, Callable[[Form], Any]] = {
+    "sin": Form.sine,
+    "cos": Form.cosine,
+    "tan": lambda x: x.sine() / x.cosine(),
+    "sqrt": Form.square_root,
+    "exp": Form.exponential,
+    "log": Form.logarithm,
+    "atan": Form.arctangent,
+    "arctan": Form.arctangent,
+    "sinh": lambda x: (x.exponential() - (-x).exponential()) * 0.5,
+    "cosh": lambda x: (x.exponential() + (-x).exponential()) * 0.5,
+    "tanh": lambda x: 1.0 - 2.0 / ((2.0 * x).exponential() + 1.0),
+}
+for _name, _function in FUNCTIONS.items():  # NumPy calls them on arrays of forms by these names
+    setattr(Form, _name, _function)
+
+
+def operand(value: Any) -> Any:
+    """An operand with which NumPy does not ask forms how to go on: an array of objects, or a number of Python's."""
+    if type(value) is not Form and isinstance(value, np.ndarray):
+        return value.astype(object)
+    made = np.empty((), dtype=object)
+    made[()] = float(value) if type(value) is not Form and isinstance(value, np.generic) else value
+    return made
 
 
 def _each(array: Any, function: Callable[[Any], Any]) -> Any:
@@ -227,77 +352,3 @@ def symbols(forms: Iterable[Form]) -> Any:
     made = np.empty(len(forms), dtype=object)
     made[:] = forms
     return made
-
-
-def trace(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Run a callback in Python on symbols: what it returns, None of a compiled one.
-
-    Raises
-    ------
-    Untraceable
-        If it does not run on them.
-    """
-    try:
-        return _Traced(lambda python_function: python_function).value(function)(*arguments)
-    except Untraceable:
-        raise
-    except Exception as error:  # what a callback makes of symbols is its own
-        raise Untraceable(f"it does not run on symbols: {type(error).__name__}: {error}") from error
-
-
-class _Traced(Rewritten):
-    """Copies of callbacks with the mathematics of forms in the place of `math` and `numpy`."""
-
-    functions = (Dispatcher, types.FunctionType)
-
-    def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        if isinstance(value, types.ModuleType) and value in (math, np):
-            return _Mathematics(value)
-        if isinstance(value, types.BuiltinFunctionType | np.ufunc) and value.__name__ in _FUNCTIONS:
-            return _either(value)
-        return super().value(value, names)
-
-
-_FUNCTIONS: dict[str, Callable[[Form], Any]] = {
-    "sin": Form.sine,
-    "cos": Form.cosine,
-    "tan": lambda x: x.sine() / x.cosine(),
-    "sqrt": Form.square_root,
-    "exp": Form.exponential,
-    "log": Form.logarithm,
-    "atan": Form.arctangent,
-    "arctan": Form.arctangent,
-    "sinh": lambda x: (x.exponential() - (-x).exponential()) * 0.5,
-    "cosh": lambda x: (x.exponential() + (-x).exponential()) * 0.5,
-    "tanh": lambda x: 1.0 - 2.0 / ((2.0 * x).exponential() + 1.0),
-}
-
-
-def _either(known: Any) -> Callable[..., Any]:
-    """A function of numbers, and of forms."""
-    own = _FUNCTIONS[known.__name__]
-
-    def function(x: Any) -> Any:
-        if isinstance(x, np.ndarray) and x.dtype == object:
-            return _each(x, function)
-        return own(x) if isinstance(x, Form) else known(x)
-
-    return function
-
-
-class _Mathematics:
-    """`math` or `numpy`, with functions that take forms too, and arrays that hold them."""
-
-    def __init__(self, module: types.ModuleType):
-        self._module = module
-
-    def __getattr__(self, name: str) -> Any:
-        if name in _FUNCTIONS:
-            return _either(getattr(self._module, name))
-        if name == "hypot":
-            return lambda x, y: (x * x + y * y) ** 0.5
-        if name == "pow":
-            return lambda x, y: x**y
-        if name in ("zeros", "empty"):
-            return lambda shape, *_, **__: np.full(shape, 0.0, dtype=object)
-        return getattr(self._module, name)
