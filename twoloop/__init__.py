@@ -3,6 +3,7 @@
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
 from twoloop.citations import citation
+from twoloop.certificate import Certificate, CertificateWarning
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
 from twoloop.drawing import Drawing
@@ -23,6 +24,8 @@ __all__ = [
     "BDF",
     "DOP853",
     "ESDIRK",
+    "Certificate",
+    "CertificateWarning",
     "ConsistentState",
     "ConstrainedSystem",
     "ConstraintWarning",

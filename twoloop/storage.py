@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 FORMAT = "twoloop result 1"
 ALWAYS = ("t", "q", "v", "a", "lam", "h")
-SOMETIMES = ("rejected_error", "rejected_convergence", "partitioned", "redundant")
+SOMETIMES = ("rejected_error", "rejected_convergence", "partitioned", "redundant", "atol", "untested")
 OF_EVENTS = ("t_events", "q_events", "v_events")
 
 
@@ -40,6 +40,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
         arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
     words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
     words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
+    words["rtol"] = result.rtol
     if result.sol is not None:
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
@@ -103,6 +104,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         rank=words["rank"],
         system=system,
         method=words.get("method", ""),  # older files have none
+        rtol=words.get("rtol"),
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 
