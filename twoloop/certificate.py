@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks import check_positive, check_tolerance
-from twoloop.remake import Remaker, explicit, implicit, tighter
+from twoloop.kernels.intervals import APART
+from twoloop.remake import Remade, Remaker, explicit, implicit, tighter
 from twoloop.result import Result
 
 Array = NDArray[np.float64]
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 PIECES = 200  # of a run: the longest piece, and the longest step with which one is made again, is this part of it
 LIMIT = 300.0  # tolerances: steps of right runs were at most 140 off, of wrong ones that passed over something 590 and more
 ROUNDING = 1e-14  # of the largest coordinate or velocity: what no step can be expected to hold
-SEVERAL = 10.0  # the defect of several steps in one piece, from which on each is looked at
+SEVERAL = 100.0  # the defect of several steps in one piece, from which on each is looked at
 ENOUGH = 3  # wrong steps of a piece, after which the others are not looked at
 NEGLIGIBLE = 1e-10  # singular values of the rows below this share of the largest are zero
 MOST, MOST_A_STEP = 400, 32  # attempts at steps that a piece may take, and as many more for each step of the run in it
@@ -119,6 +120,7 @@ class _Look:
 
     def __init__(self, result: Result, rtol: float, atol: Array):
         self.result, self.system, self.rtol, self.atol = result, result.system, rtol, atol
+        self.sol = result.sol
         self.t, self.states = result.t, np.vstack([result.q, result.v]).T
         if result.sol is not None:  # the states at all steps, and those stored at other times
             table = result.sol.table
@@ -199,16 +201,28 @@ class _Look:
 
     def _by(self, method: str, looser: float, i: int, j: int) -> float:
         """The defect from state i to state j by a method, at tolerances so much looser; of many steps, that of one."""
-        state = self._again(method, looser, self.states[i], i, j)
-        if state is None:
+        made = self._again(method, looser, self.states[i], i, j)
+        if made is None:
             return np.inf
-        single = 1 if j > i + 1 else self.n_steps[i]
-        return self._distance(state, self.states[j], i, j) / float(single)
+        n_steps = 1 if j > i + 1 else int(self.n_steps[i])
+        at_end = self._distance(made.end, self.states[j], i, j)
+        return max(at_end, self._off_between(made.between, i, j)) / n_steps
+
+    def _off_between(self, state: Array, i: int, j: int) -> float:
+        """How far the dense solution is from a state made again, over the tolerance."""
+        t = self._between(i, j)
+        if self.sol is None or not self.t[i] < t < self.t[j]:
+            return 0.0
+        table = self.sol.table
+        if table.kinds[np.searchsorted(table.t, t) - 1] == APART:  # there the states themselves are not as good
+            return 0.0
+        found = self.sol(t)
+        return self._distance(state, np.concatenate([found.q, found.v]), i, j)
 
     def _growth(self, method: str, i: int, j: int) -> float:
         """How many times the tolerance an error of about that size at state i is at state j."""
-        ends = [self._again(method, 1.0, start, i, j) for start in (self.states[i], self._beside(i))]
-        return np.inf if ends[0] is None or ends[1] is None else self._distance(*ends, i, j)
+        one, other = (self._again(method, 1.0, start, i, j) for start in (self.states[i], self._beside(i)))
+        return np.inf if one is None or other is None else self._distance(one.end, other.end, i, j)
 
     def _beside(self, i: int) -> Array:
         """A state beside state i, as far from it as the tolerances allow, on the constraints."""
@@ -229,8 +243,8 @@ class _Look:
         error = np.abs(state - other) / self._allowed(other)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
-    def _again(self, method: str, looser: float, start: Array, i: int, j: int) -> Array | None:
-        """The state j, made again from `start` in the place of state i."""
+    def _again(self, method: str, looser: float, start: Array, i: int, j: int) -> Remade | None:
+        """The states up to state j, made again from `start` in the place of state i."""
         key = (method, looser)
         if key not in self.remakers:
             made = explicit() if method == "explicit" else implicit(method == "all")
@@ -242,12 +256,17 @@ class _Look:
         remaker = self.remakers[key]
         t0, t1 = float(self.t[i]), float(self.t[j])
         most = MOST + MOST_A_STEP * (int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest))
-        found = remaker.to(t0, start, t1, most if looser == 1.0 else MOST)
-        if found is None:
-            return None
-        state, longest = found
-        self.gap = max(self.gap, longest * remaker.spacing)
-        return state
+        found = remaker.to(t0, start, self._between(i, j), t1, most if looser == 1.0 else MOST)
+        if found is not None:
+            self.gap = max(self.gap, found.longest * remaker.spacing)
+        return found
+
+    def _between(self, i: int, j: int) -> float:
+        """A time between the states i and j, in the middle of the longest interval; that of state j without `sol`."""
+        if self.sol is None:
+            return float(self.t[j])
+        k = i + int(np.diff(self.t[i : j + 1]).argmax())
+        return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
 def _in_words(

@@ -1,6 +1,7 @@
 """Pieces of a run made again: short runs from stored states, by an explicit or an implicit method."""
 
 import warnings
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,14 @@ def implicit(velocities: bool) -> tuple[Method, Array]:
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
+class Remade(NamedTuple):
+    """States [q, v] at a time within a piece and at its end, and the longest step, s."""
+
+    between: Array
+    end: Array
+    longest: float
+
+
 class Remaker:
     """Makes pieces of a run again, each from a state that is given; the arrays are made once.
 
@@ -78,15 +87,15 @@ class Remaker:
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
         self.run.work.notes[common.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
-        rows = (np.empty(1), np.empty((1, len(self.run.state))))
+        rows = (np.empty(len(Remade._fields)), np.empty((len(Remade._fields), len(self.run.state))))
         self.out = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS)), np.zeros(2, dtype=np.int64))
         self.next_step = np.inf
 
-    def to(self, t0: float, state: Array, t1: float, most: int) -> tuple[Array, float] | None:
-        """The state [q, v] at t1 from that at t0, and the longest step, s; None if not within so many attempts."""
-        run, a = self.run, self.run.a
+    def to(self, t0: float, state: Array, between: float, t1: float, most: int) -> Remade | None:
+        """Start from a state [q, v] at t0; None if t1 is not reached within so many attempts at steps."""
+        run, a, n = self.run, self.run.a, len(state)
         run.state[:] = 0.0
-        run.state[: len(state)] = state
+        run.state[:n] = state
         run.plan.memory[:] = run.memory
         clock = run.clock
         clock[:] = 0.0
@@ -96,15 +105,19 @@ class Remaker:
         self.next_step = np.inf
         if a.start(run.kit, run.work, t0, run.state) != common.DONE:
             return None
-        end, advance, longest = np.array([t1]), direct(a.advance), 0.0
+        times = np.array([between, t1] if t0 < between < t1 else [t1])
         arrays = (run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state)
+        found: list[Array] = []
+        longest, advance = 0.0, direct(a.advance)
+        _, states, steps, filled = self.out
         for _ in range(0, most, CHUNK):
-            code = advance(run.kit, run.work, *arrays, end, *self.out)
-            n_steps = int(self.out[-1][1])
-            longest = max(longest, float(self.out[2][:n_steps, a.H].max(initial=0.0)))
+            code = advance(run.kit, run.work, *arrays, times, *self.out)
+            n_rows, n_steps = filled.tolist()
+            found.extend(states[:n_rows, :n].copy())
+            longest = max(longest, float(steps[:n_steps, a.H].max(initial=0.0)))
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(clock[a.H_NEXT])
-                return run.state[: len(state)].copy(), longest
+                return Remade(found[0], found[-1], longest)
             if code != a.PAUSED:
                 break
         return None
