@@ -2,8 +2,8 @@
 
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
-from twoloop.citations import citation
 from twoloop.certificate import Certificate, CertificateWarning
+from twoloop.citations import citation
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
 from twoloop.drawing import Drawing

@@ -13,11 +13,12 @@ from twoloop.checks import check_positive, check_tolerance
 from twoloop.kernels.intervals import APART
 from twoloop.remake import Remade, Remaker, explicit, implicit, tighter
 from twoloop.result import Result
+from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
 PIECES = 200  # of a run: the longest piece, and the longest step with which one is made again, is this part of it
-LIMIT = 300.0  # tolerances: steps of right runs were at most 140 off, of wrong ones that passed over something 590 and more
+LIMIT = 300.0  # tolerances: right steps were at most 140 off, those that passed over something 590 and more
 ROUNDING = 1e-14  # of the largest coordinate or velocity: what no step can be expected to hold
 SEVERAL = 100.0  # the defect of several steps in one piece, from which on each is looked at
 ENOUGH = 3  # wrong steps of a piece, after which the others are not looked at
@@ -72,8 +73,14 @@ class Certificate:
 
 def certify(result: Result, rtol: float | None, atol: ArrayLike | None) -> Certificate:
     """The certificate of a result, see `Result.certify`."""
-    look = _Look(result, *_tolerances(result, rtol, atol))
-    defect, where, unseen = 0.0, float(look.t[0]), []
+    if result.system is None:
+        raise ValueError(
+            "certify needs the system: read a file by twoloop.load(path, system), give a result of another solver "
+            "dataclasses.replace(result, system=system)"
+        )
+    look = _Look(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
+    defect, where = 0.0, float(look.t[0])
+    unseen: list[tuple[float, float]] = []
     for i, j, found in look.pieces():
         if not np.isfinite(found):
             start = unseen.pop()[0] if unseen and unseen[-1][1] == look.t[i] else float(look.t[i])
@@ -88,13 +95,8 @@ def certify(result: Result, rtol: float | None, atol: ArrayLike | None) -> Certi
     return Certificate(defect, where, gap, LIMIT, tuple(unseen), passed, message)
 
 
-def _tolerances(result: Result, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
-    """Those given, else those of the run; and what is wrong with the result, if anything is."""
-    if result.system is None:
-        raise ValueError(
-            "certify needs the system: read a file by twoloop.load(path, system), give a result of another solver "
-            "dataclasses.replace(result, system=system)"
-        )
+def _tolerances(result: Result, n_q: int, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
+    """Those given, else those of the run; and what is wrong with them or the result, if anything is."""
     if result.t.size < 2:
         raise ValueError(f"certify needs a result with two times or more; this one has {result.t.size}: {result}")
     rtol, atol = result.rtol if rtol is None else rtol, result.atol if atol is None else atol
@@ -104,7 +106,7 @@ def _tolerances(result: Result, rtol: float | None, atol: ArrayLike | None) -> t
             "file): give rtol and atol"
         )
     check_positive("rtol", rtol)
-    return float(rtol), check_tolerance("atol", atol, result.system.n_q)
+    return float(rtol), check_tolerance("atol", atol, n_q)
 
 
 class _Look:
@@ -118,9 +120,8 @@ class _Look:
         The widest so far, s.
     """
 
-    def __init__(self, result: Result, rtol: float, atol: Array):
-        self.result, self.system, self.rtol, self.atol = result, result.system, rtol, atol
-        self.sol = result.sol
+    def __init__(self, result: Result, system: ConstrainedSystem, rtol: float, atol: Array):
+        self.result, self.sol, self.system, self.rtol, self.atol = result, result.sol, system, rtol, atol
         self.t, self.states = result.t, np.vstack([result.q, result.v]).T
         if result.sol is not None:  # the states at all steps, and those stored at other times
             table = result.sol.table
@@ -130,7 +131,7 @@ class _Look:
             self.states = states[first]
         self.n_steps, self.untested = self._steps(result)
         self.longest = float(self.t[-1] - self.t[0]) / PIECES
-        blocks = np.abs(self.states).reshape(len(self.t), 2, len(atol))
+        blocks = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
         self.rounding = ROUNDING * np.repeat(blocks.max(axis=(0, 2)), len(atol))
         self.gap = 0.0
         self.remakers: dict[tuple[str, float], Remaker] = {}
@@ -139,8 +140,6 @@ class _Look:
         """How many steps of the run touch each interval, and whether one of them left velocities untested."""
         n, m = len(self.t) - 1, len(result.h)
         untested = np.zeros(m, dtype=bool) if result.untested is None else result.untested
-        if m == n:  # of most results
-            return np.ones(n, dtype=np.int64), untested
         start = self.t[0] if result.sol is None else result.sol.t_min
         ends = start + np.cumsum(result.h)
         near = 1e-9 * (self.t[-1] - self.t[0])
@@ -200,13 +199,13 @@ class _Look:
         return np.inf
 
     def _by(self, method: str, looser: float, i: int, j: int) -> float:
-        """The defect from state i to state j by a method, at tolerances so much looser; of many steps, that of one."""
+        """The defect from state i to state j by a method, at tolerances so much looser."""
         made = self._again(method, looser, self.states[i], i, j)
         if made is None:
             return np.inf
-        n_steps = 1 if j > i + 1 else int(self.n_steps[i])
         at_end = self._distance(made.end, self.states[j], i, j)
-        return max(at_end, self._off_between(made.between, i, j)) / n_steps
+        several = 1 if j > i + 1 else int(self.n_steps[i])  # of a run that kept no state between them
+        return max(at_end, self._off_between(made.between, i, j)) / float(np.sqrt(several))
 
     def _off_between(self, state: Array, i: int, j: int) -> float:
         """How far the dense solution is from a state made again, over the tolerance."""
@@ -249,10 +248,8 @@ class _Look:
         if key not in self.remakers:
             made = explicit() if method == "explicit" else implicit(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
-            rtol, atol = (looser * tighter(each) for each in (np.float64(self.rtol), self.atol))
-            self.remakers[key] = Remaker(
-                self.system, float(self.t[0]), q, v, made, float(rtol), atol, self.longest
-            )
+            rtol, atol = looser * float(tighter(self.rtol)), looser * tighter(self.atol)
+            self.remakers[key] = Remaker(self.system, float(self.t[0]), q, v, made, rtol, atol, self.longest)
         remaker = self.remakers[key]
         t0, t1 = float(self.t[i]), float(self.t[j])
         most = MOST + MOST_A_STEP * (int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest))
@@ -269,9 +266,7 @@ class _Look:
         return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
-def _in_words(
-    result: Result, defect: float, where: float, gap: float, unseen: list[tuple[float, float]]
-) -> str:
+def _in_words(result: Result, defect: float, where: float, gap: float, unseen: list[tuple[float, float]]) -> str:
     """What was found, what it proves and what not."""
     of = result.method or "the run"
     parts = []

@@ -1,10 +1,12 @@
 """Pieces of a run made again: short runs from stored states, by an explicit or an implicit method."""
 
+from __future__ import annotations  # ArrayLike stays a word in help()
+
 import warnings
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
@@ -24,9 +26,9 @@ SHARE = 0.1  # of the tolerances of the run: those of the pieces ...
 FINEST = 1e-13  # ... which rounding allows no smaller
 
 
-def tighter(tolerance: Array) -> Array:
+def tighter(tolerance: ArrayLike) -> Array:
     """Tolerances of a piece made again, for those of the run."""
-    return np.minimum(tolerance, np.maximum(SHARE * tolerance, FINEST))
+    return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
 
 
 def explicit() -> tuple[Method, Array]:
