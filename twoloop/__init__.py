@@ -2,6 +2,7 @@
 
 from twoloop.bdf import BDF
 from twoloop.callbacks import callback
+from twoloop.certificate import Certificate, CertificateWarning
 from twoloop.citations import citation
 from twoloop.consistency import ConstraintWarning
 from twoloop.dop853 import DOP853
@@ -23,6 +24,8 @@ __all__ = [
     "BDF",
     "DOP853",
     "ESDIRK",
+    "Certificate",
+    "CertificateWarning",
     "ConsistentState",
     "ConstrainedSystem",
     "ConstraintWarning",

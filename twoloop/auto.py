@@ -109,6 +109,11 @@ class Auto:
         """Shown in messages and tables."""
         return "auto"
 
+    @property
+    def tested(self) -> str:
+        """What the error estimate of implicit steps is taken over."""
+        return "positions"
+
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)

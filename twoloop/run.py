@@ -365,6 +365,7 @@ class Run:
             rejected_error=errors,
             rejected_convergence=failures,
             partitioned=partitions,
+            untested=steps[1:, a.JACOBIANS] > 0.0,
             sol=recorder.solution(),
             t_events=t_events,
             q_events=q_events,

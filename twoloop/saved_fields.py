@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 STATES = ("q", "v", "a", "lam")
 COUNTS = ("rejected_error", "rejected_convergence", "partitioned")
+NUMBERS = ("rtol", "defect", "widest_gap")  # each may be None
 OF_EVENTS = ("t_events", "q_events", "v_events")
 KINDS = (intervals.APART, intervals.VELOCITIES, intervals.ACCELERATIONS, intervals.ACROSS)
 LARGEST = 2**63
@@ -57,6 +58,13 @@ class Fields:
         for name in COUNTS:
             if name in arrays:
                 self._check(name, bool((self._array(name, h.shape, np.int64) >= 0).all()), "counts")
+        if "untested" in arrays:
+            self._array("untested", h.shape, np.bool_)
+        if "atol" in arrays:
+            self._check("atol", bool((self._finite("atol", (n_q,)) > 0.0).all()), "positive")
+        self.numbers = {name: self._number(name) for name in NUMBERS if words.get(name) is not None}
+        for name, value in self.numbers.items():
+            self._check_word(name, value >= 0.0, "a number that is not negative")
         self.rank = self._whole("rank", 0, min(n_q, n_rows), or_none=True)
         if "redundant" in arrays:
             rows = self._array("redundant", (None,), np.int64)

@@ -204,7 +204,10 @@ def solve_dae(
             lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
             result = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
-        return replace(result, method=chosen.name)
+        untested = result.untested if getattr(chosen, "tested", "all") == "positions" else None
+        own = getattr(chosen, "error_tol", None)  # of Newmark, in the place of both
+        rtol, atol = (float(rtol), atol) if own is None else (float(own), np.full(system.n_q, own))
+        return replace(result, method=chosen.name, rtol=rtol, atol=atol, untested=untested)
     return not_begun(system, t0, event_functions, chosen.name)
 
 

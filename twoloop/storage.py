@@ -14,14 +14,14 @@ from twoloop.checks import shown
 from twoloop.consistency import check_system
 from twoloop.dense import DenseSolution, Interpolator, Table, ranks_at
 from twoloop.result import Result
-from twoloop.saved_fields import COUNTS, OF_EVENTS, STATES, Fields, check_sum
+from twoloop.saved_fields import COUNTS, NUMBERS, OF_EVENTS, STATES, Fields, check_sum
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
 FORMAT = "twoloop result 1"
 ALWAYS = ("t", *STATES, "h")
-SOMETIMES = (*COUNTS, "redundant")
+SOMETIMES = (*COUNTS, "redundant", "atol", "untested")
 
 
 def check_path(path: Any) -> Path:
@@ -40,6 +40,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
         arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
     words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
     words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
+    words |= {name: getattr(result, name) for name in NUMBERS}
     if result.sol is not None:
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
@@ -99,6 +100,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         rank=known.rank,
         system=system,
         method=known.method,
+        **known.numbers,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 
@@ -136,7 +138,8 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str
             f"system must be the one that was solved: ranks of its constraints are {list(ranks)} at the start of the "
             f"run; sol_ranks in the file are {words['sol_ranks']}"
         )
-    interpolator = Interpolator(system, start, row, rtol, np.full(system.n_q, rtol), ranks)
+    atol = arrays.get("atol", np.full(system.n_q, rtol))  # older files have none
+    interpolator = Interpolator(system, start, row, rtol, atol, ranks)
     if "sol_interior_t" in arrays:
         interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])
     return DenseSolution(interpolator, table, words["sol_end"])
