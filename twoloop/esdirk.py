@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 OUTER_SHARE = 3.0  # of the tolerance: the correction that is this small is still made, and convergence is quadratic
 LOOSEST_OUTER = 3e-3  # relative: with larger corrections stiff problems are solved so badly that steps become short
+FEW_STEPS = 1e-3  # tolerance below which the share is smaller by the number of steps over which corrections add up
 OUTER_TOL_FIXED = 1e-12  # relative; stiff forces magnify rounding
 SAFETY = 0.8  # with 0.9 one attempt in seven is refused where the motion is not smooth, as of the stiff beam
 
@@ -101,15 +102,19 @@ class ESDIRK:
 
         make, order = FORMULAS[self.formula]
         A, embedded = make()
-        outer_tol = self.outer_tol
-        if outer_tol is None:
-            outer_tol = OUTER_TOL_FIXED if fixed else min(OUTER_SHARE * least_tolerance(rtol, atol), LOOSEST_OUTER)
+        exponent = 1.0 / (3.0 if order == 2 else 4.0)
+        outer_tol = OUTER_TOL_FIXED if self.outer_tol is None else self.outer_tol
+        if self.outer_tol is None and not fixed:
+            tolerance = least_tolerance(rtol, atol)
+            outer_tol = min(OUTER_SHARE * tolerance, LOOSEST_OUTER) * min(1.0, (tolerance / FEW_STEPS) ** exponent)
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
             kernels.diagonal_step,
-            kernels.diagonal_options(A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol, self.tested == "all"),
+            kernels.diagonal_options(
+                A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol, self.tested == "all", order == 2
+            ),
             kernels.diagonal_memory(len(embedded), n_q),
-            exponent=1.0 / (3.0 if order == 2 else 4.0),
+            exponent=exponent,
             safety=SAFETY,
             predictive=True,
         )

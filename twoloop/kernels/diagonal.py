@@ -8,6 +8,10 @@ where v_j = v + h sum_k a_jk a_k and q_j = q + h sum_k a_jk V_k over the stages 
 (I - z^2 J_q - z J_v) d = F - a with the derivatives of the two-loop right-hand side F, see newton.py. Where the system
 gives tangents, they are those of each iterate: stiff directions turn as the body moves, and after the turn of a large
 step an older matrix no longer contracts. The stages of a method with eigenvalues of its own per stage cannot do so.
+
+With step-size control TR-BDF2 goes on from its embedded formula of order 3, the difference to it filtered three times,
+which leaves the method L-stable: so the errors of many short steps add up to the tolerance, and not to their number
+times it.
 """
 
 import numpy as np
@@ -38,6 +42,7 @@ from twoloop.kernels.newton_banded import filter_error as filter_banded
 from twoloop.kernels.newton_dense import filter_error as filter_dense
 from twoloop.kernels.newton_memory import (
     A_MID,
+    A_NEW,
     CONTRACTION,
     E_Q,
     E_V,
@@ -46,6 +51,7 @@ from twoloop.kernels.newton_memory import (
     HAS_JACOBIAN,
     HAS_TRIAL,
     LAST_ACCEPTED,
+    LASTING,
     N_EIGEN_SCALARS,
     PARTITION_NUMBER,
     PREVIOUS,
@@ -65,21 +71,27 @@ MAX_ITERATIONS = 8
 GROWTH = 2.0  # of a correction, from which the iteration is given up
 SHARE_IF_LINEAR = 0.01  # of the tolerance of the outer loop, where it does not converge quadratically
 KEPT_WHILE = 0.1  # contraction up to which derivatives that were differenced serve on
+SHARE_OF_VELOCITY = 0.1  # what a correction counts as by the position that its velocity leads to
+FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
 
-# `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^
+# `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^, and 1
+# if steps with an error estimate go on from the embedded formula
 PLACE = N_SCALARS + 2 + 5
 TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
 
 
 def diagonal_options(
-    A: ArrayLike, c: ArrayLike, weights: ArrayLike, inner_tol: float, outer_tol: float, velocities: bool
+    A: ArrayLike, c: ArrayLike, weights: ArrayLike, inner_tol: float, outer_tol: float, velocities: bool, embedded: bool
 ) -> NDArray[np.float64]:
-    """The parameter block: A (s, s) with zeros in its first row and gamma on the diagonal below, b its last row."""
+    """The parameter block: A (s, s) with zeros in its first row and gamma on the diagonal below, b its last row.
+
+    `embedded`: the embedded formula is the one of higher order, from which steps go on.
+    """
     A, c, weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights))
     gamma = A[-1, -1]
     one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
     newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
-    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights])
+    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, [float(embedded)]])
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
@@ -179,9 +191,9 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
         else:
             correct(f, w, options, memory, _one(options), residual, A_stage)
         change = 0.0
+        share = max(z / scale_q, SHARE_OF_VELOCITY * min(memory[LASTING] / scale_q, 1.0 / scale_v))
         for m in w.independent:
-            d = abs(residual[0, m])
-            change = max(change, z * z * d / scale_q)
+            change = max(change, z * abs(residual[0, m]) * share)
         if not np.isfinite(change):
             return OUTER_DIVERGED
         contraction = 0.0
@@ -208,15 +220,32 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
 
 
 @compiled
+def _filter(f, w, options, memory, h, e_q, e_v):
+    """(I - z J)^-1 (e_q, e_v) by the last factors, J being the Jacobian of (v, F); all n_dof numbers in (n_q)."""
+    z = h * _gamma(options)
+    count = w.independent.size
+    if _dense_tangents(f, w):
+        filter_by_iteration(w, memory, z, e_q[:count], e_v[:count])
+    elif f.flags[BANDWIDTH] >= 0:
+        filter_banded(f, w, options, memory, _one(options), h, e_q, e_v)
+    else:
+        filter_dense(w, options, memory, _one(options), h, e_q[:count], e_v[:count])
+    for i in range(count):
+        e_q[i] += z * e_v[i]
+
+
+@compiled
 def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights):
     """Largest component, over atol + rtol |value|, of the difference to the embedded formula.
 
-    It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
+    It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it. An error of velocity
+    moves the positions for as long as it lasts: J J e shows the square of the rate at which it turns back or decays.
+    So what a force leaves that jumps within a step is found, and vibrations that do not matter are passed over.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
-    z = h * _gamma(options)
     e_q, e_v = vector(memory, 1, n, E_Q), vector(memory, 1, n, E_V)
+    raw, once = vector(memory, 1, n, A_NEW), vector(memory, 1, n, A_MID)
     count = w.independent.size
     for i in range(count):
         j = w.independent[i]
@@ -226,22 +255,41 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
             in_v += weights[k] * A_stage[k, j]
         e_q[i] = h * in_q
         e_v[i] = h * in_v
-    if _dense_tangents(f, w):
-        filter_by_iteration(w, memory, z, e_q[:count], e_v[:count])
-    elif f.flags[BANDWIDTH] >= 0:
-        filter_banded(f, w, options, memory, _one(options), h, e_q, e_v)
-    else:
-        filter_dense(w, options, memory, _one(options), h, e_q[:count], e_v[:count])
+    copy(e_v, raw)
+    _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
     for i in range(count):
         j = w.independent[i]
-        in_q = e_q[i] + z * e_v[i]
         scale = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
-        error = max(error, abs(in_q) / scale)
+        error = max(error, abs(e_q[i]) / scale)
         if options[PLACE + VELOCITIES] == 1.0:
             scale = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
             error = max(error, abs(e_v[i]) / scale)
+    copy(e_v, once)
+    _filter(f, w, options, memory, h, e_q, e_v)
+    largest, turn = 0.0, 0.0
+    for i in range(count):
+        largest = max(largest, abs(e_v[i]))
+        turn = max(turn, abs(e_v[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
+    if largest > 0.0:
+        memory[LASTING] = h * _gamma(options) * np.sqrt(largest / turn)
+    for i in range(count):
+        j = w.independent[i]
+        scale_q = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
+        scale_v = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
+        error = max(error, abs(e_v[i]) * min(memory[LASTING] / scale_q, 1.0 / scale_v))
     return error
+
+
+@compiled
+def _extrapolate(f, w, options, memory, h, q1, v1):
+    """From the end of the step by the formula to that of the embedded one; its difference was filtered twice."""
+    e_q, e_v = vector(memory, 1, w.Q.size, E_Q), vector(memory, 1, w.Q.size, E_V)
+    for _ in range(2, FILTERED):
+        _filter(f, w, options, memory, h, e_q, e_v)
+    for i in range(w.independent.size):
+        q1[w.independent[i]] -= e_q[i]
+        v1[w.independent[i]] -= e_v[i]
 
 
 @kernel(STEP, vectorized=True)
@@ -297,6 +345,8 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights)
         if not error <= 1.0:
             return DONE, error
+        if options[options.size - 1] == 1.0:
+            _extrapolate(f, w, options, memory, h, q1, v1)
     keep_predicted(w, q1)
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
