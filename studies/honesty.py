@@ -288,11 +288,14 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
 def trust_in(rows: pd.DataFrame) -> dict[str, Any]:
     """Runs on all traps, and those wrong without a word: of the default, compiled, of our others, of others."""
     ran = rows[rows["outcome"] != NOT_RUN]
-    wrong = ran["outcome"].isin((SILENT, UNASKED, HANG))
+    wrong, unasked = ran["outcome"].isin((SILENT, HANG)), ran["outcome"] == UNASKED
     ours = ran["solver"].str.endswith("(two-loop)")
     default, compiled = ran["solver"] == DEFAULT, ran["solver"] == DEFAULT_COMPILED
     parts = {"default": default, "compiled": compiled, "ours": ours & ~default & ~compiled, "others": ~ours}
-    return {name: {"n": int(which.sum()), "wrong": int((wrong & which).sum())} for name, which in parts.items()}
+    return {
+        name: {"n": int(which.sum()), "wrong": int((wrong & which).sum()), "unasked": int((unasked & which).sum())}
+        for name, which in parts.items()
+    }
 
 
 def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:

@@ -204,7 +204,7 @@ def families() -> dict[str, Draw]:
 
     def noise(g: np.random.Generator) -> Sharp:
         b = 0.05
-        force = made("noise by interpolation", 8, (log(g, 3.0, 20.0), b), breaks=tuple(b * np.arange(1, N_TABLE - 3)))
+        force = made("noise by interpolation", 8, (log(g, 3.0, 20.0), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
         force.parameters[TABLE:] = g.standard_normal(N_TABLE)
         return force
 
@@ -249,7 +249,7 @@ def families() -> dict[str, Draw]:
 
     def packet(g: np.random.Generator) -> Sharp:
         c, b = when(g), log(g, 0.01, 0.1)
-        return made("wave packet", 22, (log(g, 10.0, 200.0), b, c, log(g, 30.0, 500.0)), windows=about(c, b))
+        return made("wave packet", 22, (log(g, 10.0, 100.0), b, c, log(g, 30.0, 300.0)), windows=about(c, b))
 
     def driven(name: str, kind: int, low: float, high: float) -> Draw:
         def draw(g: np.random.Generator) -> Sharp:
@@ -283,14 +283,14 @@ def families() -> dict[str, Draw]:
     found["high power of x"] = follows(
         "high power of x", 18, decades(10.0, 100.0), lambda g: 2.0 * g.integers(5, 33) + 1.0
     )
-    found["magnet"] = follows("magnet", 20, decades(10.0, 200.0), decades(0.003, 0.1), between(-0.4, 0.5))
+    found["magnet"] = follows("magnet", 20, decades(10.0, 100.0), decades(0.03, 0.2), between(-0.4, 0.5))
     found["backlash"] = follows("backlash", 24, decades(50.0, 2000.0), decades(0.03, 0.3))
     found["resonance in v"] = lambda g: made(
-        "resonance in v", 21, (log(g, 3.0, 60.0), log(g, 0.01, 0.2), float(g.uniform(-1.5, 1.5)))
+        "resonance in v", 21, (log(g, 3.0, 60.0), log(g, 0.1, 0.5), float(g.uniform(-1.5, 1.5)))
     )
-    found["spikes"] = whole("spikes", 23, decades(5.0, 60.0), decades(3.0, 15.0), decades(20.0, 1000.0))
+    found["spikes"] = whole("spikes", 23, decades(5.0, 60.0), decades(3.0, 10.0), decades(20.0, 200.0))
     found["rectified sine"] = rectified
     found["drive with a kink"] = driven("drive with a kink", 1, 1.0, 2.0)
-    found["drive with a gust"] = driven("drive with a gust", 2, 0.005, 0.3)
-    found["drive with a step"] = driven("drive with a step", 3, 0.003, 0.2)
+    found["drive with a gust"] = driven("drive with a gust", 2, 0.01, 0.3)
+    found["drive with a step"] = driven("drive with a step", 3, 0.01, 0.2)
     return found

@@ -26,6 +26,7 @@ PARTS = 40  # steps of a window, at least
 NUDGE = 1e-6  # of a state, to see how errors grow
 FROM = (0, 4, 8)  # places in TIMES at which it is disturbed
 LOOSENESS = 1e3  # an answer is right within so many tolerances, times the growth of errors ...
+JUMPS = 10  # ... and once more for as many jumps ...
 LEAST = 3e-12  # ... a tolerance below which no more is asked
 CHAOTIC = 1e3  # growth beyond which a motion is not used
 RIGHT, SAID, SILENT = "right", "said so", "wrong and silent"
@@ -126,14 +127,15 @@ def case(family: str, seed: list[int]) -> tuple[Mechanism, Motion, int]:
             return mechanism, known, n_drawn
 
 
-def allowed(known: Motion, tolerance: float) -> float:
+def allowed(known: Motion, tolerance: float, n_jumps: int = 0) -> float:
     """Error up to which an answer is right."""
-    return LOOSENESS * max(tolerance, LEAST) * known.growth
+    return LOOSENESS * (1.0 + n_jumps / JUMPS) * max(tolerance, LEAST) * known.growth
 
 
 def judged(mechanism: Mechanism, known: Motion, method: str, tolerance: float, time_limit: float, **more: Any) -> Row:
     """A run and its outcome."""
-    row: Row = {"status": "", "message": "", "error": None, "allowed": allowed(known, tolerance), "warned": ""}
+    limit = allowed(known, tolerance, len(mechanism.sharp.breaks))
+    row: Row = {"status": "", "message": "", "error": None, "allowed": limit, "warned": ""}
     options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": time_limit, "t_eval": TIMES, **more}
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

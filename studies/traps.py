@@ -286,13 +286,16 @@ def end_under_force(mechanism: Mechanism) -> Array:
     return ends[0]
 
 
-def under_forces(quick: bool) -> Iterator[Trap]:
-    """Sharp forces on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
+def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
+    """Families of sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
     every = [(family, bodies) for family in FORCES for bodies in (pendulum, bars, slider_in_space)]
     every += [(KINK, pendulum), (KINK, masses)]
-    if quick:
-        every = [(family, pendulum) for family in QUICK_FORCES]
-    for family, bodies in every:
+    return [(family, pendulum) for family in QUICK_FORCES] if quick else every
+
+
+def under_forces(quick: bool) -> Iterator[Trap]:
+    """The traps that are made of these."""
+    for family, bodies in forces(quick):
         drawn = families()[family](np.random.default_rng([SEED, [*FORCES, KINK].index(family)]))
         mechanism = bodies(drawn)
         yield Trap(

