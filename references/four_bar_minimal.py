@@ -85,7 +85,7 @@ class MinimalFourBar:
         self._gravity = gravity
         angles = _assemble(self._lengths, ground, theta3, branch)
         start = np.append(angles, 0.0)
-        push = self._rate(0.0, start)[3]
+        push = self.rate(0.0, start)[3]
         if not abs(push) > 1e-9:
             raise ValueError(f"the linkage must not start in equilibrium; its initial u' is {push:.3g}")
         half = self._swing(start)
@@ -134,8 +134,8 @@ class MinimalFourBar:
             return y[3]
 
         rest.terminal = True  # type: ignore[attr-defined]
-        rest.direction = -math.copysign(1.0, self._rate(0.0, start)[3])  # type: ignore[attr-defined]
-        rough = solve_ivp(_counted(self._rate), (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
+        rest.direction = -math.copysign(1.0, self.rate(0.0, start)[3])  # type: ignore[attr-defined]
+        rough = solve_ivp(_counted(self.rate), (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
         if rough.status == -1:
             raise ValueError(f"the linkage's equation of motion cannot be integrated: {rough.message}")
         if rough.status != 1:
@@ -144,7 +144,7 @@ class MinimalFourBar:
             )
         end = float(rough.t[-1])
         fine = solve_ivp(
-            _counted(self._rate),
+            _counted(self.rate),
             (0.0, 1.1 * end),
             start,
             "DOP853",
@@ -158,8 +158,23 @@ class MinimalFourBar:
             raise ValueError(f"the linkage comes to rest at {end:g} s with loose tolerances, and not with tight ones")
         return fine
 
-    def _rate(self, t: float, state: Array) -> Array:
-        """(th', u') from Lagrange's equation for u; x and y are the centres' displacements along the tangent."""
+    def coordinates(self, state: Array) -> Array:
+        """Absolute coordinates (9,) of a state [th1, th2, th3, u]."""
+        q = np.empty(9)
+        q[0::3] = _centres(self._lengths, np.cos(state[:3]))
+        q[1::3] = _centres(self._lengths, np.sin(state[:3]))
+        q[2::3] = state[:3]
+        return q
+
+    def tangent(self, state: Array) -> Array:
+        """Rates of the three angles of a state over its u."""
+        return _tangent(self._lengths, state[:3])
+
+    def rate(self, t: float, state: Array, torque: float = 0.0) -> Array:
+        """(th', u') from Lagrange's equation for u, with a torque on the first bar.
+
+        x and y are the centres' displacements along the tangent.
+        """
         L, masses = self._lengths, self._masses
         angles, u = state[:3], state[3]
         n = _tangent(L, angles)
@@ -170,7 +185,7 @@ class MinimalFourBar:
         inertias = masses * L**2 / 12.0
         inertia = masses @ (x * x + y * y) + inertias @ (n * n)
         coupling = masses @ (x * x_s + y * y_s) + inertias @ (n * n_s)
-        return np.append(n * u, -(coupling * u**2 + self._gravity * (masses @ y)) / inertia)
+        return np.append(n * u, (torque * n[0] - coupling * u**2 - self._gravity * (masses @ y)) / inertia)
 
 
 def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:

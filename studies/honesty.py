@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any
@@ -15,21 +16,29 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from references.cvode_c import solve_cvode_c
 from references.ida import solve_ida
 from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
 from studies import study
 from studies.cli import StudyError
 from studies.render import render, table
+from studies.sharp_forces import T_END
 from studies.store import Output, Row
-from studies.traps import Trap, traps
+from studies.traps import AGREE as TRUE_TO
+from studies.traps import FORCE, MISTAKE, Trap, traps
 from twoloop import ConstrainedSystem, Result, solve_dae
 
 Array = NDArray[np.float64]
 
 OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
-IDA_C = "IDA from C"
+IDA_C, CVODE_C, HEYOKA = "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
+OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
+    *("auto, compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14", "Gauss16", "SunRadau5"),
+    *("RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
+)
+DEFAULT, DEFAULT_COMPILED = "auto (two-loop)", "auto, compiled (two-loop)"
 QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
@@ -48,9 +57,10 @@ Call = Callable[[Trap], Result]
 
 def own(method: str, trap: Trap) -> Result:
     """One of ours, as a user calls it."""
-    tolerances = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
-    span = (0.0, trap.t_end)
-    return solve_dae(trap.system, span, trap.q0, trap.v0, method=method, **tolerances, **trap.steps)  # type: ignore[arg-type]
+    name, _, code = method.partition(", ")
+    options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
+    options |= {"compiled": True} if code else {}
+    return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, method=name, **options, **trap.steps)
 
 
 def scipy(method: str, trap: Trap) -> Result:
@@ -68,14 +78,28 @@ def ida_c(trap: Trap) -> Result:
     return solve_ida_c(*_start(trap), trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
 
 
+def cvode_c(trap: Trap) -> Result:
+    """CVODE's library with code made of the mechanism."""
+    return solve_cvode_c(*_start(trap), "Adams", trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
+
+
+def heyoka(trap: Trap) -> Result:
+    """heyoka's Taylor series, compiled for the mechanism."""
+    from references.heyoka_taylor import solve_heyoka
+
+    return solve_heyoka(*_start(trap), trap.tolerance, time_limit=trap.time_limit)
+
+
 def _start(trap: Trap) -> tuple[Any, Any, Any, Any]:
     return trap.system, (0.0, trap.t_end), trap.q0, trap.v0
 
 
-def solvers(quick: bool) -> dict[str, Call]:
-    """Name to call; "two-loop" ones first."""
-    made: dict[str, Call] = {f"{name} (two-loop)": partial(own, name) for name in (QUICK_OWN if quick else OWN)}
+def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
+    """Name to call, of those that are asked a group of traps; "two-loop" ones first."""
+    ours = (*OWN, *(OF_FORCES if group == FORCE else ()))
+    made: dict[str, Call] = {f"{name} (two-loop)": partial(own, name) for name in (QUICK_OWN if quick else ours)}
     made |= {} if quick else {"IDA, stabilised": ida, IDA_C: ida_c}
+    made |= {CVODE_C: cvode_c, HEYOKA: heyoka} if group == FORCE and not quick else {}
     return made | {f"{name}, index 1": partial(scipy, name) for name in (QUICK_SCIPY if quick else SCIPY)}
 
 
@@ -124,7 +148,7 @@ def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
             result = call(trap)
             made |= {"status": result.status.name, "message": result.message}
             if result.success and truth is not None:
-                made["error"] = float(np.abs(result.q[:, -1] - truth).max())
+                made["error"] = float(np.nanmax(np.abs(result.q[:, -1] - truth)))
             if result.success and trap.unnoticed is not None:
                 without = call(replace(trap, system=trap.unnoticed))
                 made["asked"] = not np.array_equal(result.q, without.q)
@@ -146,9 +170,14 @@ def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
     return SILENT if row["asked"] else UNASKED
 
 
+def about(name: str, trap: Trap) -> Row:
+    """Which cell it is."""
+    return {"group": trap.group, "trap": trap.name, "mechanism": trap.mechanism, "solver": name}
+
+
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """One cell, in a process of its own that is ended when it does not come back."""
-    row: Row = {"trap": trap.name, "mechanism": trap.mechanism, "solver": name, "tol": trap.tolerance}
+    row = about(name, trap) | {"tol": trap.tolerance}
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=cell, args=(call, trap, truth, there), daemon=True)
@@ -170,10 +199,10 @@ def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
 def make(output: Output) -> pd.DataFrame:
     """Make all cells. The checks of a start in our adapters of foreign solvers are off: those are to answer alone."""
     rows = []
-    known = solvers(output.call.quick)
     with output.kept() as kept, unchecked():
         compiled: set[tuple[Any, ...]] = set()
         for trap in traps(output.call.quick):
+            known = solvers(output.call.quick, trap.group)
             if all(f"{trap.name} | {trap.mechanism} | {name}" in kept for name in known):
                 truth = None
             else:
@@ -182,8 +211,7 @@ def make(output: Output) -> pd.DataFrame:
                 key = f"{trap.name} | {trap.mechanism} | {name}"
                 if key not in kept:
                     if why := why_not(name, trap):
-                        row = {"trap": trap.name, "mechanism": trap.mechanism, "solver": name, "outcome": NOT_RUN}
-                        kept.add(key, row | {"status": "", "message": why})
+                        kept.add(key, about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why})
                     else:
                         warm_up(name, call, trap, compiled)
                         kept.add(key, run(name, call, trap, truth))
@@ -195,6 +223,8 @@ def why_not(name: str, trap: Trap) -> str:
     """Why a solver is not run on a trap; "" where it is."""
     if trap.steps and not name.endswith("(two-loop)"):
         return "its adapter takes no steps"
+    if name == HEYOKA and find_spec("heyoka") is None:
+        return "heyoka is not installed"
     return "it takes compiled functions only" if name == IDA_C and trap.system.called_in_python else ""
 
 
@@ -218,7 +248,9 @@ class unchecked:
     """Context: references/ without the check of a start, which is ours."""
 
     def __enter__(self) -> None:
-        self.patches = [patch(f"references.{name}.check_start") for name in ("ida", "ida_c", "index1")]
+        self.patches = [
+            patch(f"references.{name}.check_start") for name in ("cvode_c", "heyoka_taylor", "ida", "ida_c", "index1")
+        ]
         for each in self.patches:
             each.start()
 
@@ -227,8 +259,47 @@ class unchecked:
             each.stop()
 
 
-def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
+def counts_of(rows: pd.DataFrame) -> dict[str, int]:
+    """Runs, and how many of them had each outcome."""
+    return {"n": len(rows)} | {what: int((rows["outcome"] == what).sum()) for what in ORDER}
+
+
+def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says: of mistakes and of forces, and of both together how far ours can be trusted."""
+    rows, forces = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE))
+    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(all_rows)}
+    return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO}
+
+
+def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
+    """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
+    ran = rows[rows["outcome"] != NOT_RUN]
+    ours = ran["solver"].str.endswith("(two-loop)")
+    solvers = [{"solver": str(name)} | counts_of(own) for name, own in ran.groupby("solver", sort=False)]
+    found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "solvers": solvers, "families": []}
+    for family, own in ran.groupby("trap", sort=False):
+        mine = own["solver"].str.endswith("(two-loop)")
+        line = {"family": str(family), "ours": counts_of(own[mine]), "others": counts_of(own[~mine])}
+        found["families"].append(line | {"by": sorted(set(own[mine & (own["outcome"] == SILENT)]["solver"]))})
+    found["mechanisms"] = [str(name) for name in ran["mechanism"].unique()]
+    return found | {"ours": counts_of(ran[ours]), "others": counts_of(ran[~ours])}
+
+
+def trust_in(rows: pd.DataFrame) -> dict[str, Any]:
+    """Runs on all traps, and those wrong without a word: of the default, compiled, of our others, of others."""
+    ran = rows[rows["outcome"] != NOT_RUN]
+    wrong, unasked = ran["outcome"].isin((SILENT, HANG)), ran["outcome"] == UNASKED
+    ours = ran["solver"].str.endswith("(two-loop)")
+    default, compiled = ran["solver"] == DEFAULT, ran["solver"] == DEFAULT_COMPILED
+    parts = {"default": default, "compiled": compiled, "ours": ours & ~default & ~compiled, "others": ~ours}
+    return {
+        name: {"n": int(which.sum()), "wrong": int((wrong & which).sum()), "unasked": int((unasked & which).sum())}
+        for name, which in parts.items()
+    }
+
+
+def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
+    """Outcomes on traps that lie in a model, a motion or a setting."""
     names, trap_names = list(dict.fromkeys(rows["solver"])), list(dict.fromkeys(rows["trap"]))
     found: dict[str, Any] = {"n_traps": len(trap_names), "n_cells": int((rows["outcome"] != NOT_RUN).sum())}
     found["cells"] = []
@@ -278,6 +349,21 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     shown = [what for what in ORDER if what != NOT_RUN]
     counts = [[name, *(each[what] for what in shown)] for name, each in found["counts"].items()]
     ready = {"cells": table(["trap", *short], cells), "counts": table(["solver", *(x.lower() for x in shown)], counts)}
+    of_force = (SILENT, SAID, RIGHT)
+    ready["forces"] = table(
+        ["force", *(f"{whose}: silent / said / right" for whose in ("ours", "others"))],
+        [
+            [each["family"], *("/".join(str(each[whose][what]) for what in of_force) for whose in ("ours", "others"))]
+            for each in found["forces"]["families"]
+        ],
+    )
+    ready["solvers"] = table(
+        ["solver", "silent", "said", "right"],
+        [
+            [each["solver"].replace(" (two-loop)", ""), *(each[what] for what in of_force)]
+            for each in found["forces"]["solvers"]
+        ],
+    )
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 

@@ -1,6 +1,7 @@
 """Random linkages, sizes, masses and long runs: no answer of ours may be wrong and silent."""
 
 import multiprocessing
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from studies import study
+from studies import sharp_runs, study
 from studies.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
 from studies.render import number, power, render, table
 from studies.store import Output, Row
@@ -146,7 +147,7 @@ def make(output: Output) -> pd.DataFrame:
     """Make all rows, those kept from an unfinished run aside."""
     rows: list[Row] = []
     with output.kept() as kept:
-        for part in (linkages, scales, long_runs):
+        for part in (linkages, sharp_runs.random_mechanisms, scales, long_runs):
             for key, run in part(output.call.quick):
                 if key not in kept:
                     kept.add(key, {"rows": run()})
@@ -181,11 +182,12 @@ def limits_of(own: pd.DataFrame) -> dict[str, Any]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     drawn, long = rows[rows["group"] == "linkage"], rows[rows["group"] == "long"]
-    silent = rows[rows["outcome"] == SILENT]
+    silent = rows[(rows["outcome"] == SILENT) & (rows["group"] != sharp_runs.SHARP)]
     found: dict[str, Any] = {"tolerance": TOLERANCE, "looseness": LOOSENESS, "t_end": T_END, "grows": GROWS}
     found["n_linkages"] = len(drawn.groupby(["what", "value"]))
     found["n_redrawn"] = int(drawn.drop_duplicates(["what", "value"])["n_redrawn"].sum())
     found["sensitivity"] = float(drawn["sensitivity"].max())
+    found["sharp"] = sharp_runs.counts(rows[rows["group"] == sharp_runs.SHARP])
     stopped = drawn[drawn["outcome"] == SAID]
     found["n_stopped"], found["n_stopped_rank"] = len(stopped), int(stopped["message"].str.contains("rank").sum())
     found["linkages"] = [
@@ -250,7 +252,9 @@ def tables_of(found: dict[str, Any]) -> dict[str, str]:
         ]
         for line in found["long"]
     ]
+    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT))] for line in found["sharp"]["methods"]]
     return {
+        "sharp": table(("method", RIGHT, SAID, SILENT), sharp),
         "linkages": table(("method", *kinds, "median error", "worst / allowed"), drawn),
         "scales": table(("method", "size, m", "density, kg/m", "density of bar 2 over the others"), reached),
         "long": table(("method", "steps", "max abs C", "max abs C_q v", "energy (J)", "bytes a step"), lasting),
@@ -266,7 +270,11 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
+    """Run the study and write its report; with --features a grid of sharp forces in its place, printed only."""
+    given = sys.argv[1:] if words is None else words
+    if "--features" in given:
+        sharp_runs.main("--quick" in given)
+        return
     study.run_rows("robustness", __doc__, words, make, report)
 
 

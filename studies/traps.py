@@ -11,8 +11,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from studies.cli import StudyError
 from studies.faults import python_copy
 from studies.random_linkages import end_of
+from studies.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families
+from studies.sharp_mechanisms import Mechanism, bars, row, slider_in_space
+from studies.sharp_mechanisms import chain as chain_of
+from studies.sharp_motion import CHECK, RTOL, march, off
 from twoloop import ConstrainedSystem
 from twoloop.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
@@ -20,6 +25,17 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 Array = NDArray[np.float64]
 
 NEVER = 1e30  # s
+MISTAKE, FORCE = "mistake", "force"  # what a trap is made of: a model or a setting, or a force that is sharp
+AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
+SEED = 13  # of the numbers of the forces
+FORCES = (  # families of `sharp_forces`
+    "drag",
+    *(f"tanh friction, width {width:g}" for width in FRICTIONS),
+    *(f"gust of {1e3 * width:g} ms" for width in GUSTS),
+    *("softplus stop", "chirp", "switching drive", "square wave", "noise by interpolation"),
+)
+KINK = "drive with a kink"
+QUICK_FORCES = ("drag", "gust of 30 ms", KINK)
 # places in the parameters: gravity, mass of the last point, stiffness of a spring that holds it, begin and end of a
 # force along x and its size, when the force becomes NaN, when it raises, wrong entry of C_q, amplitude and frequency
 # of the pivot, where the spring is at rest
@@ -143,6 +159,8 @@ class Trap:
         Times at which the right motion is computed in pieces.
     positions : callable or None
         positions(t) -> q, where they are known.
+    group : str
+        MISTAKE or FORCE.
     tolerance, time_limit : float
     steps : mapping
         `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
@@ -163,6 +181,7 @@ class Trap:
     time_limit: float = 10.0
     steps: Mapping[str, float] = field(default_factory=dict)
     unnoticed: ConstrainedSystem | None = None
+    group: str = MISTAKE
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -174,9 +193,9 @@ def start(n: int) -> tuple[Array, Array]:
 
 
 def traps(quick: bool) -> list[Trap]:
-    """All traps, each on a chain of two and of three points; those of positions on two linkages each."""
+    """All traps: mistakes on chains of two and of three points, positions on two linkages each, and sharp forces."""
     made = [trap for n in ((2,) if quick else (2, 3)) for trap in of_chain(n)]
-    return made + ([] if quick else list(of_linkages()))
+    return made + ([] if quick else list(of_linkages())) + list(under_forces(quick))
 
 
 def of_linkages() -> Iterator[Trap]:
@@ -237,3 +256,56 @@ def of_chain(n: int) -> list[Trap]:
         trap("first step of 1 s", system(), system(), steps={"first_step": 1.0}),
         trap("fixed steps of 0.5 s", system(), system(), steps={"step_size": 0.5}),
     ]
+
+
+def pendulum(sharp: Sharp) -> Mechanism:
+    """A point of 1 kg on a link of 1 m, released 1 rad from the vertical."""
+    one = np.ones(1)
+    return chain_of(sharp, one, one, one, 0.0 * one)
+
+
+def masses(sharp: Sharp) -> Mechanism:
+    """Two masses on springs, the sum of whose places is given."""
+    return row(sharp, np.array([3.0, 8.0]), np.array([1.0, 1.5]), 0.2, 0.0)
+
+
+def end_under_force(mechanism: Mechanism) -> Array:
+    """Positions at the end by two methods of SciPy in independent coordinates; NaN where they are not compared.
+
+    Raises
+    ------
+    StudyError
+        If the two do not agree.
+    """
+    ends = [
+        mechanism.positions(T_END, march(mechanism, method, tolerance, mechanism.y0)[T_END])
+        for method, tolerance in (("DOP853", RTOL), ("LSODA", CHECK))
+    ]
+    if not off(ends[1], ends[0]) <= AGREE:
+        raise StudyError(f"no right answer for {mechanism.sharp.family} on {mechanism.name}: two methods differ")
+    return ends[0]
+
+
+def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
+    """Families of sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
+    every = [(family, bodies) for family in FORCES for bodies in (pendulum, bars, slider_in_space)]
+    every += [(KINK, pendulum), (KINK, masses)]
+    return [(family, pendulum) for family in QUICK_FORCES] if quick else every
+
+
+def under_forces(quick: bool) -> Iterator[Trap]:
+    """The traps that are made of these."""
+    for family, bodies in forces(quick):
+        drawn = families()[family](np.random.default_rng([SEED, [*FORCES, KINK].index(family)]))
+        mechanism = bodies(drawn)
+        yield Trap(
+            family,
+            mechanism.name,
+            mechanism.system,
+            mechanism.q0,
+            mechanism.v0,
+            T_END,
+            mechanism.system,
+            positions=lambda t, mechanism=mechanism: end_under_force(mechanism),  # type: ignore[misc]
+            group=FORCE,
+        )

@@ -9,8 +9,9 @@ import pytest
 
 from studies import honesty
 from studies.render import render
-from studies.traps import of_linkages, traps
+from studies.traps import FORCE, MISTAKE, forces, of_linkages, traps, under_forces
 from twoloop import solve_dae
+from twoloop.methods import PRESETS
 
 TRAPS = {trap.name: trap for trap in traps(quick=True)}
 SOUND = TRAPS["redundant row"]
@@ -98,14 +99,21 @@ def test_ours_say_so(name, method):
 
 def test_sentences_turn_with_the_rows():
     lines = [
-        {"trap": trap, "mechanism": "chain of 2", "solver": solver, "outcome": honesty.RIGHT, "error": 1e-9}
+        {
+            "group": MISTAKE,
+            "trap": trap,
+            "mechanism": "chain of 2",
+            "solver": solver,
+            "outcome": honesty.RIGHT,
+            "error": 1e-9,
+        }
         for trap in ("a", "b")
         for solver in ("BDF (two-loop)", "LSODA, index 1")
     ]
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = {"cells": "", "counts": ""}
+        tables = dict.fromkeys(("cells", "counts", "forces", "solvers"), "")
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
     assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
@@ -119,3 +127,63 @@ def test_sentences_turn_with_the_rows():
     assert "run but one are right" not in told
     assert "All that are run are right: a." in told and "All that are run say so" not in told
     assert "No solver notices: b" in told
+
+
+OURS, COMPILED, OTHER, THEIRS = honesty.DEFAULT, honesty.DEFAULT_COMPILED, "BDF (two-loop)", "LSODA, index 1"
+
+
+def rows_of_forces(wrong=()):
+    """Two runs of each solver, one on a mistake and one under a force; those of `wrong` are wrong and silent."""
+    return pd.DataFrame(
+        [
+            {
+                "group": group,
+                "trap": "gust" if group == FORCE else "a",
+                "mechanism": "pendulum",
+                "solver": solver,
+                "outcome": honesty.SILENT if (solver, group) in wrong else honesty.RIGHT,
+                "error": 1e-9,
+            }
+            for solver in (OURS, COMPILED, OTHER, THEIRS)
+            for group in (MISTAKE, FORCE)
+        ]
+    )
+
+
+def told_of_forces(rows):
+    found = honesty.findings_of(rows)
+    tables = dict.fromkeys(("cells", "counts", "forces", "solvers"), "")
+    return found, render("honesty", found, tables, stamp="stamp", quick=False)
+
+
+def test_trust_is_counted_over_mistakes_and_forces():
+    found, text = told_of_forces(rows_of_forces())
+    assert found["trust"]["default"] == {"n": 2, "wrong": 0, "unasked": 0}
+    assert "None of ours is wrong and silent." in text
+    found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
+    assert {name: each["wrong"] for name, each in found["trust"].items()} == {
+        "default": 0,
+        "compiled": 1,
+        "ours": 1,
+        "others": 1,
+    }
+    assert "the default 0 of 2 runs, compiled 1 of 2, our other methods 1 of 2, other projects' solvers 1 of 2." in text
+    assert "gust (BDF, auto, compiled)." in text
+    line = found["forces"]["families"][0]
+    assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == 1
+
+
+def test_a_force_has_a_known_end_and_all_presets_are_asked():
+    trap = next(trap for trap in under_forces(quick=False) if trap.name == "tanh friction, width 0.1")
+    assert trap.mechanism == "pendulum"
+    assert row_of(trap)["outcome"] == honesty.RIGHT
+    assert row_of(replace(trap, system=TRAPS["drag"].system))["outcome"] == honesty.SILENT
+    asked = {name.removesuffix(" (two-loop)").split(",")[0] for name in honesty.solvers(False, FORCE)}
+    assert set(PRESETS) - asked == {"PaperIRK", "PaperNewmark"}
+
+
+def test_forces_are_on_three_mechanisms():
+    made = [(family, bodies.__name__) for family, bodies in forces(quick=False)]
+    assert len({name for name, _ in made}) >= 15
+    for bodies in ("pendulum", "bars", "slider_in_space"):
+        assert ("gust of 3 ms", bodies) in made

@@ -149,6 +149,25 @@ def test_the_cheapest_are_found_among_ours_and_others():
     assert entry["picks"] == [] and index.overall([entry]) == []
 
 
+def test_the_sentence_on_trust_is_computed(tmp_path):
+    wrong = {"default": 0, "compiled": 3, "ours": 5, "others": 7}
+    trust = {name: {"n": 50, "wrong": n, "unasked": 0} for name, n in wrong.items()}
+    bad = {"ours_bad": [], "others_bad": [], "unasked": 0, "missed_by_all": []}
+    honesty = bad | {"n_traps": 20, "forces": {"n_families": 15, "mechanisms": ["pendulum", "four-bar"]}, "trust": trust}
+    text = front(tmp_path, [case()], honesty=honesty)
+    assert "under 15 kinds of sharp everyday forces" in text and "on 2 mechanisms, and on 20 other traps" in text
+    assert (
+        "0 of 50 runs of the default, 3 of 50 of the compiled default, 5 of 50 of our other methods and 7 of 50" in text
+    )
+    assert "step over" not in text and "random mechanisms under such forces" not in text
+    trust["default"] |= {"unasked": 2}
+    sharp = {"n": 3000, "wrong and silent": 4}
+    text = front(tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []})
+    assert "; 2 more of the default step over a force of 1 ms." in text
+    assert "Of 3000 runs of random mechanisms under such forces, by every preset, 4 are" in text
+    assert "**Trust**" not in front(tmp_path, [case()])
+
+
 def test_mechanisms_of_a_class_with_the_same_picks_are_told_together():
     cheaper = case(name="hoist", at=[at_error(ours=BEST | {"cpu_s": 0.05}, ida=None)])
     mine = case(name="robot", at=[at_error(ours=BEST | {"solver": "mine"})])

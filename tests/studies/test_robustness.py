@@ -111,7 +111,8 @@ def rows_of(outcome, last=1e-16):
     lines[3] |= {"outcome": outcome}
     long = {"group": "long", "what": "long", "method": "BDF", "outcome": "right", "n_steps": 10, "bytes_a_step": 50.0}
     long |= {"first_q": 1e-16, "last_q": last, "first_v": 1e-16, "last_v": 1e-16, "energy": 1e-9}
-    return pd.DataFrame([*lines, long | {"value": 1.0}, long | {"value": 10.0}])
+    sharp = {"group": "sharp", "what": "drag", "name": "pendulum", "method": "auto", "outcome": outcome, "value": 0.0}
+    return pd.DataFrame([*lines, long | {"value": 1.0}, long | {"value": 10.0}, sharp])
 
 
 def text_of(rows):
@@ -122,9 +123,13 @@ def text_of(rows):
 def test_sentences_turn_with_the_rows():
     good = text_of(rows_of("right"))
     assert "No run is wrong and silent" in good
+    assert (
+        "Of 1 runs of 1 random mechanisms under sharp forces, half of them friction, none is wrong and silent." in good
+    )
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
     assert "Wrong and silent: 2 runs" in bad
+    assert "half of them friction, 1 are wrong and silent: drag 1." in bad
     assert "Not all methods are right from" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
