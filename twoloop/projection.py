@@ -185,9 +185,9 @@ def _another_assembly(
         expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
         if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
             continue
-        beside = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
-        beside[columns] = again[columns]
-        beside, excess, _ = _gauss_newton(system, t, beside, np.array(columns, dtype=int), cut)
+        mixed = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
+        mixed[columns] = again[columns]
+        beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
         if beside is None or not excess <= CONVERGED:
             return "ends elsewhere, from where no way leads back to it"
         if distance(beside, found) > SAME * far or sign_at(beside) != sign:
