@@ -264,7 +264,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Say that C_q nearly loses rank at a position, where it does in its own units and in like ones, and by how much."""
+    """Say that C_q nearly loses rank at a position, where it does in its own units and in like ones, and how far."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]
@@ -273,8 +273,8 @@ def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: lis
         return ""
     without = f" without the columns of keep={kept}" if kept else ""
     return (
-        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is {ratios[0]:.2g} of "
-        "the largest"
+        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is {ratios[0]:.2g} "
+        "of the largest"
     )
 
 
