@@ -109,7 +109,7 @@ def test_check_assembly_is_a_flag():
         consistent_state(pendulum(), 0.0, [0.0, -1.0], [0.0, 0.0], check_assembly="no")
 
 
-@pytest.mark.parametrize("beside", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize("beside", [1e-2, 1e-5])
 def test_messages_have_the_digits_that_show_the_difference(beside):
     """A rod whose end is kept next to the height of the pivot: up or down."""
     height = beside * 0.3
@@ -121,7 +121,7 @@ def test_messages_have_the_digits_that_show_the_difference(beside):
         assert float(one) != float(other)
 
 
-@pytest.mark.parametrize("beside", [0.3, 1e-1, 1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("beside", [0.3, 1e-2, 1e-4, 1e-6])
 def test_loss_of_rank_is_said_where_it_is_so(beside):
     problems = [four_bar((0.8, 1.2, 1.0), 2.0, theta3=STRETCHED - beside, branch=branch) for branch in (-1, 1)]
     between = 0.52 * problems[0].q0 + 0.48 * problems[1].q0
