@@ -196,7 +196,13 @@ def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
     jacobian = system.rows(t, q)
     rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
-    return in_words(jacobian, rows) if rows else "or so nearly that Newton cannot tell"
+    if rows:
+        return in_words(jacobian, rows)
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    return (
+        "or so nearly that Newton cannot tell: its smallest singular value at the last state is "
+        f"{values[-1] / values[0]:.1g} of the largest"
+    )
 
 
 def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float, str]:

@@ -140,17 +140,17 @@ def _position(
         raise ValueError(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
             f"iterations max|C| is {_largest(system.constraint(t, where))}. Give a guess that is nearer to an "
-            f"assembled position{_smallest(scaled, free, kept)}"
+            f"assembled position{_smallest(scales, jacobian, free, kept)}"
         )
     if start.excess > 1.0 and check_assembly:
         other = _another_assembly(system, t, found, guess, free, scales, cut)
         if other is not None:
-            there = scales.scaled(system.jacobian(t, found))
+            there = system.jacobian(t, found)
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
                 f"{_change(guess, found, scales)}, and that of another guess as far away {other}. Give a guess that is "
                 "nearer to the assembly that is meant, or farther from a dead centre; check_assembly=False takes the "
-                f"one found{_smallest(there, free, kept)}"
+                f"one found{_smallest(scales, there, free, kept)}"
             )
     return found
 
@@ -185,9 +185,9 @@ def _another_assembly(
         expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
         if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
             continue
-        beside = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
-        beside[columns] = again[columns]
-        beside, excess, _ = _gauss_newton(system, t, beside, np.array(columns, dtype=int), cut)
+        mixed = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
+        mixed[columns] = again[columns]
+        beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
         if beside is None or not excess <= CONVERGED:
             return "ends elsewhere, from where no way leads back to it"
         if distance(beside, found) > SAME * far or sign_at(beside) != sign:
@@ -263,15 +263,18 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
     return direction
 
 
-def _smallest(scaled: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Say that C_q nearly loses rank at the guess, where it does, and by how much."""
-    values = np.linalg.svd(scaled[:, free], compute_uv=False)
-    if len(values) == 0 or values.min() > DEAD_CENTRE * values.max():
+def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
+    """Say that C_q nearly loses rank at a position, where it does in its own units and in like ones, and how far."""
+    if jacobian[:, free].size == 0:
+        return ""
+    values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]
+    ratios = [float(each.min()) / max(float(each.max()), 1e-300) for each in values]
+    if max(ratios) > DEAD_CENTRE:
         return ""
     without = f" without the columns of keep={kept}" if kept else ""
     return (
-        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is "
-        f"{values.min() / max(float(values.max()), 1e-300):.2g} of the largest (rows and columns scaled to like size)"
+        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is {ratios[0]:.2g} "
+        "of the largest"
     )
 
 

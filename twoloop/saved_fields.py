@@ -168,7 +168,7 @@ class Fields:
         return value
 
     def _number(self, name: str) -> float:
-        value = self.words.get(name)
+        value: Any = self.words.get(name)
         if not _is_number(value):
             raise self._wrong(name, "a finite number", shown(value))
         return float(value)

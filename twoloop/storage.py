@@ -88,11 +88,12 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
                 f"system must be the one that was solved, with n_q = {sizes[0]} and n_c + n_a = {sizes[1]}; "
                 f"{system.name!r} has {given[0]} and {given[1]}"
             )
+    always: dict[str, Any] = {name: arrays[name] for name in ALWAYS}
     optional: dict[str, Any] = {name: arrays.get(name) for name in SOMETIMES}
     if known.n_events is not None:
         optional |= {name: [arrays[f"{name}_{k}"] for k in range(known.n_events)] for name in OF_EVENTS}
     return Result(
-        **{name: arrays[name] for name in ALWAYS},
+        **always,
         **optional,
         status=known.status,
         message=known.message,
