@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import compare, metrics
+from studies import compare, metrics, reference_motion
 from studies.bench import Case, Run, called_from
 from studies.solvers import CATALOGUE
 
@@ -76,10 +76,17 @@ def test_called_from_python_is_said_of_what_is():
     assert {name: called_from(Run(case, CATALOGUE[name], 1e-3)) for name in expected} == expected
 
 
-def test_without_a_reference_the_report_says_why(mechanisms):
-    with pytest.raises(SystemExit, match=r"^error: no reference for 'swing'.*shorter --t-end, or more than"):
-        compared(mechanisms, "plain", "--reference-limit", "1e-9")
-    assert "no reference for 'swing'" in (mechanisms.parent / "plain" / "compare.md").read_text()
+def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
+    def not_installed(*arguments):
+        raise RuntimeError("scikit-sundae is not installed")
+
+    monkeypatch.setattr(reference_motion, "_ida", not_installed)
+    says = (
+        r"^error: no reference for 'heavy top': .*time_limit = 1e-09 .*not installed. Choose a shorter --t-end, or more"
+    )
+    with pytest.raises(SystemExit, match=says):
+        compared(mechanisms, "top", "--reference-limit", "1e-9")
+    assert "no reference for 'heavy top'" in (mechanisms.parent / "top" / "compare.md").read_text()
 
 
 def test_functions_that_raise_are_named(mechanisms):
