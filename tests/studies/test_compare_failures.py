@@ -77,15 +77,14 @@ def test_called_from_python_is_said_of_what_is():
 
 
 def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
-    def not_installed(*arguments):
-        raise RuntimeError("scikit-sundae is not installed")
+    def too_slow(problem, t_end, tolerance, time_limit):
+        raise RuntimeError(f"stopped after {time_limit:g} s")
 
-    monkeypatch.setattr(reference_motion, "_ida", not_installed)
-    says = (
-        r"^error: no reference for 'heavy top': .*time_limit = 1e-09 .*not installed. Choose a shorter --t-end, or more"
-    )
+    monkeypatch.setattr(reference_motion, "_own_explicit", too_slow)
+    monkeypatch.setattr(reference_motion, "_ida", too_slow)
+    says = r"^error: no reference for 'heavy top': .*stopped after 7 s\. Choose a shorter --t-end, or more than"
     with pytest.raises(SystemExit, match=says):
-        compared(mechanisms, "top", "--reference-limit", "1e-9")
+        compared(mechanisms, "top", "--reference-limit", "7")
     assert "no reference for 'heavy top'" in (mechanisms.parent / "top" / "compare.md").read_text()
 
 
