@@ -61,8 +61,9 @@ class Case:
         known() -> ReferenceMotion where the motion is known; None: two unlike methods make one.
     n_instants : int
         Common instants, evenly spaced in (0, t_end].
-    conserved : bool
-        Whether the problem's energy is an invariant of the true motion.
+    conserved : bool or None
+        Whether the problem's energy is an invariant of the true motion. None: as the problem says, and where it does
+        not, as the reference shows.
     invariants : mapping
         Further ones: column to invariant(t, q, v), for columns of states.
     watched : tuple of int or None
@@ -86,7 +87,7 @@ class Case:
     t_end: float
     known: Callable[[], ReferenceMotion] | None = None
     n_instants: int = INSTANTS
-    conserved: bool = True
+    conserved: bool | None = None
     invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
     watched: tuple[int, ...] | None = None
     step_sizes: tuple[float, ...] | None = None
@@ -109,7 +110,10 @@ class Case:
     @cached_property
     def scale(self) -> metrics.Scale:
         """Largest kinetic energy and ranges of the reference."""
-        return metrics.Scale(self.problem, self.reference, self.instants, self.conserved)
+        conserved = self.problem.conserved if self.conserved is None else self.conserved
+        if conserved is None:
+            conserved = metrics.keeps_energy(self.problem, self.reference, self.instants)
+        return metrics.Scale(self.problem, self.reference, self.instants, conserved)
 
     def steps(self) -> tuple[float, ...]:
         """Fixed steps, s."""
@@ -140,6 +144,8 @@ class Solver:
         Values of the setting, loose to tight. Empty: those of the case, for "h".
     fixed : mapping
         Settings that do not vary, numbers or texts, for the row.
+    traces : bool
+        Whether it runs the mechanism's functions once, or has a model of its own, and calls none during a run.
     own_accelerations : bool
         Whether the accelerations in its results are not those of eq. (6) at its q and v.
     builds_each : bool
@@ -155,6 +161,7 @@ class Solver:
     values: tuple[float, ...] = ()
     fixed: Mapping[str, float | str] = field(default_factory=dict)
     own_accelerations: bool = False
+    traces: bool = False
     builds_each: bool = False
 
     def grid(self, case: Case) -> tuple[float, ...]:
@@ -306,8 +313,13 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
     if result is None:
         return row | metrics.COLUMNS
     invariants = dict(case.invariants)
-    row |= metrics.measure(case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants)
-    return row if measure is None else row | measure(run, result)
+    try:
+        given = case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants
+        row |= metrics.measure(*given)
+        return row if measure is None else row | measure(run, result)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:  # the rest of the night goes on
+        why = f"{status}, but it cannot be measured: {type(error).__name__}: {error}"
+        return row | metrics.COLUMNS | {"status": "NOT_MEASURED", "message": why}
 
 
 def build(run: Run, repeat: int, built: set[tuple[int, str, float]], limit: float = COMPILING) -> float | None:
@@ -328,8 +340,9 @@ def warm_up(run: Run, repeat: int, limit: float = COMPILING) -> None:
 
 
 def called_from(run: Run) -> str:
-    """What calls the mechanism: Python wherever the mechanism's functions themselves are Python."""
-    return "Python" if run.case.problem.system.called_in_python else run.solver.called_from
+    """What calls the mechanism: Python wherever functions that are called are Python themselves."""
+    in_python = run.case.problem.system.called_in_python and not run.solver.traces
+    return "Python" if in_python else run.solver.called_from
 
 
 def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str]:

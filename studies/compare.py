@@ -1,6 +1,8 @@
 """Work-precision report of a mechanism of your own: our methods beside IDA and SciPy's solvers."""
 
+import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import pandas as pd
 from studies import cli, figures, tables
 from studies.bench import Case, Run, collect
 from studies.cli import StudyError
-from studies.reference_motion import check_published
+from studies.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.render import number, power, render, table
 from studies.solvers import CATALOGUE, COMPARED
 from studies.store import Output
@@ -18,6 +20,7 @@ from twoloop.user_file import problem_from
 
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
+REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
 
 
 def load_problem(where: str) -> Problem:
@@ -32,6 +35,21 @@ def load_problem(where: str) -> Problem:
         return problem_from(where)
     except ValueError as error:
         raise StudyError(str(error)) from None
+
+
+def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
+    """The reference, with a word before and after, as it is the longest part of many comparisons."""
+    print(f"making the reference of {problem.name!r} to {t_end:g} s, at most {limit:g} s a run ...", flush=True)
+    began = time.perf_counter()
+    try:
+        made = make_reference(problem, t_end, limit)
+    except StudyError as error:
+        raise StudyError(f"{error}. Choose a shorter --t-end, or more than --reference-limit {limit:g}") from None
+    except Exception as error:  # of the mechanism's functions
+        said = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+        raise StudyError(f"no reference for {problem.name!r}: {said}") from error
+    print(f"... made in {time.perf_counter() - began:.1f} s; it holds to {made.floor:.0e}", flush=True)
+    return made
 
 
 def runs_of(case: Case, solvers: Sequence[str], quick: bool) -> list[Run]:
@@ -52,6 +70,7 @@ def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict
     floor = float(rows["floor"].iloc[0])
     found: dict[str, Any] = {"name": case.name, "t_end": case.t_end, "floor": floor, "n_instants": case.n_instants}
     found |= {"python": case.problem.system.called_in_python, "unresolved": [e for e in errors if e < floor]}
+    found["any_compiled"] = bool((rows["called_from"] != "Python").any())
     found["cheapest"] = []
     for error in errors:
         ours, others = tables.of_both(tables.ranking(rows, error)).values()
@@ -92,6 +111,9 @@ def _work(words: Sequence[str] | None) -> None:
     )
     parser.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     parser.add_argument("--solvers", nargs="+", metavar="NAME", help=f"of {', '.join(CATALOGUE)}")
+    parser.add_argument(
+        "--reference-limit", type=float, default=REFERENCE_LIMIT, metavar="S", help="s, for each run of the reference"
+    )
     parser.add_argument("--errors", nargs="+", type=float, default=list(ERRORS), help="errors to compare the cost at")
     given = parser.parse_args(words)
     unknown = [name for name in given.solvers or () if name not in CATALOGUE]
@@ -99,24 +121,38 @@ def _work(words: Sequence[str] | None) -> None:
         raise StudyError(f"no solver is called {unknown[0]!r}; there are: {'; '.join(CATALOGUE)}")
     if any(not error > 0.0 for error in given.errors):
         raise StudyError("--errors must be positive")
+    if not given.reference_limit > 0.0:
+        raise StudyError(f"--reference-limit must be positive; given {given.reference_limit:g}")
     given.out = given.out or Path("compare")
     problem = load_problem(given.where)
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
     if not t_end > 0.0:
         raise StudyError(f"--t-end must be positive; given {t_end:g}")
-    case = Case(problem.name, problem, t_end, note=problem.note, timed=0.004 if given.quick else 0.02)
+    known = partial(known_of, problem, t_end, given.reference_limit)
+    case = Case(problem.name, problem, t_end, known, note=problem.note, timed=0.004 if given.quick else 0.02)
     call, errors = cli.call_of("compare", given, words), sorted(given.errors, reverse=True)
     with Output(call) as output:
         if call.redraw:
             rows, line = output.load_rows()
         else:
-            runs = runs_of(case, given.solvers or COMPARED, call.quick)
-            with output.kept({"where": given.where, "t_end": t_end}) as kept:
-                rows = collect(runs, kept)
-            if not (rows["status"] == "REACHED_END").any():
-                raise StudyError(f"no solver reached the end; the first said: {rows['message'].iloc[0]}")
-            line = cli.stamp(call.command)
+            runs, line = runs_of(case, given.solvers or COMPARED, call.quick), cli.stamp(call.command)
+            try:
+                with output.kept({"where": given.where, "t_end": t_end}) as kept:
+                    rows = collect(runs, kept)
+            except StudyError as error:  # without a reference
+                output.write(
+                    "compare.md",
+                    render("compare_failed", {"name": case.name, "why": str(error)}, {"failed": ""}, stamp=line),
+                )
+                raise
             output.save_rows(rows, line)
+            if not (rows["status"] == "REACHED_END").any():
+                why = f"no solver reached the end; the first said: {rows['message'].iloc[0]}"
+                failed = {"failed": table(["solver", "setting", "status", "message"], tables.failures(rows))}
+                output.write(
+                    "compare.md", render("compare_failed", {"name": case.name, "why": why}, failed, stamp=line)
+                )
+                raise StudyError(why)
         report(output, case, rows, line, errors)
     print(f"wrote compare.md, .csv, .json, .png and .svg to {output.path}")
 

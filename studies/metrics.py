@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 CHECKED = 500  # stored instants, evenly chosen, at which violations are taken
 MULTIPLIERS = 100  # stored instants at which multipliers are compared
 LOST = 0.25  # of the largest kinetic energy of the motion: a run with a greater energy error has lost the solution
+KEPT = 1e-8  # of the largest kinetic energy: a reference that loses more, or ...
+FLOORS = 1e3  # ... so many times its floor, as errors of velocities are larger, does not keep its energy
 ASTRAY = 0.1  # of the range of a watched coordinate: a run that strays farther is out of phase
 
 COLUMNS: dict[str, Any] = {
@@ -84,9 +86,9 @@ def violations(system: ConstrainedSystem, result: Result, most: int = CHECKED) -
         t, q, v = float(result.t[k]), result.q[:, k].copy(), result.v[:, k].copy()
         jacobian, bias = system.jacobian(t, q), np.zeros(system.n_c)
         gamma(t, q, v, p, bias)
-        levels["q"][i] = np.abs(system.constraint(t, q)).max()
-        levels["v"][i] = np.abs(jacobian @ v + system.constraint_rate(t, q)).max()
-        levels["a"][i] = np.abs(jacobian @ result.a[:, k] - bias).max()
+        levels["q"][i] = np.abs(system.constraint(t, q)).max(initial=0.0)
+        levels["v"][i] = np.abs(jacobian @ v + system.constraint_rate(t, q)).max(initial=0.0)
+        levels["a"][i] = np.abs(jacobian @ result.a[:, k] - bias).max(initial=0.0)
     return result.t[chosen], levels
 
 
@@ -113,6 +115,19 @@ def _error_lam(system: ConstrainedSystem, result: Result, motion: ReferenceMotio
             return None
         largest = max(largest, float(np.abs(result.lam[:, k] - truth).max()))
     return largest
+
+
+def keeps_energy(problem: Problem, motion: ReferenceMotion, instants: Array) -> bool:
+    """Whether the energy is an invariant, by the power balance of a motion that is known to its floor.
+
+    False, too, of a motion without kinetic energy, which shows nothing.
+    """
+    times = np.concatenate([[0.0], instants])
+    q, v = motion.states(times)
+    energy = np.asarray(problem.energy(times, q, v))
+    kinetic = float((energy - problem.energy(times, q, 0.0 * v)).max())
+    lost = float(np.abs(energy - energy[0]).max())
+    return kinetic > 0.0 and lost <= max(KEPT, FLOORS * motion.floor) * kinetic
 
 
 class Scale:

@@ -53,7 +53,7 @@ def chain(n: int, closed: bool) -> Problem:
         rows.link(f"link {links}", 2 * n - 2, fixed(*nodes[-1]), 1.0 / links)
     name = f"{'closed' if closed else 'open'} chain"
     system, q0 = rows.system(name, bandwidth=2), nodes[:n].ravel()
-    return Problem(name, system, q0, np.zeros(2 * n), (0.0, 1.0), rows.energy)
+    return Problem(name, system, q0, np.zeros(2 * n), (0.0, 1.0), rows.energy, conserved=True)
 
 
 FAMILIES: dict[str, tuple[Callable[[int], Problem], tuple[int, ...]]] = {

@@ -249,22 +249,25 @@ def _all() -> Iterator[Solver]:
         if preset == TAYLOR or preset in COMPILED:
             run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
         # the default compiles another method at other tolerances
-        yield _solver(preset, "two-loop", "compiled", "tol", run, builds_each=preset in COMPILED)
+        yield _solver(
+            preset, "two-loop", "compiled", "tol", run, builds_each=preset in COMPILED, traces=preset in COMPILED
+        )
     yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
     own: dict[str, Any] = {"own_accelerations": True}
+    model = own | {"traces": True}
     for form in IDA_FORMS:
         keeps, run = form == "stabilised", partial(_ida, form)
         yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
     for name, options in ((IDA_C, {}), (IDA_C_ORDER_2, {"max_order": 2, "error_test": "positions"})):
         yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
-    yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True)
+    yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True, traces=True)
     for method in ("Adams", "BDF"):
         run = partial(_cvode_c, method)
-        yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False)
+        yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False, traces=True)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
-    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False)
-    yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True)
-    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False)
+    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
+    yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True, traces=True)
+    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False, traces=True)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
@@ -277,11 +280,11 @@ def _all() -> Iterator[Solver]:
         yield _index_1(baumgarte(name, alpha), False, name, "baumgarte", alpha=alpha)
     for solver in EXUDYN:
         keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
-        yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **own)
+        yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **model)
     for radius in (1.0, 0.6):
         fixed = {"spectral_radius": radius}
         run = partial(_exudyn, "GeneralizedAlpha", fixed)
-        yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **own)
+        yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **model)
     for order, start in product(GEAR_ORDERS, GEAR_STARTS):
         run, fixed = partial(_gear, order, start), {"order": order}
         yield _solver(gear(order, start), "stand-in", "compiled", "h", run, fixed=fixed, **own)

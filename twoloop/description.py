@@ -23,15 +23,15 @@ class Description:
         Names of the coordinates with their units, such as "x of crank (m)". Empty: q0, q1, ...
     energy : callable or None
         energy(t, q, v), J, of one state or of the columns of many.
-    conserved : bool
-        Whether the energy is an invariant.
+    conserved : bool or None
+        Whether the energy is an invariant; None: not known.
     drawing : Drawing or None
         What to draw.
     """
 
     coordinates: tuple[str, ...] = ()
     energy: Callable[[Any, Any, Any], Any] | None = None
-    conserved: bool = False
+    conserved: bool | None = None
     drawing: Drawing | None = None
 
     def with_parameters(self, p: NDArray[Any]) -> Description:

@@ -253,8 +253,8 @@ class Result:
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
         """Draw the coordinates, the energy and the violation of the constraints over time; needs no display.
 
-        A panel for each unit of the coordinates; the energy less that at the start where it is an invariant; the
-        largest violation of positions and of velocities at each time of `t`. What is not known is left out.
+        A panel for each unit of the coordinates; the energy, less that at the start where it is known as an invariant;
+        the largest violation of positions and of velocities at each time of `t`. What is not known is left out.
 
         Parameters
         ----------

@@ -39,7 +39,10 @@ SAVE_EVERY = 10.0  # s
 
 
 def ends(problem: Problem, result: Result) -> dict[str, Any]:
-    """What a sweep measures where it is not told: the last time, steps, evaluations and the largest energy error."""
+    """What a sweep measures where it is not told: the last time, steps, evaluations and the largest energy error.
+
+    The latter is NaN unless the problem says that its energy is an invariant.
+    """
     energy = result.energy if problem.conserved and result.t.size else np.array([np.nan])
     return {
         "t": result.t[-1] if result.t.size else np.nan,
@@ -78,8 +81,8 @@ def sweep(
         one kind.
     measure : callable
         measure(problem, result) -> mapping of further columns, whose values are numbers, strings, True and False or
-        None, in one column of one kind. By default the last time, counts, and the largest energy error where the
-        energy is an invariant.
+        None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN unless
+        the problem says that its energy is an invariant (`conserved`).
     workers : int, optional
         Processes or threads. None: one for each core.
     parallel : {"processes", "threads"}

@@ -184,6 +184,7 @@ def andrews() -> Problem:
         v0=np.zeros(7),
         t_span=(0.0, 0.03),
         energy=Energy(),
+        conserved=True,
         drawing=Drawing(joints, BARS, (1, 2, 6, 8)),
         parameters=PARAMETERS,
         note="The energy counts the potential of the constant torque and is conserved.",

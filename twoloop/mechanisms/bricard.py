@@ -96,6 +96,7 @@ def bricard() -> Problem:
         v0=np.zeros(60),
         t_span=(0.0, 2.0),
         energy=rows.energy,
+        conserved=True,
         drawing=rows.drawing(_end(1, 0.5)),
         parameters={"length": 1.0, "width": WIDTH, "mass": 1.0, "gravity": GRAVITY},
         note="The run of the benchmark is 10 s long.",

@@ -203,6 +203,7 @@ def four_bar(
         v0=np.zeros(9),
         t_span=(0.0, 100.0),
         energy=Energy(lengths_array),
+        conserved=True,
         drawing=_drawing(L1, L2, L3, ground),
         parameters={
             "L1": L1,

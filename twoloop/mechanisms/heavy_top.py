@@ -27,6 +27,7 @@ def heavy_top() -> Problem:
         v0=v0,
         t_span=(0.0, 0.2),
         energy=rows.energy,
+        conserved=True,
         drawing=rows.drawing,
         parameters={"mass": MASS, "length": LENGTH, "inertia": INERTIA, "spin": tuple(SPIN), "gravity": GRAVITY},
         note="The inertia is about the centre of mass, as in Exudyn's model; some give it about the fixed point.",

@@ -80,6 +80,7 @@ def knife_edge() -> Problem:
         v0=v0,
         t_span=(0.0, 10.0),
         energy=energy,
+        conserved=True,
         drawing=Drawing(BodyPoints((0, 0, 0), np.array([[-0.3, 0.0], [0.3, 0.0], [0.0, 0.0]])), ((0, 1),), (2,)),
         parameters={"mass": MASS, "inertia": INERTIA, "slope": SLOPE, "spin": SPIN, "gravity": GRAVITY},
         note="Mass, inertia, slope and spin were chosen for this project.",

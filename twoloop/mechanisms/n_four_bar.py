@@ -86,6 +86,7 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
         v0=v0,
         t_span=(0.0, 10.0),
         energy=rows.energy,
+        conserved=True,
         drawing=drawing,
         parameters={"n": n, "length": 1.0, "mass": 1.0, "gravity": GRAVITY},
         note="Solved along the synchronous branch; the length of the usual run is that of MBSbenchmarksInOpenSim.",

@@ -54,6 +54,7 @@ def _pendulum(name: str, gravity: float, side: int, end: float, **known: object)
         v0=np.zeros(2),
         t_span=(0.0, end),
         energy=rows.energy,
+        conserved=True,
         drawing=rows.drawing(point(0)),
         parameters={"length": 1.0, "mass": 1.0, "gravity": gravity},
         reference=Reference(

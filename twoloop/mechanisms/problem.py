@@ -132,8 +132,9 @@ class Problem:
         Its kinds, of `TAGS`.
     purpose : str
         What it tests, in plain words.
-    conserved : bool
-        Whether the energy is an invariant.
+    conserved : bool or None
+        Whether the energy is an invariant. None: it is not known, and nothing is judged by it; `studies.compare` looks
+        at the energy of its reference then.
     invariants : mapping
         Further ones: name to invariant(t, q, v), as `energy`.
     condition : Condition or None
@@ -163,7 +164,7 @@ class Problem:
     source: str = ""
     tags: tuple[str, ...] = ()
     purpose: str = ""
-    conserved: bool = True
+    conserved: bool | None = None
     invariants: Mapping[str, Callable[[Any, Array, Array], Any]] = field(default_factory=dict)
     condition: Condition | None = None
     coordinates: tuple[str, ...] = ()

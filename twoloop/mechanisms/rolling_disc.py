@@ -121,6 +121,7 @@ def rolling_disc() -> Problem:
         v0=np.array([x, y, -RADIUS * math.sin(lean) * AHEAD, turn, AHEAD, TURN + turn * math.sin(lean)]),
         t_span=(0.0, 2.0),
         energy=energy,
+        conserved=True,
         drawing=Drawing(rim, (*pairwise((*range(N_RIM), 0)), (0, N_RIM // 2), (N_RIM // 4, 3 * N_RIM // 4)), (N_RIM,)),
         parameters={"mass": MASS, "radius": RADIUS, "gravity": GRAVITY, "angles": ANGLES},
         note="Mass, radius and start were chosen for this project.",

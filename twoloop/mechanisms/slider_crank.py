@@ -66,6 +66,7 @@ def redundant_slider_crank() -> Problem:
         v0=v0,
         t_span=(0.0, 2.0),
         energy=rows.energy,
+        conserved=True,
         drawing=rows.drawing,
         parameters=PARAMETERS,
         reference=computed("redundant slider-crank"),

@@ -76,6 +76,7 @@ def spatial_four_bar() -> Problem:
         v0=v0,
         t_span=(0.0, 2.0),
         energy=rows.energy,
+        conserved=True,
         drawing=rows.drawing,
         parameters={"crank": CRANK, "coupler": length, "rocker": ROCKER, "D": tuple(D), "masses": MASSES},
         note="Dimensions and start were chosen for this project.",

@@ -49,6 +49,7 @@ def spatial_slider_crank() -> Problem:
         v0=v0,
         t_span=(0.0, 5.0),
         energy=rows.energy,
+        conserved=True,
         drawing=rows.drawing,
         parameters={"crank": CRANK, "rod": ROD, "A": tuple(A), "masses": MASSES, "inertias": INERTIAS},
         note=(

@@ -1,0 +1,135 @@
+"""`studies.compare` where something is missing or fails: no reference, no end, no measure, a mass of less rank."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import compare, metrics, reference_motion
+from studies.bench import Case, Run, called_from
+from studies.solvers import CATALOGUE
+
+MECHANISMS = """
+import dataclasses
+import numpy as np
+from twoloop import ConstrainedSystem
+from twoloop.mechanisms import Problem, heavy_top
+
+def top():
+    return dataclasses.replace(heavy_top(), conserved=None)
+
+def swinging(drag, **more):
+    system = ConstrainedSystem.from_python(
+        n_q=2, n_c=1, mass=np.eye(2), force=lambda t, q, v: np.array([0.0, -9.81]) - drag * v,
+        constraint=lambda t, q: np.array([q @ q - 1.0]), jacobian=lambda t, q: 2.0 * q[None, :], name="swing")
+    energy = lambda t, q, v: 0.5 * (v * v).sum(axis=0) + 9.81 * q[1]
+    return Problem("swing", system, np.array([1.0, 0.0]), np.zeros(2), (0.0, 0.5), energy, **more)
+
+def plain():
+    return swinging(0.0)
+
+def raising():
+    return swinging(Raises())
+
+class Raises:
+    def __rmul__(self, v): return self
+    __mul__ = __rmul__
+    def __rsub__(self, v): raise KeyError("x")
+    __array_ufunc__ = None
+
+def still():
+    made = swinging(0.0)
+    return dataclasses.replace(made, q0=np.array([0.0, -1.0]))
+"""
+
+
+@pytest.fixture
+def mechanisms(tmp_path):
+    path = tmp_path / "mechanisms.py"
+    path.write_text(MECHANISMS)
+    return path
+
+
+def compared(path, name, *words):
+    out = path.parent / name
+    compare.main([f"{path}:{name}", "--quick", "--out", str(out), "--errors", "1e-3", *words])
+    return (out / "compare.md").read_text(), pd.read_csv(out / "compare.csv", comment="#")
+
+
+def test_euler_parameters(mechanisms, capsys):
+    solvers = ["DOP853 (two-loop)", "DOP853, projected", "LSODA, index 1"]
+    text, rows = compared(mechanisms, "top", "--t-end", "0.02", "--solvers", *solvers)
+    own = rows[rows["solver"] == solvers[0]]
+    assert set(own["status"]) == {"REACHED_END"} and own["error_q"].max() < 1e-2 and own["energy"].abs().max() > 0.0
+    others = rows[rows["solver"] != solvers[0]]
+    assert set(others["status"]) == {"RAISED"} and others["message"].str.contains("must be positive definite").all()
+    assert "both two-loop" in text and "`DOP853 (two-loop)`" in text
+    said = capsys.readouterr().out
+    assert "making the reference of 'heavy top' to 0.02 s, at most 300 s a run" in said and "it holds to" in said
+
+
+def test_called_from_python_is_said_of_what_is():
+    names = {}
+    exec(MECHANISMS, names)
+    case = Case("case", names["plain"](), 0.1)
+    expected = {"DOP853, compiled": "compiled", "DOP853 (two-loop)": "Python", "LSODA, index 1": "Python"}
+    expected |= {"CVODE from C, Adams": "compiled", "IDA, stabilised": "Python"}
+    assert {name: called_from(Run(case, CATALOGUE[name], 1e-3)) for name in expected} == expected
+
+
+def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
+    def too_slow(problem, t_end, tolerance, time_limit):
+        raise RuntimeError(f"stopped after {time_limit:g} s")
+
+    monkeypatch.setattr(reference_motion, "_own_explicit", too_slow)
+    monkeypatch.setattr(reference_motion, "_ida", too_slow)
+    says = r"^error: no reference for 'heavy top': .*stopped after 7 s\. Choose a shorter --t-end, or more than"
+    with pytest.raises(SystemExit, match=says):
+        compared(mechanisms, "top", "--reference-limit", "7")
+    assert "no reference for 'heavy top'" in (mechanisms.parent / "top" / "compare.md").read_text()
+
+
+def test_functions_that_raise_are_named(mechanisms):
+    with pytest.raises(SystemExit, match=r"^error: no reference for 'swing': KeyError: 'x'; raised by force of system"):
+        compared(mechanisms, "raising")
+
+
+def test_where_no_solver_reaches_the_end_the_report_lists_them(mechanisms):
+    with pytest.raises(SystemExit, match=r"^error: no solver reached the end; the first said: Exudyn needs a model"):
+        compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "Exudyn, GeneralizedAlpha")
+    text = (mechanisms.parent / "plain" / "compare.md").read_text()
+    assert "not compared" in text and "not applicable" in text
+
+
+def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
+    def measure(problem, result, *others):
+        if result.method == "DOP853":
+            raise np.linalg.LinAlgError("Singular matrix")
+        return real(problem, result, *others)
+
+    real = metrics.measure
+    monkeypatch.setattr(metrics, "measure", measure)
+    _, rows = compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "DOP853 (two-loop)", "Gauss12")
+    found = dict(zip(rows["solver"], zip(rows["status"], rows["message"], strict=True), strict=True))
+    assert found["Gauss12"][0] == "REACHED_END" and found["DOP853 (two-loop)"][0] == "NOT_MEASURED"
+    assert found["DOP853 (two-loop)"][1] == "REACHED_END, but it cannot be measured: LinAlgError: Singular matrix"
+
+
+@pytest.mark.parametrize(
+    ("call", "kept"),
+    [("swinging(0.0)", True), ("swinging(0.1)", False), ("swinging(1e-6)", False), ("still()", False), ("top()", True)],
+)
+def test_whether_the_energy_is_an_invariant_is_found(mechanisms, call, kept):
+    names = {}
+    exec(MECHANISMS, names)
+    problem = eval(call, names)
+    assert problem.conserved is None
+    case = Case("case", problem, min(0.5, problem.t_span[1]), n_instants=50)
+    assert (case.scale.kinetic is not None) == kept
+
+
+def test_a_problem_that_says_so_is_believed(mechanisms):
+    names = {}
+    exec(MECHANISMS, names)
+    for said in (True, False):
+        case = Case("case", names["swinging"](0.0, conserved=said), 0.1, n_instants=10)
+        assert (case.scale.kinetic is not None) == said
