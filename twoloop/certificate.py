@@ -23,6 +23,7 @@ ROUNDING = 1e-14  # of the largest coordinate or velocity: what no step can be e
 SEVERAL = 100.0  # the defect of several steps in one piece, from which on each is looked at
 ENOUGH = 3  # wrong steps of a piece, after which the others are not looked at
 NEGLIGIBLE = 1e-10  # singular values of the rows below this share of the largest are zero
+USUAL = 10.0  # growth of an error between two states that says nothing of what is between them
 MOST, MOST_A_STEP = 400, 32  # attempts at steps that a piece may take, and as many more for each step of the run in it
 LOOSER = (10.0, 100.0)  # times the tolerances of a piece, where it cannot be made again with them
 
@@ -49,7 +50,8 @@ class Certificate:
     limit : float
         The largest `defect` of a run that passes.
     unseen : tuple of (float, float)
-        Start and end of parts of the run that could not be made again, s, as near a singular position.
+        Start and end, s, of parts of the run of which nothing can be said: they could not be made again, as near a
+        singular position, or errors grow hundredfold within a step.
     passed : bool
         Whether `defect` is at most `limit`, and nothing is unseen.
     message : str
@@ -98,7 +100,7 @@ def certify(result: Result, rtol: float | None, atol: ArrayLike | None) -> Certi
 def _tolerances(result: Result, n_q: int, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
     """Those given, else those of the run; and what is wrong with them or the result, if anything is."""
     if result.t.size < 2:
-        raise ValueError(f"certify needs a result with two times or more; this one has {result.t.size}: {result}")
+        raise ValueError(f"certify needs a result with two times or more; this one has {result.t.size}")
     rtol, atol = result.rtol if rtol is None else rtol, result.atol if atol is None else atol
     if rtol is None or atol is None:
         raise ValueError(
@@ -190,7 +192,7 @@ class _Look:
                 return least
         if least < np.inf:  # is it the step, or does whatever is there grow so?
             growth = self._growth(by, i, j)
-            return least / max(growth, 1.0) if growth <= LIMIT else np.inf
+            return least / (growth if growth > USUAL else 1.0) if growth <= LIMIT else np.inf
         for looser in LOOSER:  # near a singular position rounding may allow no better
             for method in order:
                 least = self._by(method, looser, i, j)
@@ -239,7 +241,8 @@ class _Look:
 
     def _distance(self, state: Array, other: Array, i: int, j: int) -> float:
         """The largest difference of two states over the tolerance, in what the steps between i and j have tested."""
-        error = np.abs(state - other) / self._allowed(other)
+        with np.errstate(invalid="ignore"):  # of states that are not finite: what comes out is NaN, and not looked at
+            error = np.abs(state - other) / self._allowed(other)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
     def _again(self, method: str, looser: float, start: Array, i: int, j: int) -> Remade | None:
@@ -284,7 +287,10 @@ def _in_words(result: Result, defect: float, where: float, gap: float, unseen: l
         )
     if unseen:
         spans = ", ".join(f"{start:.6g} to {end:.6g}" for start, end in unseen[:3]) + (", ..." if unseen[3:] else "")
-        parts.append(f"Nothing can be said of t = {spans}, where no step could be made again.")
+        parts.append(
+            f"Nothing can be said of t = {spans}, where no step could be made again, or errors "
+            "grow too fast to tell a wrong one."
+        )
     parts.append(
         f"The equations were looked at every {gap:.2g} s or closer: what lasts less may be missed. How errors of steps "
         "grow over the run is not certified, nor is the model."

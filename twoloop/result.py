@@ -164,7 +164,8 @@ class Result:
         Tolerances of a step; those of `Newmark(error_tol=...)` are its own. None where a foreign solver ran.
     untested : ndarray of bool (n_accepted,) or None
         Steps in which the errors of velocities were not tested: those by Newton's method of "auto" and of methods with
-        tested="positions", as "TRBDF2". None: they were tested in all, or a foreign solver ran.
+        tested="positions", as "TRBDF2", and all of `Newmark(error_tol=...)`. None: they were tested in all, or a
+        foreign solver ran.
     """
 
     t: Array

@@ -205,9 +205,10 @@ def solve_dae(
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
             result = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
         untested = result.untested if getattr(chosen, "tested", "all") == "positions" else None
-        own = getattr(chosen, "error_tol", None)  # of Newmark, in the place of both
-        rtol, atol = (float(rtol), atol) if own is None else (float(own), np.full(system.n_q, own))
-        return replace(result, method=chosen.name, rtol=rtol, atol=atol, untested=untested)
+        atol, own = atol.copy(), getattr(chosen, "error_tol", None)
+        if own is not None:  # Newmark's own test, of positions, has its place
+            rtol, atol[:], untested = own, own, np.ones(len(result.h), dtype=bool)
+        return replace(result, method=chosen.name, rtol=float(rtol), atol=atol, untested=untested)
     return not_begun(system, t0, event_functions, chosen.name)
 
 

@@ -1,5 +1,7 @@
 """Tables, figures, animations and sweeps that cannot be made."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from tests.bad_input.case import Case, linkage, solve
@@ -24,6 +26,10 @@ def of_result(what, call, words, advice):
     return Case("result.to_dataframe, .energy, .plot, .animate", what, call, ValueError, words, advice)
 
 
+def of_certify(what, call, words, advice):
+    return Case("result.certify", what, call, ValueError, words, advice)
+
+
 def of_problem(what, call, error, words, advice):
     return Case("Problem and Drawing", what, call, error, words, advice)
 
@@ -42,6 +48,24 @@ RESULTS = [
         lambda: solve().animate("swing.avi"),
         r"path must end in .html, .gif, .mp4",
         "choose one of these endings",
+    ),
+    of_certify(
+        "a result of another solver, or of an older file",
+        lambda: replace(solve(), rtol=None, atol=None).certify(),
+        "certify needs tolerances",
+        "give `rtol` and `atol`",
+    ),
+    of_certify(
+        "a result without its system",
+        lambda: replace(solve(), system=None).certify(),
+        "certify needs the system",
+        "`load(path, system)`, or `dataclasses.replace(result, system=system)`",
+    ),
+    of_certify(
+        "`t_eval` of one time",
+        lambda: solve(t_eval=[0.05]).certify(),
+        "certify needs a result with two times or more",
+        "store more: `dense_output=True`, or a longer `t_eval`",
     ),
     Case(
         "citation", "another object", lambda: citation(linkage()), TypeError, "citation needs a result", "give it one"

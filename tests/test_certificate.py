@@ -1,0 +1,259 @@
+"""`result.certify()`: what passes is right, and what passed over something, was altered or is of other equations fails.
+
+Wrong runs are made so that they stay wrong whatever the methods learn: a run of one system is given another one.
+"""
+
+import math
+import warnings
+from dataclasses import FrozenInstanceError, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.problems import run
+from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, load, solve_dae
+from twoloop.dense import DenseSolution
+from twoloop.mechanisms import (
+    driven_crank,
+    four_bar,
+    moderately_stiff_beam,
+    n_four_bar,
+    redundant_slider_crank,
+    rolling_disc,
+)
+
+END = 3.0
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = 1.0
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    rate = q[0] * v[1] - q[1] * v[0]
+    tangential = p[0] * math.exp(-(((t - p[1]) / p[2]) ** 2)) - p[3] * math.tanh(rate / p[4])
+    Q[0], Q[1] = -tangential * q[1], tangential * q[0] - 9.81
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    Cq[0, 0], Cq[0, 1] = q[0], q[1]
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    Qd[0] = -(v[0] * v[0] + v[1] * v[1])
+
+
+def swing(gust=0.0, at=1.5, width=1.0, friction=0.0, below=1.0):
+    """A pendulum under a gust along its path, and dry friction that is smooth below a speed."""
+    return ConstrainedSystem(
+        n_q=2,
+        n_c=1,
+        mass=mass,
+        force=force,
+        constraint=constraint,
+        jacobian=jacobian,
+        gamma=gamma,
+        parameters=[gust, at, width, friction, below],
+        constant_mass=True,
+        name="swing",
+    )
+
+
+def swung(method="auto", tolerance=1e-6, system=None, **options):
+    start = [math.sin(1.0), -math.cos(1.0)]
+    return solve_dae(system or swing(), (0.0, END), start, [0.0, 0.0], method, tolerance, tolerance, **options)
+
+
+@cache
+def calm(method="auto"):
+    return swung(method)
+
+
+def silently(result, **tolerances):
+    """The certificate of a run that is right: without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CertificateWarning)
+        return result.certify(**tolerances)
+
+
+def refused(result, **tolerances):
+    with pytest.warns(CertificateWarning, match="Not passed"):
+        found = result.certify(**tolerances)
+    assert not found and found.defect > found.limit and str(found).startswith("Not passed")
+    return found
+
+
+METHODS = ["auto", "Taylor", "Adams", "Gauss8", "SunRadau5", "RadauIIA9", "TRBDF2", "ESDIRK4", "BDF", "PaperIRK"]
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-10])
+@pytest.mark.parametrize("method", METHODS)
+def test_right_runs_pass(default_four_bar, method, tolerance):
+    found = silently(run(default_four_bar, 1.0, method=method, rtol=tolerance, atol=tolerance))
+    assert found and found.passed and 0.0 < found.defect <= found.limit
+    assert found.gap < 1.0 / 700.0 and found.unseen == ()
+    assert str(found) == found.message
+
+
+@pytest.mark.parametrize("method", ["Newmark", "PaperNewmark"])
+def test_right_runs_of_many_steps_pass(default_four_bar, method):
+    assert silently(run(default_four_bar, 0.3, method=method, rtol=1e-6, atol=1e-6))
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize("problem", [redundant_slider_crank, rolling_disc, driven_crank, n_four_bar])
+@pytest.mark.parametrize("method", ["auto", "RadauIIA9"])
+def test_redundant_nonholonomic_driven_and_across_a_singular_position(problem, method):
+    assert silently(run(problem(), 1.0, method=method, dense_output=True))
+
+
+@pytest.mark.parametrize("method", ["auto", "TRBDF2"])
+def test_velocities_that_nobody_tested_do_not_count(method):
+    result = run(moderately_stiff_beam(), 0.1, method=method, rtol=1e-4, atol=1e-4)
+    assert result.untested.any()
+    assert silently(result)
+    assert not silently(replace(result, untested=None)).passed  # vibrations that the run passed over
+
+
+def test_an_explicit_run_tests_velocities(default_four_bar):
+    assert not run(default_four_bar, 0.3).untested.any()
+    assert run(default_four_bar, 0.3, method="RadauIIA9").untested is None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"dense_output": True}, {"t_eval": np.linspace(0.0, END, 31)}, {"t_eval": [0.0, END]}, {"max_steps": 15}],
+    ids=["steps", "dense", "t_eval", "ends", "ended early"],
+)
+@pytest.mark.parametrize("method", ["auto", "Adams", "RadauIIA9", "TRBDF2"])
+def test_a_gust_that_a_run_does_not_know(method, options):
+    result = swung(method, **options)
+    assert silently(result)
+    at = float(0.5 * (result.t[0] + result.t[-1]))
+    found = refused(replace(result, system=swing(20.0, at, 0.03)))
+    assert found.t < at + 0.06 and (len(result.t) == 2 or found.t > at - 1.0)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-10])
+def test_what_lasts_as_long_as_the_gap_is_seen_wherever_it_is(tolerance):
+    result = swung(tolerance=tolerance)
+    gap = silently(result).gap
+    assert gap < END / 700.0
+    for at in np.linspace(0.2, 2.6, 12) ** 1.1:
+        assert refused(replace(result, system=swing(20.0, at, 0.5 * gap))).defect > 1e3
+
+
+@pytest.mark.parametrize("changed", [{"friction": 0.01, "below": 1e-3}, {"gust": 1e-2, "width": 10.0}])
+def test_a_force_that_is_a_little_other(changed):
+    refused(replace(calm(), system=swing(**changed)))
+
+
+def test_a_stored_state_that_was_altered(default_four_bar):
+    for options in ({}, {"t_eval": np.linspace(0.0, 1.0, 21)}, {"dense_output": True, "t_eval": [0.0, 0.51, 1.0]}):
+        result = run(default_four_bar, 1.0, **options)
+        k = len(result.t) // 2
+        v = result.v.copy()
+        v[2, k] *= 1.0 + 1e-4
+        found = refused(replace(result, v=v))
+        assert result.t[k] - 0.11 <= found.t <= result.t[k]
+
+
+@pytest.mark.parametrize("method", ["auto", "DOP853", "Gauss8", "RadauIIA9"])
+def test_a_solution_that_is_wrong_between_its_steps_only(default_four_bar, method):
+    result = run(default_four_bar, 1.0, method=method, dense_output=True)
+    interpolator, table = result.sol.interpolator, result.sol.table
+    a = table.states.copy()
+    a[:, 18:] *= 1.01
+    inner = replace(result, sol=DenseSolution(interpolator, table._replace(states=a), result.sol.t_max))
+    assert silently(result)
+    if interpolator.parts == 1 or method == "DOP853":  # else polynomials go through states of their own
+        refused(inner)
+
+
+def test_constant_steps_are_measured_by_the_tolerance_that_is_asked_for(default_four_bar):
+    result = run(default_four_bar, 1.0, method="Gauss4", step_size=0.05)
+    refused(result)  # of 1e-8, which no step was held to
+    assert silently(result, rtol=1e-3, atol=1e-3)
+    assert silently(run(default_four_bar, 1.0, method="Gauss8", step_size=0.01))
+
+
+def test_the_tolerances_of_newmark_are_its_own(default_four_bar):
+    result = run(default_four_bar, 0.05, method="PaperNewmark", rtol=1e-3, atol=1e-3)
+    assert result.rtol == 1e-9 and (result.atol == 1e-9).all() and result.untested.all()
+    assert run(default_four_bar, 0.05, rtol=1e-5, atol=1e-7).rtol == 1e-5
+
+
+def test_a_run_that_an_event_ended(default_four_bar):
+    def end(t, q, v):
+        return q[8] - 1.0
+
+    end.terminal = True
+    for options in ({}, {"dense_output": True}, {"t_eval": np.linspace(0.0, 5.0, 51)}):
+        assert silently(run(default_four_bar, 5.0, events=end, **options))
+
+
+def test_a_result_from_a_file_has_the_same_certificate(default_four_bar, tmp_path):
+    result = run(default_four_bar, 0.5, dense_output=True)
+    result.save(tmp_path / "run.npz")
+    assert load(tmp_path / "run.npz", default_four_bar.system).certify() == result.certify()
+    with pytest.raises(ValueError, match=r"certify needs the system: .* twoloop\.load\(path, system\)"):
+        load(tmp_path / "run.npz").certify()
+
+
+def test_a_result_of_another_solver(default_four_bar):
+    """Without steps, tolerances and accelerations that mean anything."""
+    t = np.linspace(0.0, 0.5, 11)
+    result = run(default_four_bar, 0.5, rtol=1e-10, atol=1e-10, t_eval=t)
+    foreign = replace(result, h=np.empty(0), stats=Statistics(), rtol=None, atol=None, untested=None, method="")
+    with pytest.raises(ValueError, match=r"does not know any .*: give rtol and atol"):
+        foreign.certify()
+    assert silently(foreign, rtol=1e-8, atol=np.full(9, 1e-8))
+    q = foreign.q.copy()
+    q[0, 5] = np.nan
+    assert silently(replace(foreign, q=q), rtol=1e-8, atol=1e-8).unseen == ((t[4], t[6]),)
+
+
+def test_parts_that_cannot_be_made_again_are_named():
+    result = calm()
+    found = silently(replace(result, v=np.where(result.t < 2.0, result.v, np.inf)))
+    (start, end), *others = found.unseen
+    assert not others and not found.passed and end == END and found.gap == end - start
+    assert "Passed in part" in found.message and "Nothing can be said of t = " in found.message
+
+
+def test_a_step_that_grows_errors_is_not_taken_for_a_wrong_one():
+    """An inverted pendulum, stored at its ends alone: an error grows ten thousandfold."""
+    start = [1e-3, math.sqrt(1.0 - 1e-6)]
+    result = solve_dae(swing(), (0.0, 2.5), start, [0.0, 0.0], "RadauIIA9", 1e-4, 1e-4, t_eval=[0.0, 2.5])
+    assert silently(result).defect < 300.0
+
+
+def test_wrong_arguments(default_four_bar):
+    result = run(default_four_bar, 0.1)
+    with pytest.raises(ValueError, match="rtol must be positive"):
+        result.certify(rtol=0.0)
+    with pytest.raises(ValueError, match=r"atol must be a number or have one for each coordinate, shape \(9,\)"):
+        result.certify(atol=[1e-8, 1e-8])
+    short = run(default_four_bar, 0.1, t_eval=[0.1])
+    with pytest.raises(ValueError, match="certify needs a result with two times or more; this one has 1"):
+        short.certify()
+    with pytest.raises(FrozenInstanceError):
+        result.certify().defect = 0.0
+
+
+def test_the_callbacks_are_left_as_they_are(default_four_bar):
+    problem = four_bar()
+    before = problem.system.parameters.copy()
+    result = run(problem, 0.3)
+    first = result.certify()
+    assert (problem.system.parameters == before).all() and result.certify() == first
