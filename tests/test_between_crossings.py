@@ -21,7 +21,7 @@ def worst(state, motion):
 
 @pytest.mark.parametrize(
     ("windows", "coordinates", "tol", "end", "compiled"),
-    [(3, "tips", 3e-9, 10.0, False), (1, "bodies", 1e-10, 5.0, False), (2, "tips", 1e-7, 3.0, True)],
+    [(3, "tips", 3e-9, 10.0, False), (2, "tips", 1e-7, 3.0, True)],
 )
 def test_steps_across_singular_positions(windows, coordinates, tol, end, compiled):
     problem = n_four_bar(windows, coordinates)
@@ -36,18 +36,18 @@ def test_steps_across_singular_positions(windows, coordinates, tol, end, compile
 
 
 def test_no_event_that_is_none_ends_a_run():
-    problem = n_four_bar(1, "bodies")
+    problem = n_four_bar(3)
 
     def far_away(t, q, v):
-        return 4.0 - np.abs(q[[0, 1, 3, 4]]).max()  # the bars reach 2.2 m
+        return 9.0 - np.abs(q).max()  # the bars reach 4 m
 
     far_away.terminal = True
-    t = np.linspace(0.0, 5.0, 400)
-    span = (problem.system, (0.0, 5.0), problem.q0, problem.v0)
-    result = solve_dae(*span, "Adams", 1e-10, 1e-10, events=far_away, t_eval=t)
+    t = np.linspace(0.0, 10.0, 5000)
+    span = (problem.system, (0.0, 10.0), problem.q0, problem.v0)
+    result = solve_dae(*span, "Adams", 3e-9, 3e-9, events=far_away, t_eval=t)
     assert result.status == Status.REACHED_END
     assert result.t_events[0].size == 0
-    assert worst(result, problem.motion).max() < 1e-6
+    assert worst(result, problem.motion).max() < 1e-5
 
 
 def pendulum(force):
@@ -83,7 +83,7 @@ def test_sharp_forces(case, method, tol):
     """Beside steps that the force made short, and within these."""
     system, q0 = case
     span = (system, (0.0, 2.0), q0, [0.0, 0.0])
-    result = solve_dae(*span, method, tol, tol, dense_output=True, max_step=0.5)
+    result = solve_dae(*span, method, tol, tol, dense_output=True)
     assert result.success
     t = inside(result.t)
     pieces = [0.0, 1.0, 2.0] if case is BRAKE else [0.0, 2.0]
