@@ -1,5 +1,7 @@
 """Between steps of very unequal lengths, beside singular positions and forces that jump: as good as at the steps."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -96,7 +98,7 @@ def test_sharp_forces(case, method, tol):
 def _exact(span, pieces, t):
     """States at t, piece by piece: what a force does at its jump belongs to no step."""
     system, _, q, v = span
-    for begin, end in zip(pieces[:-1], pieces[1:], strict=True):
+    for begin, end in pairwise(pieces):
         here = t[(t >= begin) & (t < end)] if end < pieces[-1] else t[t >= begin]
         stops = np.append(here, end) if end < pieces[-1] else here
         made = solve_dae(system, (begin, end), q, v, "DOP853", 1e-12, 1e-12, max_step=0.005, dense_output=True)

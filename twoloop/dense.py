@@ -155,7 +155,16 @@ class Interpolator:
     def _judged(self, table: Table, groups: Groups) -> Array:
         """How far the polynomials of these intervals are off, over the tolerances."""
         out = np.zeros(len(groups))
-        arrays = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups), self.nodes, self.room, self.rows, out)
+        arrays = (
+            self.tolerances,
+            table.t,
+            table.states,
+            np.ascontiguousarray(groups),
+            self.nodes,
+            self.room,
+            self.rows,
+            out,
+        )
         direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
@@ -324,8 +333,8 @@ class DenseSolution:
     own, through v and a (order 8). `RungeKutta` of order 6 and
     more, by Newton's method of order 7 and more, and `Taylor` take steps that are too long for this, in `auto` too:
     each is divided into 2 to 6 equal steps of the method, when the first time within it is asked for, which costs about
-    as much as the run has cost. Where the last of its states changes a polynomial by more than the tolerances, it is held
-    against the constraints and the equations at two places of the interval. Where it is off them, as beside a singular
+    as much as the run has cost. Where the last of its states changes a polynomial by more than the tolerances, it is
+    held against the constraints and the equations at two places of the interval. Where it is off them, as beside a singular
     position or a force that jumps, the interval is divided into four steps of `DOP853` (where Newton's method was at
     work of a Radau method), or its two ends are all that count, whichever fits best. Evaluations for this, and for
     restoring, are counted nowhere.
