@@ -46,7 +46,7 @@ def driven(place, speed, acceleration, gamma=True, mass=MASS):
 
 
 def shaken(jump=0.0, at=np.inf, after_too=True, gamma=True):
-    """The path 0.2 sin 5t, and a ramp of slope `jump` from the time `at` on; whether the slope is there at that time."""
+    """The path 0.2 sin 5t, and a ramp of slope `jump` from `at` on; whether the slope is there at that time."""
 
     def on(t):
         return t >= at if after_too else t > at
@@ -105,7 +105,7 @@ def off(result, expected):
 @pytest.mark.parametrize("method", [name for name in PRESETS if name not in TRACED])
 def test_a_jump_is_an_impulse(case, method):
     jump, at, expected = case
-    tol = 1e-5 if method in LOW_ORDER else 1e-7
+    tol = 1e-5 if method in LOW_ORDER else 1e-7  # the Newmark methods take thousands of steps
     system = shaken(jump, at)
     result = solve_dae(system, (0.0, END), START, velocities(system), method, tol, tol)
     assert result.success

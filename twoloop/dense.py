@@ -346,8 +346,11 @@ class DenseSolution:
     own, through v and a (order 8). `RungeKutta` of order 6 and
     more, by Newton's method of order 7 and more, and `Taylor` take steps that are too long for this, in `auto` too:
     each is divided into 2 to 6 equal steps of the method, when the first time within it is asked for, which costs about
-    as much as the run has cost; where these steps do not converge, next to a singular position, neighbouring states are
-    all there is. Evaluations for this, and for restoring, are counted nowhere.
+    as much as the run has cost. Where the last of its states changes a polynomial by more than the tolerances, it is
+    held against the constraints and the equations at two places of the interval. Where it is off them, as beside a
+    singular position or a force that jumps, the interval is divided into four steps of `DOP853` (of a Radau method
+    where Newton's method was at work), or its two ends are all that count, whichever fits best. Evaluations for this,
+    and for restoring, are counted nowhere.
 
     It takes 8 (2 + 3 n_q) bytes of memory a step.
 

@@ -67,7 +67,7 @@ class Work(NamedTuple):
     mass_pattern: Any  # (n_q, n_q) the same of M; empty without the augmented form
     places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
-    rates: Any  # (9, n_c + n_a) C_t and b at times within a step, see kinks.py
+    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see kinks.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch

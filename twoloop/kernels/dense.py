@@ -49,6 +49,7 @@ TABLE = types.int64[:, ::1]
 PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
 LOOKS = len(PLACES)
 EPS = 2.0**-52
+EVEN = 8.0  # longest over shortest
 NOISY = 10.0  # of the tolerances of velocities
 
 
@@ -195,6 +196,15 @@ def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
             a[m] = slope / h
 
 
+@merged
+def _even(t, lo, hi):
+    """Whether the gaps between these times are of similar length."""
+    shortest, longest = np.inf, 0.0
+    for r in range(lo, hi):
+        shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
+    return longest <= EVEN * shortest
+
+
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
 def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     """How far the polynomials of these intervals are off, over the tolerances, into `out`; 0 where that is soon seen.
@@ -202,7 +212,8 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     Where its last node changes a polynomial by less than the tolerances, it is taken as it is. Else it is held against
     the constraints and the equations, at places within the interval: what its accelerations are off, times the time in
     which a polynomial of its degree can turn, is off in velocity. Accelerations that hold the noise of stiff modes say
-    nothing; of those the change by the last node counts alone.
+    nothing; of those the change by the last node counts alone. Methods of low order take steps that are short for their
+    polynomials, which then are off between unlike steps only.
     """
     n = w.Q.size
     half = z.size // 2
@@ -217,6 +228,8 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
         out[g] = 0.0
+        if kind < ACCELERATIONS and _even(t, lo, hi):
+            continue
         if hi - lo > 1:
             for k in range(LOOKS):
                 s = PLACES[k]
@@ -233,7 +246,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
             _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
             _slope_of_velocity(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
             copy(rows[0], rows[2])
-            code = renew_partition(f, w, t[i], states[i, :n])
+            code = DONE if k > 0 else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
                 code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
             if code != DONE:

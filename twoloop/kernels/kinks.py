@@ -2,9 +2,9 @@
 
 Steps see forces, and an impulse is none: at a jump of C_t methods that restore the dependents leave the independents
 as they were, which no momentum balance allows. So a step whose velocities change by more than its accelerations
-explain is looked at, C_t and b at nine times along a line: what a polynomial of degree 7 leaves of them is next to
-nothing where they are smooth on the scale of the step, and falls by 2^8 where an interval is halved. Of a jump it is
-the jump, in one of the halves, however short they are.
+explain is looked at, C_t and b at thirteen times along a line: what a polynomial of degree 11 leaves of them is next
+to nothing where they are smooth on the scale of the step, and falls by 2^12 where an interval is halved. Of a jump it
+is the jump, in one of the halves, however short they are.
 """
 
 import numpy as np
@@ -12,11 +12,12 @@ import numpy as np
 from twoloop.kernels.common import ATOL, RTOL, compiled
 from twoloop.kernels.constraints import constraint_rates
 
-PARTS = 8
-BINOMIAL = (1.0, -8.0, 28.0, -56.0, 70.0, -56.0, 28.0, -8.0, 1.0)  # the eighth difference
+PARTS = 12
+# the twelfth difference
+BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 HALVINGS = 60
-ROUNDING = 1e-12  # of C_t: what its eighth difference may be for rounding's sake
-BY_TIME = 300.0  # the same, times the rounding of t and the slope
+ROUNDING = 1e-11  # of C_t: what that may be for rounding's sake
+BY_TIME = 5e3  # the same, times the rounding of t and the slope
 STEEP = 4.0  # times the mean slope over the step: a ramp that the step is too long for, unless it is at most ...
 SHORT = 0.125  # ... this share of it
 NEAREST = 8.0  # spacings of floating-point numbers: no interval is halved below this length
@@ -25,7 +26,7 @@ SMOOTH, RAMP, JUMP = range(3)
 
 @compiled
 def _sample(f, w, t, q, way, begin, end):
-    """C_t and b at nine times from begin to end, on the line q + way (time - t), into w.rates."""
+    """C_t and b at thirteen times from begin to end, on the line q + way (time - t), into w.rates."""
     for k in range(PARTS + 1):
         time = end if k == PARTS else begin + (end - begin) * (k / PARTS)
         for m in range(q.size):
