@@ -24,9 +24,10 @@ KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
-AROUND = 8  # states about the start
+AROUND = 8  # states about the start, beside it
 AWAY = 0.3  # of the size of coordinates: how far these are from it
-EACH, MOST = 32, 64  # states of a part of a run, and of a run
+EACH, MOST = 32, 64  # states of a part of a run, and of a run ...
+FEW = 9  # ... if callbacks are called in Python
 ENTRIES = 20_000  # of all callbacks at all states of a run, about: fewer states of large systems
 LOST = 16.0 * np.finfo(float).eps  # of the largest term of all entries: rounding of what operations cancel exactly
 CLEAR = 1e-6  # of the largest term: a smaller difference is no rounding of the callback's if it stays ...
@@ -87,16 +88,17 @@ class Traced:
         """
         if self.trusted:
             return
-        wrong = self.wrong(system, np.concatenate([[t0], q, v])[None, :])
-        for state in _around(t0, t1, q, v) if wrong is None else ():
-            try:
-                with warnings.catch_warnings(), np.errstate(all="ignore"):
-                    warnings.simplefilter("ignore")
-                    wrong = self.wrong(system, state[None, :], everywhere=False)
-            except Exception:  # outside what the callbacks are made for
-                continue
-            if wrong is not None:
-                break
+        wrong = None
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            around = _around(t0, t1, q, v)
+            for states in (around, *around[:, None, :]):  # all at once, or one by one
+                try:
+                    wrong = wrong or self.wrong(system, states, everywhere=False)
+                except Exception:  # outside what the callbacks are made for
+                    continue
+                if states is around:
+                    break
         if wrong is not None:
             raise Untraceable(wrong)
         self.trusted = not system.called_in_python  # whose compiled callbacks do not change any more
@@ -108,7 +110,8 @@ class Traced:
         """
         from twoloop.kernels import traced as kernels
 
-        states = states[:: 1 + len(states) * len(self.places) // ENTRIES]
+        most = FEW if system.called_in_python else MOST
+        states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // ENTRIES)]
         n_different, called, traced, bounds = self._both(system, states)
         if n_different == 0:
             return None
@@ -184,10 +187,10 @@ class Sample:
             self.states = self.states[::2]
 
     def up_to(self, end: float) -> Array:
-        """All of them, the last included."""
+        """All of them, the last first."""
         states = np.concatenate(self.states)
         states = states[states[:, 0] <= end]
-        return states[:: -(1 + len(states) // MOST)]
+        return states[::-1]
 
 
 Check = Callable[[Traced], None]
@@ -198,10 +201,11 @@ def unchecked(traced: Traced) -> None:
 
 
 def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
-    """States [t, q, v] about a start, at times of a run, as fast as it is and as one that moves by its size in 1 s."""
+    """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
     generic = np.random.default_rng(6)
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
     times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)[:, None]
     parts = generic.uniform(-1.0, 1.0, (2, AROUND, len(q)))
-    return np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])
+    around = np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])
+    return np.vstack([np.concatenate([[t0], q, v]), around])
