@@ -157,8 +157,9 @@ def _type_of_work(value: Any, context: Any) -> Any:
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step
+    LEANING,  # largest share of a row that counts in a redundant one, as at the first look under this partition
     N_NOTES,
-) = range(25)
+) = range(26)
 
 # what a kernel returns: DONE, or why it could not
 (
