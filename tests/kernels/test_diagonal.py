@@ -46,7 +46,7 @@ def test_stability_function_vanishes_at_infinity(formula):
 
 
 def growth_of_extrapolated_steps(z, filtered):
-    """Largest factor by which a step multiplies (y, h y') of h y' = z y: y from the embedded formula, y' from a stage."""
+    """Largest factor by which a step multiplies (y, h y') of h y' = z y: y of the embedded formula, y' of a stage."""
     A, embedded = FORMULAS["TRBDF2"][0]()
     g = A[1, 1]
 
