@@ -79,7 +79,8 @@ class Auto:
     matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way. Counts
     decide, not times: a run can be repeated.
 
-    While the implicit method runs, errors of positions are within the tolerances; those of velocities are not tested.
+    While the implicit method runs, errors of positions are within the tolerances; those of velocities are tested
+    for what they will make of the positions before they turn back or decay.
     With constant steps it is `fixed` throughout.
 
     Parameters

@@ -50,9 +50,11 @@ class ESDIRK:
     stops contracting once stiff directions have turned; `RungeKutta(..., outer="newton")`, whose stages share one
     matrix, is held to short steps by that at loose tolerances, and is the better one at tight tolerances.
 
-    Both formulas are L-stable and end with their last stage. A step is accepted when the estimated error of the
-    positions, from the embedded formula and filtered for stiff components, is within the tolerance. Velocities are
-    tested where asked for: vibrations that the steps pass over are damped.
+    Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" goes on from its embedded
+    formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is accepted
+    when the estimated error of the positions, from the embedded formula and filtered, is within the tolerance, and so
+    is what the error of the velocities will make of them before it turns back or decays. Vibrations that the steps pass
+    over are damped; velocities themselves are tested where asked for.
 
     Parameters
     ----------
@@ -63,11 +65,11 @@ class ESDIRK:
         None: 1e-8.
     outer_tol : float, optional
         The outer loop stops when the correction just made changes no independent position by more than this, relative
-        to max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3; with fixed steps 1e-12.
-
+        to max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3, and below tolerances of 1e-3 less by the number of
+        steps over which such corrections add up; with fixed steps 1e-12.
     tested : {"all", "positions"}
-        What the error estimate is taken over: positions and velocities, or positions only. Stiff vibrations that do not
-        matter show in the velocities; "positions" passes over them.
+        What the error estimate is taken over: positions and velocities, or positions and what velocities make of them.
+        Stiff vibrations that do not matter show in the velocities; "positions" passes over them.
 
     Raises
     ------

@@ -72,8 +72,9 @@ class RungeKutta:
         with fixed steps then shows no drift of the energy; where motion does not reverse, as of a turning crank, only
         momenta under one lasting partition do. Step-size control spoils both properties.
     tested : {"all", "positions"}
-        What the error estimate of outer="newton" is taken over: positions and velocities, or positions only. Stiff
-        vibrations that do not matter show in the velocities; "positions" passes over them.
+        What the error estimate of outer="newton" is taken over: positions and velocities, or positions and what
+        velocities make of them before they turn back or decay. Stiff vibrations that do not matter show in the
+        velocities; "positions" passes over them.
     outer_test : {"all", "independent"}
         What (32) of outer="paper" is taken over: all coordinates and velocities, after the dependent ones are restored,
         or the independent ones only. The text of the paper says both. Without effect on other outer loops.

@@ -6,6 +6,7 @@ import pytest
 from tests.problems import worst
 from twoloop import ESDIRK, ConstrainedSystem, RungeKutta, solve_dae
 from twoloop.esdirk import FORMULAS
+from twoloop.kernels.diagonal import FILTERED
 from twoloop.mechanisms import four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import tip_height
 from twoloop.tableaux import radau_iia
@@ -42,6 +43,28 @@ def test_stability_function_vanishes_at_infinity(formula):
     R = lambda z: 1.0 + z * A[-1] @ np.linalg.solve(np.eye(len(A)) - z * A, np.ones(len(A)))  # noqa: E731
     assert abs(R(-1e8)) < 1e-6
     assert max(abs(R(1j * y)) for y in np.logspace(-2, 4, 50)) < 1.0 + 1e-12
+
+
+def growth_of_extrapolated_steps(z, filtered):
+    """Largest factor by which a step multiplies (y, h y') of h y' = z y: y of the embedded formula, y' of a stage."""
+    A, embedded = FORMULAS["TRBDF2"][0]()
+    g = A[1, 1]
+
+    def step(y, rate):
+        rates = np.array([rate, 0.0, 0.0], dtype=complex)
+        for j in (1, 2):
+            stage = (y + A[j, :j] @ rates[:j]) / (1.0 - g * z)
+            rates[j] = z * stage
+        return stage + (embedded - A[-1]) @ rates / (1.0 - g * z) ** filtered, rates[2]
+
+    return np.abs(np.linalg.eigvals(np.transpose([step(1.0, 0.0), step(0.0, 1.0)]))).max()
+
+
+def test_three_filters_keep_the_extrapolated_steps_stable():
+    vibrations, decay = 1j * np.logspace(-2, 5, 200), -np.logspace(-2, 5, 200)
+    assert max(growth_of_extrapolated_steps(z, FILTERED) for z in [*vibrations, *decay]) < 1.0 + 1e-12
+    assert growth_of_extrapolated_steps(-1e8, FILTERED) < 1e-6
+    assert max(growth_of_extrapolated_steps(z, FILTERED - 1) for z in vibrations) > 1.0 + 1e-5
 
 
 @pytest.mark.parametrize(("formula", "limit"), [("TRBDF2", 3e-3), ("ESDIRK4", 1.5e-3)])

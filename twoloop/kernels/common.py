@@ -166,8 +166,9 @@ def _type_of_work(value: Any, context: Any) -> Any:
     WIDEST_GAP,  # between two places at which accepted steps looked at the equations, s
     KINK_BEFORE,  # times between which no jump of C_t or b is known
     KINK_AFTER,
+    LEANING,  # largest share of a row that counts in a redundant one, as at the first look under this partition
     N_NOTES,
-) = range(31)
+) = range(32)
 
 # what a kernel returns: DONE, or why it could not
 (

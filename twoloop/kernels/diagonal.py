@@ -36,6 +36,7 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.iteration_matrix import factor_iteration, filter_by_iteration, solve_iteration
+from twoloop.kernels.lasting import lasting_error
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.newton import correct, derivatives_at, factor_systems
 from twoloop.kernels.newton_banded import filter_error as filter_banded
@@ -238,9 +239,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights):
     """Largest component, over atol + rtol |value|, of the difference to the embedded formula.
 
-    It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it. An error of velocity
-    moves the positions for as long as it lasts: J J e shows the square of the rate at which it turns back or decays.
-    So what a force leaves that jumps within a step is found, and vibrations that do not matter are passed over.
+    It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -267,18 +266,8 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    largest, turn = 0.0, 0.0
-    for i in range(count):
-        largest = max(largest, abs(e_v[i]))
-        turn = max(turn, abs(e_v[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
-    if largest > 0.0:
-        memory[LASTING] = h * _gamma(options) * np.sqrt(largest / turn)
-    for i in range(count):
-        j = w.independent[i]
-        scale_q = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
-        scale_v = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
-        error = max(error, abs(e_v[i]) * min(memory[LASTING] / scale_q, 1.0 / scale_v))
-    return error
+    z = h * _gamma(options)
+    return max(error, lasting_error(w, memory, tolerances, z, raw, once, e_v, state, new_state))
 
 
 @compiled

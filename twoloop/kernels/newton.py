@@ -32,7 +32,9 @@ from twoloop.kernels.common import (
     STEP,
     compiled,
     kernel,
+    merged,
 )
+from twoloop.kernels.lasting import lasting_error
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.newton_memory import (
     A_MID,
@@ -67,7 +69,7 @@ from twoloop.kernels.newton_memory import (
     vector,
 )
 from twoloop.kernels.predictor import restore_predicted
-from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
+from twoloop.kernels.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
 
 MAX_ITERATIONS = 15
 SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
@@ -245,16 +247,30 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 
 @compiled
-def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
+def _filter(f, w, options, memory, h, e_q, e_v):
+    """(I - z J)^-1 (e_q, e_v), z = h gamma0, J being the Jacobian of (v, F); all n_dof numbers in (n_q)."""
+    s = int(options[STAGES])
+    m = w.independent.size
+    if f.flags[BANDWIDTH] >= 0:
+        newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
+    else:
+        newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
+    for i in range(m):
+        e_q[i] += h * options[eigen_place(options, s) + GAMMA0] * e_v[i]
+
+
+@compiled
+def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Largest component, over atol + rtol |value|, of the embedded error estimate, filtered for stiff components."""
     s, A, _, _, _, _ = tableau_of(options)
-    n = q.size
-    m = w.independent.size
+    n = w.Q.size
+    q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
     place = eigen_place(options, s)
     gamma0 = options[place + GAMMA0]
     e = options[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
     e_q, e_v = vector(memory, s, n, E_Q), vector(memory, s, n, E_V)
-    for i in range(m):
+    raw, once = vector(memory, s, n, A_NEW), vector(memory, s, n, A_MID)
+    for i in range(w.independent.size):
         j = w.independent[i]
         in_q = gamma0 * v[j]
         in_v = gamma0 * a[j]
@@ -266,18 +282,29 @@ def _estimate(f, w, options, memory, h, tolerances, q, v, a, A_stage, q1, v1):
             in_v += e[k] * A_stage[k, j]
         e_q[i] = h * in_q
         e_v[i] = h * in_v
-    if f.flags[BANDWIDTH] >= 0:
-        newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
-    else:
-        newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
+    copy(e_v, raw)
+    _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
-    for i in range(m):
+    for i in range(w.independent.size):
         j = w.independent[i]
-        in_q = e_q[i] + h * gamma0 * e_v[i]
-        error = max(error, abs(in_q) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
+        error = max(error, abs(e_q[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
         if options[place + VELOCITIES] == 1.0:
             error = max(error, abs(e_v[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
-    return error
+    if options[place + VELOCITIES] == 1.0:
+        return error
+    copy(e_v, once)
+    _filter(f, w, options, memory, h, e_q, e_v)
+    return max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state))
+
+
+@merged
+def _middle(c):
+    """The node next to the middle."""
+    found = 0
+    for j in range(c.size):
+        if abs(c[j] - 0.5) < abs(c[found] - 0.5):
+            found = j
+    return c[found]
 
 
 @kernel(STEP)
@@ -305,15 +332,17 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[HAS_JACOBIAN] = 0.0
     while True:
         if memory[HAS_JACOBIAN] == 0.0:
-            # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's
+            # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
+            # the time of a stage, so that this sees nothing of a force that the stages do not see
+            x = _middle(c) * h
             for m in range(n):
-                q_mid[m] = q[m] + 0.5 * h * (v[m] + 0.25 * h * a[m])
-                v_mid[m] = v[m] + 0.5 * h * a[m]
-            code = evaluate(f, w, t + 0.5 * h, q_mid, v_mid, options[INNER_TOL], a_mid)
+                q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
+                v_mid[m] = v[m] + x * a[m]
+            code = evaluate(f, w, t + x, q_mid, v_mid, options[INNER_TOL], a_mid)
             if code != DONE:
                 return code, np.inf
-            multipliers(f, w, t + 0.5 * h, q_mid, v_mid, a_mid, w.lam)
-            code = derivatives_at(f, w, options, memory, s, t + 0.5 * h, q_mid, v_mid, a_mid)
+            multipliers(f, w, t + x, q_mid, v_mid, a_mid, w.lam)
+            code = derivatives_at(f, w, options, memory, s, t + x, q_mid, v_mid, a_mid)
             if code != DONE:
                 return code, np.inf
             memory[HAS_JACOBIAN] = 1.0
@@ -349,7 +378,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return code, np.inf
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _estimate(f, w, options, memory, h, tolerances, q, v, a, trial, q1, v1)
+        error = _estimate(f, w, options, memory, h, tolerances, state, new_state, trial)
         error = max(error, w.notes[DEPARTURE])
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0

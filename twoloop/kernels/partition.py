@@ -5,6 +5,7 @@ import numpy as np
 from twoloop.kernels.common import (
     DONE,
     GENERATION,
+    LEANING,
     N_FACTORIZATIONS,
     N_PARTITIONS,
     ORIENTATION,
@@ -19,7 +20,7 @@ from twoloop.kernels.common import (
 )
 from twoloop.kernels.constraints import constraint_rows
 from twoloop.kernels.elimination import SIZE
-from twoloop.kernels.factors import factor, make_program, sign_of
+from twoloop.kernels.factors import factor, make_program, rows_of, sign_of
 from twoloop.kernels.linalg import copy_matrix
 
 RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1
@@ -140,6 +141,7 @@ def _take_order(w):
         _insert_sorted(w.order[:rank_v], w.dependent_v)
         _insert_sorted(w.order[rank_v:], w.independent_v)
     w.notes[SENSITIVITY] = 0.0
+    w.notes[LEANING] = 0.0
     w.notes[ORIENTATION] = 0.0
     w.notes[GENERATION] += 1.0
     if w.G_of_S.size > 0:
@@ -294,14 +296,43 @@ def _largest(D, n_dof):
     return largest
 
 
-@merged
+@compiled
+def _largest_share(w):
+    """Of the rows that count in a redundant one, all scaled to 1, as the last multipliers left them in w.minimum."""
+    rows = rows_of(w.index_v)
+    largest = 0.0
+    place = 0
+    for row in range(w.Rate.size):
+        counts = False
+        for k in w.rows_v:
+            counts = counts or k == row
+        if counts:
+            continue
+        size = _largest_from(w.G[row], 0)
+        for k in range(rows.size):
+            share = abs(w.minimum[place + k]) * _largest_from(w.G[rows[k]], 0)
+            if share > largest * size:
+                largest = share / size
+        place += rows.size
+    return largest
+
+
+@compiled
 def partition_is_poor(w):
     """Whether dependents move much faster per independent than when the partition was chosen.
 
     Measures max|C_qd^-1 C_qi|, which is in w.D. Full pivoting leaves it near 1; it grows without bound where the
-    independent coordinates stop being valid.
+    independent coordinates stop being valid. So does the share that rows which count have in a redundant one, where
+    they come to depend on each other: C_qd is singular there, but not C_q.
     """
     largest = _largest(w.D, w.independent_v.size)
     if w.notes[SENSITIVITY] == 0.0:  # first look at a new partition
         w.notes[SENSITIVITY] = max(largest, 1.0)
-    return not largest <= WORSE * w.notes[SENSITIVITY]
+    if not largest <= WORSE * w.notes[SENSITIVITY]:
+        return True
+    if w.rows_v.size == w.Rate.size:
+        return False
+    share = _largest_share(w)
+    if w.notes[LEANING] == 0.0:
+        w.notes[LEANING] = max(share, 1.0)
+    return not share <= WORSE * w.notes[LEANING]
