@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers compile table3 reports bench test test-oldest lint docs lock clean
+.PHONY: help install peers compile table3 reports bench test test-portable test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -30,7 +30,7 @@ fi
 endef
 
 help: ## say what there is
-	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 install: $(STAMP) ## make .venv; runs by itself when it must
 
@@ -71,6 +71,12 @@ compile: install ## compile the kernels, on two cores
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
+
+# other rounding: no fused operations, and kernels of OpenBLAS for an old processor; a numba cache of its own, as below
+test-portable: install ## the tests of twoloop and references as on another processor; ARGS=tests/kernels for some
+	@export NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Nehalem NUMBA_CACHE_DIR=$(CURDIR)/.venv/portable; \
+	$(MAKE) --no-print-directory compile && \
+	$(RUN) -m pytest -n 2 --dist loadfile --ignore tests/studies $(ARGS)
 
 # the numba cache is its own: the versions would take turns in compiling everything anew
 test-oldest: .venv-oldest/installed ## the tests of twoloop with the oldest versions it supports; about ten minutes

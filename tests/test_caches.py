@@ -187,22 +187,20 @@ DAMAGES = {
 }
 
 
-def test_damaged_files_are_rebuilt(folder):
-    folder.mechanism(**{name: "q[0]" for name in DAMAGES})
+def test_damaged_files_and_those_of_other_functions_are_rebuilt(folder):
+    folder.mechanism(**{name: "q[0]" for name in DAMAGES}, one="q[0]", two="2.0 * q[0]")
     folder.values()
+
+    def file(name):
+        (found,) = folder.cache.glob(f"*/mechanism.{name}-*.nbc")
+        return found
+
     for name, damage in DAMAGES.items():
-        (file,) = folder.cache.glob(f"*/mechanism.{name}-*.nbc")
-        file.write_bytes(damage(file.read_bytes()))
-    assert folder.values() == {name: (1.0, 0) for name in DAMAGES}
-    assert folder.values() == {name: (1.0, 1) for name in DAMAGES}
-
-
-def test_a_file_of_another_function_is_rebuilt(folder):
-    folder.mechanism(one="q[0]", two="2.0 * q[0]")
-    folder.values()
-    (one,), (two,) = (list(folder.cache.glob(f"*/mechanism.{name}-*.nbc")) for name in ("one", "two"))
-    one.write_bytes(two.read_bytes())
-    assert folder.values() == {"one": (1.0, 0), "two": (2.0, 1)}
+        file(name).write_bytes(damage(file(name).read_bytes()))
+    file("one").write_bytes(file("two").read_bytes())
+    sound = {name: 1.0 for name in (*DAMAGES, "one")}
+    assert folder.values() == {name: (value, 0) for name, value in sound.items()} | {"two": (2.0, 1)}
+    assert folder.values() == {name: (value, 1) for name, value in sound.items()} | {"two": (2.0, 1)}
 
 
 def block_caches(folder):

@@ -51,6 +51,7 @@ def test_ctrl_c_in_compiled_code_returns_what_there_is():
         problem = four_bar()
         arguments = problem.system, (0.0, 1e9), problem.q0, problem.v0
         solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # which jobs in the background go without
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         result = solve_dae(*arguments, t_eval=[1e9])
         assert result.status is Status.INTERRUPTED, result.message

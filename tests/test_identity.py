@@ -127,11 +127,9 @@ def test_pickled_systems_solve_alike():
 
 def test_changed_parameters_travel():
     system = SYSTEMS["compiled"]()
-    system.parameters[0] = 5.0
+    system = system.with_parameters([5.0, *system.parameters[1:]])
     for other in (copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
         assert other.mass(0.0, Q)[0, 0] == 5.0
-        other.parameters[0] = 1.0
-        assert system.mass(0.0, Q)[0, 0] == 5.0
 
 
 def test_a_compiled_callback_at_the_top_level_travels_by_name():

@@ -111,7 +111,7 @@ def test_of_a_mechanism_of_ones_own_in_threads():
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "rows.parquet"
     options = {"parallel": "threads", "workers": 1, "t_span": (0.0, 0.1), "out": out}
-    monkeypatch.setattr(saved_sweep, "settings", lambda work: "the same")  # of both functions
+    monkeypatch.setattr(saved_sweep, "settings", lambda work: saved_sweep.Settings("the same", {}))  # of both functions
     with pytest.raises(KeyboardInterrupt):
         sweep(interrupted, ANGLES, **options)
     kept = pd.read_parquet(out)

@@ -37,7 +37,7 @@ def info() -> None:
     print(f"optional: {', '.join(f'{package} {installed(package)}' for package in OPTIONAL)}")
     folder = folder_of(kernels)
     if folder is None:
-        print("cache:    none: no folder can be written; set NUMBA_CACHE_DIR to one that can")
+        print("cache:    none: no folder can be written; set NUMBA_CACHE_DIR to one that can, by you alone")
     else:
         files = list(folder.glob("*.nbc"))
         size = sum(file.stat().st_size for file in files)

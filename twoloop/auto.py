@@ -145,12 +145,18 @@ class Auto:
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = implicit.plan(n_q, rtol, atol, False)
         dearer = self._dearer(n_q) if self.compiled else 1.0
-        if self.series is not None and self._series_pays(n_q, tolerance):
-            series = self.series.plan(n_q, rtol, atol, False)
-            return switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
+        explicit = self._explicit(n_q, rtol, atol, second, dearer)
+        if self.series is None or not self._series_pays(n_q, tolerance):
+            return explicit
+        series = self.series.plan(n_q, rtol, atol, False)
+        chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
+        return replace(chosen, substitute=explicit)
+
+    def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
+        """The plan without a series."""
         many = n_q >= VERY_MANY
         if n_q >= MANY and not self.compiled:
-            many = many or self.n_rows <= CONSTRAINED * n_q or tolerance < TIGHT_MANY
+            many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
         if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1

@@ -44,7 +44,13 @@ def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list
     if system.called_in_python or kind in system.within_bounds:
         return
     function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
-    error = _index_error(function, t, state, p, out)
+    given = p.copy()
+    error = _index_error(function, t, state, given, out)
+    if (given != p).any():
+        raise ValueError(
+            f"{kind} of {system.name!r} must not change p, in which it wrote entries "
+            f"{np.flatnonzero(given != p).tolist()}: every callback and every run gets the same parameters"
+        )
     if error is not None:
         longer = np.concatenate([p, np.ones(MANY)])
         too_short = _index_error(function, t, state, longer, out) is None
@@ -65,7 +71,7 @@ def _index_error(function: Dispatcher, t: float, state: list[Array], p: Array, o
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
                 Rewritten(wrap).value(function)(
-                    t, *(array.copy() for array in state), p.copy(), *(array.copy() for array in out)
+                    t, *(array.copy() for array in state), p, *(array.copy() for array in out)
                 )
         except IndexError as error:
             return error

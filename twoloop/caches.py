@@ -2,7 +2,7 @@
 
 Everything that touches numba's private parts is in this file. Numba watches the file in which a function stands, and
 nothing else: not the helpers in other files, and not the values of globals, which it freezes. It raises when no folder
-can be written and when a file is damaged.
+can be written and when a file is damaged, and runs what others have put into one.
 """
 
 import enum
@@ -14,6 +14,7 @@ import sys
 import types
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,17 +22,20 @@ from typing import Any
 import numba
 import numpy as np
 from numba import njit
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import FunctionCache, NullCache, UserProvidedCacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import Type
 from numba.misc.appdirs import AppDirs
 
+from twoloop.ownership import make_own, own_folder, read_own, write_own
+
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
-    "that can be written"
+    "that you can write, and nobody else can"
 )
-MOST_KEPT = 500  # functions made for single mechanisms, of each kind
+MOST_KEPT = 500  # functions made for single mechanisms, of each kind, on disk ...
+MOST_HELD = 50  # ... and in memory; their machine code, some 50 kB, stays there as long as the process lives
 CHECKSUM = hashlib.sha256().digest_size
 
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
@@ -75,7 +79,25 @@ def compile_kept(
                 say_once(UNWRITABLE)
     dispatcher.compile(signature)
     dispatcher.disable_compile()
+    _N_MADE[0] += 1
     return dispatcher
+
+
+class Newest(dict[str, Any]):
+    """What was made for single mechanisms, by digests: the newest MOST_HELD, as a sweep makes one for each run."""
+
+    def __setitem__(self, key: str, made: Any) -> None:
+        super().__setitem__(key, made)
+        for old in list(self)[:-MOST_HELD]:
+            self.pop(old, None)
+
+
+_N_MADE = [0]
+
+
+def n_made() -> int:
+    """How many functions this process has compiled, or read from the disk."""
+    return _N_MADE[0]
 
 
 def folder_of(package: types.ModuleType) -> Path | None:
@@ -87,7 +109,7 @@ def folder_of(package: types.ModuleType) -> Path | None:
     code = anything.__code__.replace(co_filename=str(package.__file__))
     anything.__code__ = code
     try:
-        return Path(FunctionCache(anything).cache_path)
+        return own_folder(Path(FunctionCache(anything).cache_path))
     except RuntimeError:
         return None
 
@@ -117,10 +139,15 @@ class _Cache(FunctionCache):
     def __init__(
         self, function: Callable[..., Any], stamp: str, key: str, announcement: str, folder: Path | None = None
     ):
+        chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+        if chosen:  # numba would make it as the umask has it
+            with suppress(OSError):
+                make_own(Path(chosen, UserProvidedCacheLocator.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
-        path = self._cache_path if folder is None else str(folder)
-        self._cache_file = _Files(path, self._impl.filename_base, (source, stamp), folder is not None)
+        own = own_folder(Path(self._cache_path)) if folder is None else folder
+        self._cache_path = str(own)
+        self._cache_file = _Files(own, self._impl.filename_base, (source, stamp), folder is not None)
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -143,14 +170,14 @@ class _Cache(FunctionCache):
 
 
 class _Files:
-    """The files of one function, one for each key, each behind its checksum.
+    """The files of one function, one for each key, each behind its checksum, and in the hands of the user alone.
 
     A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
     write at the same time may lead one function to the machine code of another.
     """
 
-    def __init__(self, folder: str, name: str, stamp: Any, limited: bool):
-        self.folder, self.name, self.limited = Path(folder), name, limited
+    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool):
+        self.folder, self.name, self.limited = folder, name, limited
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
@@ -158,9 +185,9 @@ class _Files:
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_own(self.folder)
         try:
-            unfinished.write_bytes(hashlib.sha256(content).digest() + content)
+            write_own(unfinished, hashlib.sha256(content).digest() + content)
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)
@@ -177,7 +204,7 @@ class _Files:
     def load(self, key: Any) -> Any:
         """What numba made for a key; None if it is missing."""
         try:
-            content = self._path(key).read_bytes()
+            content = read_own(self._path(key))
         except OSError:
             return None
         if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
@@ -203,10 +230,13 @@ def _written(path: Path) -> float:
 
 
 def sources_folder() -> Path:
-    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are."""
+    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are.
+
+    Where others can write there, it is a folder in which they cannot.
+    """
     chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
-    return Path(folder) / "equations"
+    return own_folder(Path(folder) / "equations")
 
 
 @cache
@@ -221,13 +251,21 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
     names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
     """
-    code, enclosed = _Digest(), _Digest()
+    code, enclosed = Digest(), Digest()
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(_enclosed(function))
-    except _CannotBeWatched:
+    except CannotBeWatched:
         return None
     return code.hash.hexdigest(), enclosed.hash.hexdigest()
+
+
+def helper(function: Callable[..., Any]) -> Any:
+    """A decorator for what compiled callbacks call: numba's, with our cache."""
+    dispatcher = njit(function)
+    dispatcher.enable_caching()
+    _take_over(dispatcher)
+    return dispatcher
 
 
 def _take_over(helper: Any) -> None:
@@ -247,11 +285,11 @@ def _enclosed(function: Any) -> list[Any]:
     return [cell.cell_contents for cell in function.__closure__ or ()]
 
 
-class _CannotBeWatched(Exception):
+class CannotBeWatched(Exception):
     """A value that may change unseen."""
 
 
-class _Digest:
+class Digest:
     """A hash that takes values of many types, and follows functions to whatever they name."""
 
     def __init__(self) -> None:
@@ -260,6 +298,7 @@ class _Digest:
         self.seen: set[tuple[int, str]] = set()
 
     def add(self, value: Any) -> None:
+        """Add a value."""
         self.hash.update(f"<{type(value).__qualname__}>".encode())
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
             self.hash.update(repr(value).encode())
@@ -286,6 +325,7 @@ class _Digest:
             self._add_name(value)
 
     def add_function(self, function: Any, enclosed: bool = True) -> None:
+        """Add the code of a function, its defaults, and the values of the globals that it names."""
         outer, self.names = self.names, names_in(function.__code__)
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
@@ -316,7 +356,7 @@ class _Digest:
         if type(value) is np.ufunc:
             module, name = "numpy", value.__name__
         if module is None or name is None or not _of_library(module):
-            raise _CannotBeWatched
+            raise CannotBeWatched
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -24,6 +25,9 @@ Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
 KEPT = 512  # intervals whose interior states are kept
+SOUND = 65536  # intervals of which it is kept in mind that their polynomials hold
+OFF = 10.0  # tolerances by which polynomials may be off the constraints and the equations
+MENDED = 4  # steps into which an interval is divided whose polynomials are
 
 
 class Table(NamedTuple):
@@ -32,6 +36,18 @@ class Table(NamedTuple):
     t: Array
     states: Array
     kinds: NDArray[np.int64]  # see kernels/intervals.py
+
+
+def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
+    """Ranks of C_q, and of C_q and A, by which workspaces are made: the kernels rely on them."""
+    from twoloop.kernels import advance
+
+    kit = kit_of(system, t, q)
+    work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
+    state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
+    if advance.start(kit, work, t, state) != common.RANK_DIFFERS:
+        return system.n_c, system.n_c + system.n_a
+    return int(work.notes[common.RANK]), int(work.notes[common.RANK_V])
 
 
 class Interpolator:
@@ -45,6 +61,8 @@ class Interpolator:
         A state [q, v, a] of the run.
     rtol : float
         Relative tolerance of the run.
+    atol : ndarray (n_q,)
+        Absolute tolerances.
     ranks : (int, int)
         Of C_q, and of C_q and A.
     plans : dict, optional
@@ -57,6 +75,7 @@ class Interpolator:
         t0: float,
         row: Array,
         rtol: float,
+        atol: Array,
         ranks: tuple[int, int],
         plans: Mapping[int, Plan] = MappingProxyType({}),
     ):
@@ -64,9 +83,12 @@ class Interpolator:
 
         self.kernels = dense
         self.plans = dict(plans)
-        self.made_of = (system, t0, row.copy(), rtol, ranks, self.plans)
+        self.made_of = (system, t0, row.copy(), rtol, atol, ranks, self.plans)
         self.system, self.rtol, self.ranks = system, rtol, ranks
-        self.parts = max((plan.parts for plan in self.plans.values()), default=1)
+        self.tolerances = np.concatenate([np.zeros(common.ATOL), atol])
+        self.tolerances[common.RTOL] = rtol
+        self.parts = max((plan.parts for plan in self.plans.values()), default=MENDED)
+        self.parts = max(self.parts, MENDED)
         q0 = row[: system.n_q]
         self.kits = {kind: kit_of(system, t0, q0, plan) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0)
@@ -74,15 +96,19 @@ class Interpolator:
         self.work.notes[common.GENERATION] = 1.0  # the ranks are known
         advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
         self.filled: dict[float, tuple[Array, Array]] = {}
+        self.sound: set[float] = set()  # where intervals begin whose neighbours serve
+        self.judges = True
+        self.mending: dict[bool, tuple[Plan, Any]] = {}
         self._make_room()
 
     def _make_room(self) -> None:
         """Scratch for the coefficients of two polynomials."""
         half = 3 * max(names.WINDOW, self.parts + 1)
-        self.nodes, self.room = np.zeros(2 * half), np.zeros((2 * half, self.system.n_q))
+        n = self.system.n_q
+        self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
 
     def __reduce__(self) -> tuple[Any, ...]:  # for copies, and other processes
-        return type(self), self.made_of, {"parts": self.parts, "filled": self.filled}
+        return type(self), self.made_of, {"parts": self.parts, "filled": self.filled, "judges": self.judges}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -94,100 +120,162 @@ class Interpolator:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
         intervals = np.searchsorted(table.t[1:-1], times, side="right")
         first = np.flatnonzero(np.diff(intervals, prepend=-1))
-        which = intervals[first]
-        groups = np.empty((len(which), names.N_COLUMNS), dtype=np.int64)
-        groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
-        groups[:, names.KIND] = table.kinds[which]
+        groups = _groups(table, intervals[first])
         groups[:, names.FIRST_TIME], groups[:, names.END_TIME] = first, np.append(first[1:], len(times))
         out = np.empty((len(times), 2 * self.system.n_q))
         failures = 0
-        if self.parts > 1:
-            others = []
-            for block in np.split(groups, range(KEPT, len(groups), KEPT)):
-                divided, own, rest = self._divided(table, block)
-                failures += self._between(divided, own, times, out)
-                others.append(rest)
-            groups = np.concatenate(others)
-        failures += self._between(table, groups, times, out)
+        others = []
+        for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+            self._settle(table, block)
+            divided, own, rest = self._divided(table, block)
+            failures += self._between(divided, own, times, out)
+            others.append(rest)
+        failures += self._between(table, np.concatenate(others), times, out)
         if failures > 0:
             _warn(f"at {failures} of {len(times)} times the state is interpolated and off the constraints")
         return out
 
     def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
-        arrays = (np.ascontiguousarray(groups), times, self.nodes, self.room, out)
-        return int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, table.t, table.states, *arrays))
+        known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+        return int(
+            direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, times, self.nodes, self.room, out)
+        )
+
+    def _settle(self, table: Table, groups: Groups) -> None:
+        """See to it that each interval has interior states, or is known to need none."""
+        begins = table.t[groups[:, names.FIRST_OWN]].tolist()
+        new = np.array([t not in self.sound and t not in self.filled for t in begins])
+        if not self.judges or not new.any():
+            return
+        if len(self.filled) > KEPT:
+            self.filled.clear()
+            new = np.array([t not in self.sound for t in begins])
+        if len(self.sound) > SOUND:
+            self.sound.clear()
+        groups = groups[new & (groups[:, names.KIND] != names.JUMP)]
+        for kind, plan in self.plans.items():
+            of_kind = groups[:, names.KIND] == kind
+            self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, names.FIRST_OWN]))
+        inner = np.array([t in self.filled for t in table.t[groups[:, names.FIRST_OWN]].tolist()], dtype=bool)
+        divided, own, rest = self._divided(table, groups)
+        off = np.zeros(len(groups))
+        off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
+        self.sound.update(table.t[groups[~inner & (off <= OFF), names.FIRST_OWN]].tolist())
+        for k in np.flatnonzero(~(off <= OFF)):
+            self._mend(table, groups[k], float(off[k]))
+
+    def _judged(self, table: Table, groups: Groups) -> Array:
+        """How far the polynomials of these intervals are off, over the tolerances."""
+        out = np.zeros(len(groups))
+        arrays = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups), self.nodes, self.room, self.rows, out)
+        direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
+        return out
+
+    def _mend(self, table: Table, group: Groups, worst: float) -> None:
+        """Choose what serves an interval best: its neighbours, states within it by steps, or its ends alone."""
+        i, kind = int(group[names.FIRST_OWN]), int(group[names.KIND])
+        begin = float(table.t[i])
+        ends = (table.t[i : i + 2], table.states[i : i + 2])
+        for found in (self._fill(table, *self._mending(kind), np.array([i])).get(begin, ends), ends):
+            own = Table(np.ascontiguousarray(found[0]), np.ascontiguousarray(found[1]), table.kinds)
+            single = group[None, :].copy()
+            single[0, [names.FIRST_OWN, names.LAST_OWN, names.LOW, names.HIGH]] = 0, len(own.t) - 1, 0, len(own.t) - 1
+            off = float(self._judged(own, single)[0])
+            if off < worst or not np.isfinite(worst):
+                worst = off
+                self.filled[begin] = own.t, own.states
+        if begin not in self.filled:
+            self.sound.add(begin)
+
+    def _mending(self, kind: int) -> tuple[Plan, Any]:
+        """By what steps an interval of a kind is divided where its method has none of its own."""
+        stiff = kind == names.VELOCITIES
+        if stiff not in self.mending:
+            from twoloop.dop853 import DOP853
+            from twoloop.methods import RungeKutta
+            from twoloop.tableaux import radau_iia
+
+            method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
+            atol = float(self.tolerances[common.ATOL :].min())
+            plan = replace(method.plan(self.system.n_q, self.rtol, atol, True), parts=MENDED)
+            self.mending[stiff] = plan, kit_of(self.system, self.made_of[1], self.made_of[2][: self.system.n_q], plan)
+        return self.mending[stiff]
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
         """A table of interior states, the groups of intervals that are in it, and those of others."""
         begins = table.t[groups[:, names.FIRST_OWN]].tolist()
-        if self.plans and len(self.filled) > KEPT:
-            self.filled.clear()
-        missing = np.array([t not in self.filled for t in begins])
-        for kind in self.plans:
-            self._fill(table, kind, groups[missing & (groups[:, names.KIND] == kind), names.FIRST_OWN])
-        filled = np.array([t in self.filled and len(self.filled[t][0]) > 0 for t in begins])
+        filled = np.array([t in self.filled for t in begins])
         pairs = [self.filled[t] for t, there in zip(begins, filled, strict=True) if there]
         sizes = np.array([len(t) for t, _ in pairs], dtype=np.int64)
         own = groups[filled]
-        own[:, names.LAST_OWN] = np.cumsum(sizes) - 1
-        own[:, names.FIRST_OWN] = own[:, names.LAST_OWN] - sizes + 1
+        own[:, names.LAST_OWN] = own[:, names.HIGH] = np.cumsum(sizes) - 1
+        own[:, names.FIRST_OWN] = own[:, names.LOW] = own[:, names.LAST_OWN] - sizes + 1
         t = np.concatenate([table.t[:0], *(t for t, _ in pairs)])
         states = np.concatenate([table.states[:0], *(states for _, states in pairs)])
         return Table(t, states, table.kinds), own, groups[~filled]
 
-    def _fill(self, table: Table, kind: int, intervals: Groups) -> None:
-        """Find the interior states of these intervals of a kind; where that fails, with fewer of them."""
-        if len(intervals) == 0:
-            return
+    def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
+        """Interior states of these intervals, by when they begin; where that fails, fewer of them, or none."""
         n = self.system.n_q
         tolerances = np.zeros(common.ATOL + n)  # without an estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
-        plan, kit = self.plans[kind], self.kits[kind]
         vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
+        filled = {}
         for parts in range(plan.parts, 1, -1):
+            if len(intervals) == 0:
+                break
             rows = parts + 1
             out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
             direct(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
             times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
             found = np.isfinite(times[:, 0])
             for k in np.flatnonzero(found):
-                self.filled[float(times[k, 0])] = (times[k].copy(), states[k].copy())
+                filled[float(times[k, 0])] = (times[k].copy(), states[k].copy())
             intervals = intervals[~found]
-            if len(intervals) == 0:
-                return
-        for i in intervals:  # next to a singular position
-            self.filled[float(table.t[i])] = (table.t[:0], table.states[:0])
+        return filled
 
     def interiors(self, table: Table) -> tuple[Array, Array]:
         """The interior states of all m divided intervals, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
 
         NaN where an interval has fewer.
         """
-        divided = [i for i in range(len(table.t) - 1) if table.t[i] in self.filled or table.kinds[i] in self.plans]
+        groups = _groups(table, np.arange(len(table.t) - 1))
+        divided = []
+        for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+            self._settle(table, block)
+            begins = table.t[block[:, names.FIRST_OWN]].tolist()
+            divided += [self.filled[t] for t in begins if t in self.filled]
         shape = (len(divided), self.parts + 1)
         t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
-        for row, i in enumerate(divided):
-            if table.t[i] not in self.filled:
-                self._fill(table, int(table.kinds[i]), np.array([i]))
-            own_t, own = self.filled[table.t[i]]
+        for row, (own_t, own) in enumerate(divided):
             t[row, : len(own_t)], states[row, : len(own)] = own_t, own
         return t, states
 
     def keep(self, t: Array, states: Array) -> None:
         """Take interior states as they were found before; no others can be found."""
-        self.parts = t.shape[1] - 1
+        self.parts, self.judges = t.shape[1] - 1, False
         self._make_room()
         there = np.isfinite(t)
         divided = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True) if here[0]]
         self.filled = {float(own_t[0]): (own_t, own) for own_t, own in divided}
 
-    def complete(self, times: Array, states: Array) -> Array:
-        """Rows [a, lam] at rows [q, v] on the constraints."""
-        out = np.empty((len(times), self.system.n_q + self.system.n_c + self.system.n_a))
+    def complete(self, times: Array, states: Array, out: Array) -> None:
+        """Fill rows [a, lam] at rows [q, v] on the constraints."""
         failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
         if failures > 0:
             _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
-        return out
+
+
+def _groups(table: Table, which: Groups) -> Groups:
+    """A row for each of these intervals, without the times in it."""
+    groups = np.zeros((len(which), names.N_COLUMNS), dtype=np.int64)
+    groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
+    groups[:, names.KIND] = table.kinds[which]
+    jumps = np.flatnonzero(table.kinds == names.JUMP)
+    behind = np.searchsorted(jumps, which)
+    groups[:, names.LOW] = np.append(0, jumps + 1)[behind]
+    groups[:, names.HIGH] = np.append(jumps, len(table.t) - 1)[behind]
+    return groups
 
 
 def _warn(what: str) -> None:
@@ -223,7 +311,10 @@ class DenseState:
 
     @cached_property
     def _completed(self) -> Array:
-        return self._interpolator.complete(np.atleast_1d(self.t)[self._order], self._rows)
+        system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
+        out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
+        self._interpolator.complete(times, self._rows, out)
+        return out
 
     @property
     def a(self) -> Array:

@@ -4,6 +4,7 @@ A wrong sign in one of them often runs to the end and looks like a motion. Every
 along a run one direction through all of them.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -141,11 +142,20 @@ class _Comparison:
         hint = HINTS.get(self.kind, "")
         if self.kind == "force_by_v" and self.system.functions.flags[FORCE_BY_V_GIVEN] == 0:
             hint = ", that is, give force_by_v: beside force_by_q the force may depend on v only with it"
+        given, found = _as_far_as_they_differ(float(self.given[row]), float(best.slope[row]))
         return (
-            f"{self.kind} of {self.system.name!r} is not {WHAT[self.kind]}: entry {entry} is {self.given[row]:.9g}, by "
-            f"differences it is {best.slope[row]:.9g} with an error of about {best.error[row]:.1g} (near t = "
+            f"{self.kind} of {self.system.name!r} is not {WHAT[self.kind]}: entry {entry} is {given}, by "
+            f"differences it is {found} with an error of about {best.error[row]:.1g} (near t = "
             f"{self.t:.10g}; velocities are chosen at random). Correct its formula{hint}"
         )
+
+
+def _as_far_as_they_differ(one: float, other: float) -> tuple[str, str]:
+    """Two numbers, to the third digit of their difference: those behind it are rounding, or of no interest."""
+    if not 0.0 < abs(one - other) < np.inf:
+        return f"{one:.3g}", f"{other:.3g}"
+    places = 2 - math.floor(math.log10(abs(one - other)))
+    return f"{round(one, places) + 0.0:.16g}", f"{round(other, places) + 0.0:.16g}"
 
 
 def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
@@ -332,9 +342,10 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
             if (off > level).any():
                 entry = np.unravel_index(int((off - level).argmax()), off.shape)
                 where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
+                here, there = _as_far_as_they_differ(float(fused[entry]), float(given[entry]))
                 raise ValueError(
                     f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
-                    f"{fused[entry]:.9g} and {given[entry]:.9g} (near t = {t:.10g}). Correct it, or leave it out"
+                    f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
                 )
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from numpy.typing import NDArray
+
 from twoloop.drawing import Drawing
+from twoloop.generated import GeneratedEnergy
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,12 @@ class Description:
     energy: Callable[[Any, Any, Any], Any] | None = None
     conserved: bool = False
     drawing: Drawing | None = None
+
+    def with_parameters(self, p: NDArray[Any]) -> Description:
+        """What of it holds for other parameters: an energy or a drawing may enclose the ones that it was made with."""
+        if not isinstance(self.energy, GeneratedEnergy):
+            return Description(self.coordinates)
+        return Description(self.coordinates, replace(self.energy, parameters=tuple(p.tolist())), self.conserved)
 
 
 _UNIT = re.compile(r"\s*\(([^()]*)\)")

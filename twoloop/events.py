@@ -90,10 +90,12 @@ class EventSearch:
         For each event its times and rows [q, v].
     ended : (Event, float) or None
         The terminal event that ends the run, and when.
+    reached : float
+        The end of the last step that was looked at.
     """
 
     def __init__(self, events: list[Event], t0: float, row: Array):
-        self.events = events
+        self.events, self.reached = events, t0
         self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
         self.ended: tuple[Event, float] | None = None
         self._n_q = len(row) // 2
@@ -115,6 +117,12 @@ class EventSearch:
             self._in_step(states, times[k], rows[SAMPLES * k : SAMPLES * (k + 1) + 1])
             if self.ended is not None:
                 return
+            self.reached = float(ends[k + 1])
+
+    def break_off(self) -> None:
+        """Forget what was found in a step whose search was interrupted."""
+        if self.ended is None:
+            self.found = [[(t, row) for t, row in found if t <= self.reached] for found in self.found]
 
     def _in_step(self, states: States, times: Array, rows: Array) -> None:
         """Events between samples of one step."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from twoloop.caches import UNWRITABLE, say_once, sources_folder, watch
 from twoloop.callbacks import KINDS, compile_callback
+from twoloop.ownership import make_own, read_own, write_own
 
 Array = NDArray[np.float64]
 
@@ -43,9 +44,9 @@ class GeneratedCode:
 
     @classmethod
     def stored(cls, key: str) -> "GeneratedCode | None":
-        """What an earlier process wrote for these equations; None: nothing, or a damaged file."""
+        """What an earlier process wrote for these equations; None: nothing, a damaged file, or one of others."""
         try:
-            digest, _, source = _path(key).read_text(encoding="utf-8").partition("\n")
+            digest, _, source = read_own(_path(key)).decode("utf-8").partition("\n")
         except (OSError, UnicodeDecodeError):
             return None
         return cls(key, source) if digest == _head(source) else None
@@ -119,8 +120,8 @@ def _write(path: Path, text: str) -> None:
     """Whole or not at all; where no file can be written, every process derives and compiles."""
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(text, encoding="utf-8")
+        make_own(path.parent)
+        write_own(unfinished, text.encode("utf-8"))
         unfinished.replace(path)
     except OSError:
         say_once(UNWRITABLE)

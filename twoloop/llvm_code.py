@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
+from weakref import WeakMethod
 
 from llvmlite import ir
 from numba.core.typing import signature
@@ -199,12 +200,14 @@ def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
 
     Parameters
     ----------
-    emit : callable
-        Gets vectors as pointers to their first elements; returns the result, None for `types.none`.
+    emit : method
+        Gets vectors as pointers to their first elements; returns the result, None for `types.none`. Numba keeps what
+        this returns for ever, so that it holds the method's object weakly: it must live until it is compiled.
     result : numba type
     **arguments : numba types
         Under their names.
     """
+    written_by = WeakMethod(emit)
 
     def typing(typingctx, *given):  # type: ignore[no-untyped-def]
         def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
@@ -212,7 +215,7 @@ def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
                 make_array(VECTOR)(context, builder, value).data if kind == VECTOR else value
                 for kind, value in zip(sig.args, values, strict=True)
             ]
-            made = emit(Emitter(builder), *plain)
+            made = written_by()(Emitter(builder), *plain)  # type: ignore[misc]
             return context.get_dummy_value() if made is None else made
 
         return signature(result, *arguments.values()), generate

@@ -49,6 +49,8 @@ class Plan:
     instead: Any = None
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
+    looks_within: bool = False  # whether its steps look at the equations between their ends; if not, they are limited
+    substitute: "Plan | None" = None  # what goes on where this one's values are not finite
     within_newton: "Plan | None" = None  # the same, parts included, of steps by Newton's method; None: not divided
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
 from twoloop.bounds import check_bounds
-from twoloop.checks import check_finite, check_indices, check_vector
+from twoloop.checks import check_finite, check_flag, check_indices, check_vector
 from twoloop.consistency import Violation, check_system, not_finite
-from twoloop.scales import scales_of
+from twoloop.scales import Scales, scales_of
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -21,7 +22,9 @@ MAX_ITERATIONS = 50
 CONVERGED = 1e-2  # of what a start may be off
 SINGULAR = 1e-10  # smallest singular value of scaled columns that still count as independent
 NEGLIGIBLE, WEAK = 1e-13, 1e-2  # singular values of rows of length 1 that count as zero: as a rule; redundant
-DEAD_CENTRE = 0.05  # the same, below which a position is called near a dead centre
+DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
+SAME = 0.1  # of what the projection moves: positions that are nearer to each other are one
+STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
 
 
 class Move(NamedTuple):
@@ -55,7 +58,13 @@ class ConsistentState(tuple[Array, Array]):
 
 
 def consistent_state(
-    system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike, *, keep: Sequence[int] | None = None
+    system: ConstrainedSystem,
+    t: float,
+    q: ArrayLike,
+    v: ArrayLike,
+    *,
+    keep: Sequence[int] | None = None,
+    check_assembly: bool = True,
 ) -> ConsistentState:
     """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
 
@@ -68,6 +77,9 @@ def consistent_state(
         Guess. Its distance to the constraints should be small against the mechanism.
     keep : sequence of int, optional
         Coordinates that stay as given, position and velocity: a crank and its speed, say. None: all may move.
+    check_assembly : bool
+        Whether three other guesses, as far off as this one, must lead to the same assembly. False: what the projection
+        finds is taken.
 
     Returns
     -------
@@ -82,6 +94,7 @@ def consistent_state(
         near the guess, or other guesses as far off would lead to another one: near a dead centre, as a rule.
     """
     check_system(system)
+    check_flag("check_assembly", check_assembly)
     t = check_finite("t", t)
     guess = check_vector("q", q, system.n_q)
     speeds = check_vector("v", v, system.n_q)
@@ -92,7 +105,7 @@ def consistent_state(
     reason = not_finite(system, t, guess, speeds)
     if reason is not None:
         raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
-    found = _position(system, t, guess, free, kept) if system.n_c > 0 else guess
+    found = _position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
     jacobian = system.rows(t, found)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, found, speeds))
     velocity = speeds + change
@@ -107,7 +120,9 @@ def consistent_state(
     return state
 
 
-def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int]) -> Array:
+def _position(
+    system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
+) -> Array:
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
@@ -127,29 +142,65 @@ def _position(system: ConstrainedSystem, t: float, guess: Array, free: NDArray[n
             f"iterations max|C| is {_largest(system.constraint(t, where))}. Give a guess that is nearer to an "
             f"assembled position{_smallest(scaled, free, kept)}"
         )
-    if start.excess <= 1.0:
-        return found
-    moved = (found - guess) / scales.columns
-    far = float(np.abs(moved).max())
-    there = scales.scaled(system.jacobian(t, found))
-    dependent, sign, _ = _assembly(there, free)
-    weakest = far * _weakest_direction(there, free)
-    for other in (-2.0 * moved, weakest, -weakest):
-        again, excess, _ = _gauss_newton(system, t, found + other * scales.columns, free, cut)
-        same = again is not None and excess <= CONVERGED
-        if again is not None and same:
-            block = scales.scaled(system.jacobian(t, again))[:, list(dependent)]
-            same = float(np.abs((again - found) / scales.columns).max()) <= far
-            same = same and (sign == 0 or int(np.linalg.slogdet(block)[0]) == sign)
-        if not same:
-            j = int(np.abs(moved).argmax())
+    if start.excess > 1.0 and check_assembly:
+        other = _another_assembly(system, t, found, guess, free, scales, cut)
+        if other is not None:
+            there = scales.scaled(system.jacobian(t, found))
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
-                f"coordinate {j} from {guess[j]:.6g} to {found[j]:.6g}, and from other positions as far away it does "
-                f"not lead there. Give a guess that is nearer to the assembly that is meant, or farther from a dead "
-                f"centre{_smallest(there, free, kept)}"
+                f"{_change(guess, found, scales)}, and that of another guess as far away {other}. Give a guess that is "
+                "nearer to the assembly that is meant, or farther from a dead centre; check_assembly=False takes the "
+                f"one found{_smallest(there, free, kept)}"
             )
     return found
+
+
+def _another_assembly(
+    system: ConstrainedSystem, t: float, found: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cut: float
+) -> str | None:
+    """Where another guess leads that is as far from the position found as the one given; None: to the same assembly.
+
+    Two assemblies are positions with the same values of all but the dependent coordinates. Where there is but one, a
+    small displacement ends where C_q sends it, to first order, with the same sign of the determinant.
+    """
+    moved = (found - guess) / scales.columns
+    far = float(np.abs(moved).max())
+    jacobian = system.jacobian(t, found)
+    dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
+    columns = list(dependent)
+
+    def distance(one: Array, other: Array) -> float:
+        return float(np.abs((one - other) / scales.columns).max())
+
+    def sign_at(q: Array) -> int:
+        block = scales.scaled(system.jacobian(t, q))[:, columns]
+        return int(np.linalg.slogdet(block)[0]) if sign != 0 else 0
+
+    weakest = far * _weakest_direction(scales.scaled(jacobian), free)
+    for other in (-2.0 * moved, weakest, -weakest):
+        way = other * scales.columns
+        again, excess, _ = _gauss_newton(system, t, found + way, free, cut)
+        if again is None or not excess <= CONVERGED:
+            return "does not converge"
+        expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
+        if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
+            continue
+        beside = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
+        beside[columns] = again[columns]
+        beside, excess, _ = _gauss_newton(system, t, beside, np.array(columns, dtype=int), cut)
+        if beside is None or not excess <= CONVERGED:
+            return "ends elsewhere, from where no way leads back to it"
+        if distance(beside, found) > SAME * far or sign_at(beside) != sign:
+            return f"ends on another one, which differs by {_change(found, beside, scales)}"
+    return None
+
+
+def _change(one: Array, other: Array, scales: Scales) -> str:
+    """Which coordinate changes most, with as many digits as show it."""
+    j = int(np.abs((other - one) / scales.columns).argmax())
+    size, change = max(abs(float(one[j])), abs(float(other[j]))), abs(float(other[j] - one[j]))
+    digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
+    return f"coordinate {j} from {one[j]:.{digits}g} to {other[j]:.{digits}g}"
 
 
 def _gauss_newton(
@@ -213,12 +264,15 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _smallest(scaled: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Say that C_q nearly loses rank at the guess, where it does."""
+    """Say that C_q nearly loses rank at the guess, where it does, and by how much."""
     values = np.linalg.svd(scaled[:, free], compute_uv=False)
-    if len(values) and values.min() > DEAD_CENTRE * values.max():
+    if len(values) == 0 or values.min() > DEAD_CENTRE * values.max():
         return ""
     without = f" without the columns of keep={kept}" if kept else ""
-    return f": there C_q{without} nearly loses rank, as at a dead centre"
+    return (
+        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is "
+        f"{values.min() / max(float(values.max()), 1e-300):.2g} of the largest (rows and columns scaled to like size)"
+    )
 
 
 def _no_freedom(

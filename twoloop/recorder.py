@@ -56,11 +56,14 @@ class Recorder:
         The events so far.
     n_steps, last_step : int, float
         After a terminal event: the number of steps up to it, and the part of the last one before it, s.
+    interrupted : bool
+        Whether Ctrl-C broke off the search for events, or what is computed between the steps.
     """
 
     def __init__(self, wanted: Wanted, interpolator: Interpolator | None, n_q: int, t0: float, state: Array):
-        self.wanted, self.interpolator, self._n_q = wanted, interpolator, n_q
+        self.wanted, self.interpolator, self._n_q, self._width = wanted, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
+        self.interrupted = False
         self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not looked at
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # the first interval of these that was not looked at
@@ -71,6 +74,8 @@ class Recorder:
         self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[:two])
         if wanted.times is not None and wanted.lands:
             self._outputs.append((self._t, self._rows))
+        elif wanted.times is not None:
+            self._outputs.append((self._t[:0], self._rows[:0, :two]))
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         """Take over the states [q, v, a, lam] at which steps ended, and what kind of interval each step is.
@@ -96,6 +101,17 @@ class Recorder:
         self._look(len(self._t) - 1)
 
     @property
+    def last(self) -> tuple[float, Array] | None:
+        """Time and row [q, v] of the event that ended the run."""
+        return None if self.search is None or self.ended is None else self.search.found[self.ended[0].number][-1]
+
+    @property
+    def broken_off(self) -> float | None:
+        """When the search for events was interrupted, behind which nothing is known of them: the result ends there."""
+        behind = self.interrupted and self.search is not None and self.ended is None
+        return self.search.reached if behind and self.search is not None else None
+
+    @property
     def ended(self) -> tuple[Event, float] | None:
         """The event that ended the run, and when."""
         return None if self.search is None else self.search.ended
@@ -103,12 +119,19 @@ class Recorder:
     def _look(self, end: int) -> None:
         """Search and interpolate the intervals before `end`."""
         interpolator = self.interpolator
-        if interpolator is None or self.ended is not None or (end <= self._next and len(self._t) > 1):
+        if interpolator is None or self.ended is not None or self.interrupted:
+            return
+        if end < self._next or (end == self._next and len(self._t) > 1):
             return
         table = Table(self._t, np.ascontiguousarray(self._rows[:, : 3 * self._n_q]), self._kinds)
         ends = self._t[self._next : end + 1]
         if self.search is not None:
-            self.search.search(lambda times: interpolator.states(table, times), ends)
+            try:
+                self.search.search(lambda times: interpolator.states(table, times), ends)
+            except KeyboardInterrupt:
+                self.interrupted = True
+                self.search.break_off()
+                ends = ends[ends <= self.search.reached]
             if self.ended is not None:
                 before = int(np.searchsorted(ends, self.ended[1]))
                 self.last_step = float(self.ended[1] - ends[max(before - 1, 0)])
@@ -117,8 +140,11 @@ class Recorder:
         if self.wanted.times is not None and not self.wanted.lands:
             times = self.wanted.times[self._n_outputs :]
             times = times[times <= ends[-1]]
-            self._n_outputs += len(times)
-            self._outputs.append((times, interpolator.states(table, times)))
+            try:
+                self._outputs.append((times, interpolator.states(table, times)))
+                self._n_outputs += len(times)
+            except KeyboardInterrupt:
+                self.interrupted = True
         drop = max(0, end - WINDOW)
         self._t, self._rows, self._kinds = self._t[drop:], self._rows[drop:], self._kinds[drop:]
         self._next = end - drop
@@ -132,6 +158,9 @@ class Recorder:
             t, rows = t[landed], rows[landed]
         elif self.wanted.times is not None:
             rows = self._completed(t, rows)
+        if self.broken_off is not None:
+            kept = t <= self.broken_off
+            return t[kept], rows[kept]
         if self.search is None or self.search.ended is None:
             return t, rows
         event, end = self.search.ended
@@ -144,7 +173,15 @@ class Recorder:
 
     def _completed(self, times: Array, rows: Array) -> Array:
         """Rows [q, v, a, lam] at rows [q, v]."""
-        return rows if self.interpolator is None else np.hstack([rows, self.interpolator.complete(times, rows)])
+        if self.interpolator is None:
+            return rows
+        added = np.full((len(times), self._width - rows.shape[1]), np.nan)
+        try:
+            self.interpolator.complete(times, rows, added)
+        except KeyboardInterrupt:
+            self.interrupted = True
+            added[np.isnan(added).any(axis=1)] = np.nan  # a row that was half written, too
+        return np.hstack([rows, added])
 
     def solution(self) -> DenseSolution | None:
         """The dense solution, if it is wanted."""
@@ -152,7 +189,8 @@ class Recorder:
             return None
         t, rows, kinds = (np.concatenate(each) for each in zip(*self._all, strict=True))
         table = Table(t, np.ascontiguousarray(rows[:, : 3 * self._n_q]), kinds)
-        return DenseSolution(self.interpolator, table, float(t[-1]) if self.ended is None else self.ended[1])
+        end = float(t[-1]) if self.broken_off is None else self.broken_off
+        return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
         """Times, coordinates and velocities of the events, an array for each event function."""

@@ -38,6 +38,7 @@ class Status(IntEnum):
     WRONG_DERIVATIVE = -9
     TIME_LIMIT = -10
     ROWS_CONTRADICT = -11
+    RATE_JUMPS = -12
 
 
 MEANINGS: dict[Status, str] = {
@@ -54,6 +55,7 @@ MEANINGS: dict[Status, str] = {
     Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong at a state of the run",
     Status.TIME_LIMIT: "the run reached its time_limit",
     Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
+    Status.RATE_JUMPS: "constraint_rate jumps, and no impulse gives velocities that the constraints allow",
 }
 
 
@@ -139,6 +141,15 @@ class Result:
     t_events, q_events, v_events : list of ndarray or None
         For each event function the times (n_events,) of its events, and coordinates and velocities (n_events, n_q)
         there. None: no events were asked for.
+    defect : float or None
+        Largest defect that the steps found of themselves, over what the tolerances allow: how far their accelerations
+        are from those of the equations, at the ends of steps and between them. A step whose defect is above 1 is not
+        accepted, unless rounding in the equations explains it. None where a step did not look: of methods other than
+        "Taylor", and of "auto" where it took others; `certify` looks afterwards.
+    widest_gap : float or None
+        The longest time of the run within which the equations were perhaps not looked at, s: what lasts no longer may
+        have been missed. It is the longest distance of the places where "Taylor" looks, or the longest step of other
+        methods; at most a hundredth of the run unless the steps are constant. None where a foreign solver ran.
     system : ConstrainedSystem or None
         The system: `reactions` and `plot` evaluate its rows, and its `Problem` told it names, energy and drawing. None
         where a foreign solver ran, a file was read without the system, or the result comes from another process, and
@@ -165,6 +176,8 @@ class Result:
     t_events: list[Array] | None = None
     q_events: list[Array] | None = None
     v_events: list[Array] | None = None
+    defect: float | None = None
+    widest_gap: float | None = None
     system: ConstrainedSystem | None = None
     method: str = ""
 

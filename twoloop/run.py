@@ -11,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite, pattern_of
+from twoloop.crossings import said_of_crossings, singular_ratio
 from twoloop.dense import Interpolator
 from twoloop.derivatives import wrong_derivative
+from twoloop.impulse import beyond_jump
+from twoloop.interrupts import Interrupts, said_of_interrupt
 from twoloop.kernels import common, intervals
 from twoloop.linking import direct
 from twoloop.plan import Plan, least_tolerance
@@ -31,6 +34,7 @@ FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functi
 SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
 CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
+LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
@@ -87,27 +91,36 @@ class Run:
         self.tolerances[common.LEAST] = least_tolerance(rtol, float(atol.min()))
         self.tolerances[common.ATOL :] = atol
         self.control = np.zeros(advance.N_CONTROL)
-        self.control[advance.SAFETY] = plan.safety
-        self.control[advance.FACTOR_MIN] = plan.factor_min
-        self.control[advance.FACTOR_MAX] = plan.factor_max
-        self.control[advance.EXPONENT] = plan.exponent
         self.control[advance.MAX_STEP] = np.inf
         self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
-        self.control[advance.LIMIT_START] = plan.limit_start
-        self.control[advance.LIMIT_FACTOR] = plan.limit_factor
-        self.control[advance.LIMIT_MEMORY] = plan.limit_memory
-        self.control[advance.SYMMETRIC] = plan.symmetric
-        self.control[advance.PREDICTIVE] = plan.predictive
-        self.control[advance.LEAST_ERROR] = plan.least_error
         self.control[advance.MAX_STEPS] = np.inf
         self.control[advance.BRIDGE] = 1.0
+        rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
+        self.control[advance.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
-        self.control[advance.MAX_ATTEMPTS] = max(1, first_chunk // max(1, system.n_q // SMALL))
+        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
         self.clock = np.zeros(advance.N_CLOCK)
         self.clock[advance.T] = self.clock[advance.T_START] = t0
-        self.clock[advance.H_LIMIT] = plan.limit_start
-        self.crossings: list[float] = []  # times near which steps went across a singular position
+        self._control_by(plan)
+        self.substituted = False  # whether another plan has taken over, for good
+        self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
+        self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
+        self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self._begin()
+
+    def _control_by(self, plan: Plan) -> None:
+        """Step-size control as a plan wants it."""
+        a, control = self.a, self.control
+        control[a.SAFETY], control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.safety, plan.factor_min, plan.factor_max
+        control[a.EXPONENT], control[a.PREDICTIVE], control[a.LEAST_ERROR] = (
+            plan.exponent,
+            plan.predictive,
+            plan.least_error,
+        )
+        control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
+        control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
+        control[a.GIVES_WAY] = plan.substitute is not None
+        self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
@@ -173,15 +186,21 @@ class Run:
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""
         span = t1 - self.t0
-        first = min(self._first_step(span) if first_step is None else first_step, span)
+        first = min(self._first_step(span, self.state) if first_step is None else first_step, span)
         self.clock[self.a.H_NEXT] = first
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
-        self.control[self.a.MAX_STEP] = max_step
+        self.max_step, self.gap = max_step, LONGEST_UNSEEN * span
+        self.tolerances[common.GAP] = self.gap
+        self._limit_steps()
 
-    def _first_step(self, span: float) -> float:
-        """A share of the time in which the initial velocities and accelerations change the coordinates as a whole."""
+    def _limit_steps(self) -> None:
+        """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
+        self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
+
+    def _first_step(self, span: float, state: Array) -> float:
+        """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
-        q, v, a = (float(np.abs(self.state[k * n : (k + 1) * n]).max()) for k in range(3))
+        q, v, a = (float(np.abs(state[k * n : (k + 1) * n]).max()) for k in range(3))
         q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
         scales = [span]
         if v > 0.0:
@@ -192,7 +211,15 @@ class Run:
             scales.append(v / a)
         return FIRST_STEP * min(scales)
 
-    def go(self, t1: float, wanted: Wanted, report: Any, time_limit: float | None, check_derivatives: bool) -> Result:
+    def go(
+        self,
+        t1: float,
+        wanted: Wanted,
+        report: Any,
+        time_limit: float | None,
+        check_derivatives: bool,
+        interrupts: Interrupts,
+    ) -> Result:
         """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
         deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         a, system = self.a, self.system
@@ -201,19 +228,22 @@ class Run:
         if wanted.times is not None and wanted.lands:
             outputs = np.append(wanted.times[(wanted.times > self.t0) & (wanted.times < t1)], t1)
         self.control[a.STORE_ALL] = wanted.every_step
-        largest_chunk = float(BUFFER_STEPS)
+        largest_chunk = BUFFER_STEPS
         if any(event.terminal < np.inf for event in wanted.events or []):
-            largest_chunk = self.control[a.MAX_ATTEMPTS] = CHUNK_TO_EVENT
+            largest_chunk = self.chunk = CHUNK_TO_EVENT
+        # the run is looked at after so many attempts, however long the chunks are that the clock allows
+        between_looks, next_look = self.chunk, self.chunk
         step_parts = [np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])]  # the first partition of a run is not a renewal
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
         cpu = 0.0
-        code = a.PAUSED
+        code = INTERRUPTED if interrupts.asked else a.PAUSED
         out_t, out_state, out_steps = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
         while code == a.PAUSED:
-            across = plan is not self.plan
+            across, leaps = plan is not self.plan, self.clock[a.LEAPS] == 1.0
+            self.control[a.MAX_ATTEMPTS] = min(self.chunk, max(0, next_look - self._attempts()))
             began = time.process_time()
             try:
                 code = advance(
@@ -235,32 +265,43 @@ class Run:
             except KeyboardInterrupt:
                 code = INTERRUPTED
             except Exception as error:  # of a callback; beyond a terminal event it does not matter
-                code, raised = INTERRUPTED, error
+                code, raised = INTERRUPTED, None if interrupts.asked else error
             n_rows, n_steps = filled.tolist()
             t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
             sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
             if sparse:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             step_parts.append(steps)
-            kinds = self._kinds(steps, across) if wanted.between_steps else NO_KINDS
+            kinds = self._kinds(steps, across, leaps) if wanted.between_steps else NO_KINDS
             recorder.add(t, rows, kinds)
             spent = time.process_time() - began
             cpu += spent
             filled[:] = 0  # for Ctrl-C before the next chunk begins
             if recorder.ended is not None:
                 break
-            if code == a.PAUSED and not across:
-                looks.take(float(self.clock[a.T]), self.state, system.n_q, steps[:, a.H])
+            looks.pass_by(steps[:, a.H])
+            pace.pass_by(steps[:, a.H])
+            if code == a.PAUSED and self._attempts() >= next_look:
+                between_looks = min(2 * between_looks, largest_chunk)
+                next_look = self._attempts() + between_looks
+                if not across:
+                    looks.take(float(self.clock[a.T]), self.state, system.n_q)
+                if pace.stagnates(self.clock[a.T], t1) and self.control[a.MAX_STEPS] == np.inf:
+                    code = STAGNATED
             if spent < CHUNK_TIME:
-                self.control[a.MAX_ATTEMPTS] = min(2.0 * self.control[a.MAX_ATTEMPTS], largest_chunk)
-            if not sparse or len(out_t) < min(self.control[a.MAX_ATTEMPTS], BUFFER_ROWS):
+                self.chunk = min(2 * self.chunk, largest_chunk)
+            if not sparse or len(out_t) < min(self.chunk, BUFFER_ROWS):
                 out_t, out_state, out_steps = self._buffers()
-            limited = self.control[a.MAX_STEPS] < np.inf
-            if pace.stagnates(self.clock[a.T], steps[:, a.H], t1) and code == a.PAUSED and not limited:
-                code = STAGNATED
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
-            if code == a.NEAR_SINGULAR:
+            if code == a.PAUSED and (interrupts.asked or recorder.interrupted):
+                code = INTERRUPTED
+            if code == a.HAS_TO_GIVE_WAY:
+                self._give_way()
+                plan, control, kit, code = self.plan, self.control, self.kit, a.PAUSED
+            elif code == a.AT_JUMP and not across and self._leap(t1):
+                code = a.PAUSED
+            elif code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
                 kit = common.Kit(self.functions, self.kit.general, plan.step)
                 code = a.PAUSED
@@ -283,14 +324,23 @@ class Run:
                 steps[-1, a.H] = recorder.last_step
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
             statistics = replace(statistics, n_accepted=recorder.n_steps)
-        else:
-            status, message = self._outcome(code, t1, pace)
+        reached = float(self.clock[a.T])
+        if recorder.broken_off is not None:
+            reached, steps = recorder.broken_off, steps[: recorder.n_steps + 1]
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
         n = system.n_q
-        if check_derivatives and code != INTERRUPTED:
-            last = (float(self.clock[a.T]), self.state) if recorder.ended is None else (float(t[-1]), table[-1])
-            status, message = self._check_again(t, table, last, status, message)
-        if status in EXPLAINED_BY_STIFFNESS:
-            message += said_of_stiffness(looks, self.kit, self.work)
+        try:
+            if recorder.ended is None:
+                status, message = self._outcome(code, t1, pace)
+            if check_derivatives and code != INTERRUPTED:
+                last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
+                status, message = self._check_again(t, table, last, status, message)
+            if status in EXPLAINED_BY_STIFFNESS:
+                message += said_of_stiffness(looks, self.kit, self.work)
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        if interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+            status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
         t_events, q_events, v_events = recorder.events()
         return Result(
@@ -312,13 +362,19 @@ class Run:
             t_events=t_events,
             q_events=q_events,
             v_events=v_events,
+            defect=self._defect(),
+            widest_gap=float(self.work.notes[common.WIDEST_GAP]),
             system=system,
         )
 
+    def _defect(self) -> float | None:
+        """The largest defect of the steps, if all looked for it."""
+        checked = self.work.counters[common.N_ACCEPTED] > 0 and self.work.notes[common.UNCHECKED] == 0.0
+        return float(self.work.notes[common.LARGEST_DEFECT]) if checked else None
+
     def _buffers(self) -> tuple[Array, Array, Array]:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
-        most = int(self.control[self.a.MAX_ATTEMPTS])
-        n_rows, n_steps = min(most, BUFFER_ROWS), min(most, BUFFER_STEPS)
+        n_rows, n_steps = min(self.chunk, BUFFER_ROWS), min(self.chunk, BUFFER_STEPS)
         return np.empty(n_rows), np.empty((n_rows, len(self.state))), np.empty((n_steps, self.a.N_STEP_COLUMNS))
 
     def _recorder(self, wanted: Wanted) -> Recorder:
@@ -326,16 +382,34 @@ class Run:
         n, interpolator = self.system.n_q, None
         if wanted.between_steps:
             ranks = (len(self.work.rows), len(self.work.rows_v))
-            interpolator = Interpolator(self.system, self.t0, self.state[: 3 * n], self.rtol, ranks, self.interiors)
+            start, atol = self.state[: 3 * n], self.tolerances[common.ATOL :]
+            interpolator = Interpolator(self.system, self.t0, start, self.rtol, atol, ranks, self.interiors)
         return Recorder(wanted, interpolator, n, self.t0, self.state)
 
-    def _kinds(self, steps: Array, across: bool) -> NDArray[np.int64]:
+    def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""
+        if leaps:
+            return np.full(len(steps), intervals.JUMP)
         if across:
             return np.full(len(steps), intervals.ACROSS)
         if self.plan.apart:
             return np.full(len(steps), intervals.APART)
-        return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, intervals.ACCELERATIONS)
+        explicit = intervals.ACROSS if self.substituted else intervals.ACCELERATIONS
+        return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)
+
+    def _give_way(self) -> None:
+        """Go on with the plan that takes over where values of this one are not finite."""
+        assert self.plan.substitute is not None
+        t, n = float(self.clock[self.a.T]), self.system.n_q
+        self.plan = replace(self.plan.substitute, inner=self.plan.inner)
+        self.kit = kit_of(self.system, t, self.state[:n], self.plan)
+        self.memory = self.plan.memory.copy()
+        self.substituted = True
+        self._control_by(self.plan)
+        self._limit_steps()
+        self.clock[self.a.FAILURE_CODE] = common.DONE
+        self.clock[self.a.H_NEXT] = self.clock[self.a.H_FAILED]
+        self.clock[self.a.H_BEFORE] = self.clock[self.a.ERROR_BEFORE] = 0.0
 
     def _bridge(self) -> tuple[Plan, Array]:
         """The plan and the controls for steps across a singular position, see kernels/bridge.py."""
@@ -343,12 +417,15 @@ class Run:
         from twoloop.kernels import bridge
 
         a, clock = self.a, self.clock
-        self.crossings.append(float(clock[a.T]))
+        self.crossings.append([(float(clock[a.T]), self.state.copy())])
         plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
         control = self.control.copy()
         control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
         control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.factor_min, plan.factor_max
         control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+        control[a.GIVES_WAY] = 0.0
+        if control[a.FIXED_STEP] == 0.0:
+            control[a.MAX_STEP] = min(self.max_step, self.gap)
         clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
         self.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
         clock[a.H_NEXT] = self.lengths.pop(0)
@@ -367,19 +444,42 @@ class Run:
             return plan, control, code
         if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
             self.control[a.BRIDGE] = 0.0
+        self.crossings[-1].append((float(self.clock[a.T]), self.state.copy()))
         self.plan.memory[:] = self.memory
         self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
         return self.plan, self.control, a.PAUSED
 
-    def _crossed(self) -> str:
-        """What a run that succeeded has to say of singular positions."""
-        if not self.crossings:
-            return ""
-        times = ", ".join(f"{t:.4g}" for t in self.crossings[:3]) + (", ..." if len(self.crossings) > 3 else "")
-        return (
-            f" Near t = {times} steps went across positions where the constraints lose rank: beyond these, errors may "
-            "exceed the tolerances."
-        )
+    def _leap(self, t1: float) -> bool:
+        """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
+        a, clock, n = self.a, self.clock, self.system.n_q
+        end = float(clock[a.JUMP_TO])
+        beyond = beyond_jump(self.system, end, self.state[:n], self.state[n : 2 * n])
+        if beyond is None:
+            return False
+        self.new_state[: 2 * n] = beyond
+        self.work.notes[common.KINK_BEFORE], self.work.notes[common.KINK_AFTER] = end, np.inf
+        if a.start(self.kit, self.work, end, self.new_state) != common.DONE:
+            return False
+        self.jumps.append(end)
+        self.plan.memory[:] = self.memory
+        clock[a.LEAPS] = 1.0
+        clock[a.H_LIMIT], clock[a.LIMIT_AGE] = self.plan.limit_start, 0.0
+        if end < t1:
+            clock[a.H_NEXT] = min(clock[a.H_NEXT], self._first_step(t1 - end, self.new_state))
+        return True
+
+    def _said_of_events(self) -> str:
+        """What a run that succeeded has to say of jumps and of singular positions."""
+        said = ""
+        if self.jumps:
+            said = f" At t = {_times(self.jumps)} C_t or b jumps: velocities changed there as by an impulse."
+        now = (float(self.clock[self.a.T]), self.state)
+        return said + said_of_crossings(self.system, self.crossings, now, self.rank)
+
+    def _attempts(self) -> int:
+        """How many steps were tried so far."""
+        places = [common.N_ACCEPTED, common.N_REJECTED_ERROR, common.N_REJECTED_CONVERGENCE]
+        return int(self.work.counters[places].sum())
 
     def _statistics(self, cpu: float) -> Statistics:
         c = self.work.counters
@@ -403,12 +503,9 @@ class Run:
         failure = int(self.clock[a.FAILURE_CODE])
         if code == a.ALL_OUTPUT_DONE:
             fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
-            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._crossed()}"
+            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._said_of_events()}"
         if code == INTERRUPTED:
-            return (
-                Status.INTERRUPTED,
-                f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.",
-            )
+            return Status.INTERRUPTED, ""
         if code == a.MAX_STEPS_REACHED:
             return (
                 Status.MAX_STEPS,
@@ -427,6 +524,12 @@ class Run:
                 f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
                 "singular position or a stiff force near this time, or take another method; with max_steps the run "
                 "goes on up to that number of steps.",
+            )
+        if code == a.AT_JUMP:
+            return (
+                Status.RATE_JUMPS,
+                f"{stopped}: constraint_rate or nonholonomic_rate jumps there, and no impulse gives velocities that "
+                "the constraints allow beyond it. Correct the drives, or end t_span before.",
             )
         if code == a.ROWS_VIOLATED:
             return Status.ROWS_CONTRADICT, self._contradiction()
@@ -476,13 +579,12 @@ class Run:
 
     def _near_singular(self) -> str:
         """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
-        rows = self.system.rows(float(self.clock[self.a.T]), self.state[: self.system.n_q])
-        values = np.linalg.svd(rows, compute_uv=False)[: self.rank]
-        if len(values) == 0 or values[-1] > NEARLY_SINGULAR * values[0]:
+        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
+        if ratio > NEARLY_SINGULAR:
             return ""
         return (
             f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-            f"{values[-1] / values[0]:.1g} of the largest. No step led across: end t_span before, take another "
+            f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
             "method, or change the geometry. "
         )
 
@@ -519,10 +621,17 @@ class Run:
             found = not_finite(self.system, instant, q, v)
             if found is not None:
                 return f"{found} at t = {instant:.10g}"
-        return (
-            "the state became larger than floating-point numbers can be, or a callback returned a value that is not "
-            "finite at a state within the step; none does at its start"
-        )
+        if self.plan.looks_within:
+            return (
+                "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "
+                "no derivatives at this state (a root of zero, a norm of zero velocity), or its argument is too large "
+                "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
+            )
+        return "the callbacks are finite at the start of the step, but not at a state within it"
+
+
+def _times(times: list[float]) -> str:
+    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")
 
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
@@ -535,10 +644,13 @@ class _Pace:
         self.window_t, self.window_n = t0, 0
         self.longest = self.mean = 0.0
 
-    def stagnates(self, t: float, h: Array, t1: float) -> bool:
-        """Whether the run has come to a standstill, after accepted steps h that ended at t."""
+    def pass_by(self, h: Array) -> None:
+        """Note the lengths of accepted steps."""
         self.longest = max(self.longest, float(h.max(initial=0.0)))
         self.window_n += len(h)
+
+    def stagnates(self, t: float, t1: float) -> bool:
+        """Whether the run has come to a standstill, at time t."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n

@@ -3,39 +3,59 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from twoloop.digests import described, digest_of, digest_of_package
 from twoloop.optional import needed
 
 KEY = "twoloop sweep"
+DIGESTS = "twoloop sweep, digests"
+TWOLOOP = "twoloop itself"
 
 
-def settings(work: tuple[Any, Any, dict[str, Any]]) -> str:
-    """What the rows depend on beside their parameters, in words."""
+@dataclass(frozen=True)
+class Settings:
+    """What the rows depend on beside their parameters.
+
+    Attributes
+    ----------
+    words : str
+        By names, for messages.
+    digests : dict
+        The code and the values of all that is reached, by what reaches it.
+    """
+
+    words: str
+    digests: dict[str, str]
+
+
+def settings(work: tuple[Any, Any, dict[str, Any]]) -> Settings:
+    """What the rows of a sweep depend on.
+
+    Raises
+    ------
+    ValueError
+        If something that a function reaches cannot be compared.
+    """
     problem_of, measure, options = work
-    words = [_name(problem_of), _name(measure), *(f"{name}={_name(options[name])}" for name in sorted(options))]
-    return ", ".join(words)
+    words = [described(problem_of), described(measure)] + [described(options)] * bool(options)
+    reached = {"problem_of": problem_of, "measure": measure, **options}
+    digests = {what: digest_of(what, value) for what, value in reached.items()}
+    return Settings(", ".join(words), digests | {TWOLOOP: digest_of_package()})
 
 
-def _name(value: Any) -> str:
-    """A function by where it stands: its address differs from process to process."""
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_name, value))}]"
-    name = getattr(value, "__qualname__", None)
-    return repr(value) if name is None else f"{value.__module__}.{name}"
-
-
-def write(table: Any, path: Path, made_with: str) -> None:
+def write(table: Any, path: Path, made_with: Settings) -> None:
     """Write the rows, whole or not at all."""
     needed("pyarrow", "pyarrow", "out=")
-    table.attrs[KEY] = made_with
+    table.attrs |= {KEY: made_with.words, DIGESTS: made_with.digests}
     new = path.with_name(f".{path.name}.new")
     table.to_parquet(new, engine="pyarrow")
     os.replace(new, path)
 
 
-def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: str) -> dict[int, dict[str, Any]]:
+def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: Settings) -> dict[int, dict[str, Any]]:
     """The rows of a file by their numbers; none where there is no file.
 
     Raises
@@ -56,12 +76,24 @@ def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: str) -
     kept = table.attrs.get(KEY)
     if kept is None:
         raise ValueError(f"out must be a file that a sweep wrote; {str(path)!r} holds something else. {advice}")
-    if kept != made_with:
-        raise ValueError(f"out, {str(path)!r}, holds runs of {kept}; this sweep is of {made_with}. {advice}")
+    if kept != made_with.words:
+        raise ValueError(f"out, {str(path)!r}, holds runs of {kept}; this sweep is of {made_with.words}. {advice}")
+    digests = table.attrs.get(DIGESTS) or {}
+    other = [what for what, digest in made_with.digests.items() if digests.get(what) != digest]
+    if other:
+        raise ValueError(
+            f"out, {str(path)!r}, holds runs of functions or values that bear the same names and are not the same: "
+            f"{', '.join(other)} changed since (its code, what it encloses, or a global that it reaches). {advice}"
+        )
     rows = {int(number): row for number, row in zip(table.index, table.to_dict("records"), strict=True)}
     for number, row in rows.items():
-        if number >= len(given) or any(row.get(name) != value for name, value in given[number].items()):
+        if number >= len(given) or any(not same(row.get(name), value) for name, value in given[number].items()):
             asked = given[number] if number < len(given) else "not asked for"
             of_file = {name: row.get(name) for name in given[0]}
             raise ValueError(f"out, {str(path)!r}, holds other runs: {number} has {of_file}, {asked}. {advice}")
     return rows
+
+
+def same(kept: Any, value: Any) -> bool:
+    """Whether a cell holds a value; one that is no number equals itself here."""
+    return bool(kept == value or (kept != kept and value != value))

@@ -17,7 +17,7 @@ from numba import types
 from numba.core.dispatcher import Dispatcher
 
 from twoloop import llvm_code, series_groups
-from twoloop.caches import compile_kept, sources_folder
+from twoloop.caches import Newest, compile_kept, sources_folder
 from twoloop.callbacks import VECTOR, f8
 from twoloop.llvm_code import INTEGER, ONE, SLACK, ZERO, Emitter, Quantities, Value, emitted
 from twoloop.series import SeriesProgram
@@ -332,10 +332,10 @@ class CompiledSeries(NamedTuple):
 
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
-        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order)
+        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order) + n
 
 
-_COMPILED: dict[str, CompiledSeries] = {}  # by their digests
+_COMPILED = Newest()
 
 
 def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
@@ -352,10 +352,11 @@ def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
             f"it out"
         )
     key = program.digest + own.digest
-    if key not in _COMPILED:
+    made: CompiledSeries | None = _COMPILED.get(key)
+    if made is None:
         code, solution = SeriesCode(program), Solution(own.equations)
-        _COMPILED[key] = CompiledSeries(_compile(code, solution, own, key), code, solution.n_kept)
-    return _COMPILED[key]
+        _COMPILED[key] = made = CompiledSeries(_compile(code, solution, own, key), code, solution.n_kept)
+    return made
 
 
 def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Dispatcher:

@@ -22,6 +22,7 @@ from twoloop.checks import (
 )
 from twoloop.consistency import check_start, check_system
 from twoloop.events import check_events
+from twoloop.interrupts import Interrupts, not_begun
 from twoloop.kernels.intervals import ACCELERATIONS, VELOCITIES
 from twoloop.methods import PRESETS
 from twoloop.plan import Method
@@ -92,7 +93,9 @@ def solve_dae(
     first_step : float, optional
         First step to try, s. None: chosen from the velocities and accelerations at the start.
     max_step : float
-        Largest step, s. A force that acts for less than a step may be passed over unseen: give its duration.
+        Largest step, s. Methods that do not look at the equations between the ends and stages of their steps, all but
+        "Taylor", take none that is longer than a hundredth of the run in any case. A force that acts for a shorter time
+        than `result.widest_gap` may be passed over unseen: give its duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run whose steps have become a thousand times shorter
         than before, so that the rest would take more than ten million of them, ends with the status STAGNATED.
@@ -170,33 +173,35 @@ def solve_dae(
             f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
         )
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
-    check_start(system, t0, q0, v0, derivatives=check_derivatives)
+    with Interrupts() as interrupts:
+        check_start(system, t0, q0, v0, derivatives=check_derivatives)
 
-    code = own_code(system, t0, q0) if compiled else None
-    if hasattr(chosen, "for_system"):
-        chosen = chosen.for_system(system, code)
-    plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-    interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
-    if plan.parts > 1:
-        always = (system.n_q, float(rtol), float(atol.min()), True)
-        interiors[ACCELERATIONS] = chosen.plan(*always) if plan.interior is None else plan.interior
-    if code is not None:
-        if not plan.compilable:
-            constant = " with step_size, by which it is implicit" if chosen.name == "auto" else ""
-            raise ValueError(
-                f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
-            )
-        plan = replace(plan, inner=code.inner)
-    run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
-    if step_size is None:
-        run.set_sizes(first_step, float(max_step), t1)
-    if max_steps is not None:
-        run.control[run.a.MAX_STEPS] = max_steps
-    with _progress_bar(progress, chosen.name, t0, t1) as report:
-        lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
-        wanted = Wanted(times, lands, bool(dense_output), event_functions)
-        result = run.go(t1, wanted, report, time_limit, check_derivatives)
-    return replace(result, method=chosen.name)
+        code = own_code(system, t0, q0) if compiled else None
+        if hasattr(chosen, "for_system"):
+            chosen = chosen.for_system(system, code)
+        plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
+        interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
+        if plan.parts > 1:
+            always = (system.n_q, float(rtol), float(atol.min()), True)
+            interiors[ACCELERATIONS] = chosen.plan(*always) if plan.interior is None else plan.interior
+        if code is not None:
+            if not plan.compilable:
+                constant = " with step_size, by which it is implicit" if chosen.name == "auto" else ""
+                raise ValueError(
+                    f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
+                )
+            plan = replace(plan, inner=code.inner)
+        run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
+        if step_size is None:
+            run.set_sizes(first_step, float(max_step), t1)
+        if max_steps is not None:
+            run.control[run.a.MAX_STEPS] = max_steps
+        with _progress_bar(progress, chosen.name, t0, t1) as report:
+            lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
+            wanted = Wanted(times, lands, bool(dense_output), event_functions)
+            result = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
+        return replace(result, method=chosen.name)
+    return not_begun(system, t0, event_functions, chosen.name)
 
 
 def check_method(method: str | Method) -> Method:

@@ -17,11 +17,12 @@ Array = NDArray[np.float64]
 MOST = 8  # states that are kept; they lie about as far from one another
 LAST_STEPS = 8  # whose median is the step at a state
 ITERATIONS = 6
+START = 0.1  # share of all coordinates in the direction of each look
 DISPLACEMENT = 1e-6  # of the largest coordinate or velocity, for derivatives along a direction
 INNER_TOL = 1e-8  # of the positions; their error is squared
 ALIGNED = 0.9  # cosine from which on two directions are one
 MANY = 200  # accepted steps before the last look, from which on it is worth a sentence
-NEXT_TO = 0.55  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
+NEXT_TO = 0.45  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
 
 
 class Look(NamedTuple):
@@ -41,19 +42,24 @@ class Looks:
 
     def __init__(self, plan: Plan):
         self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
+        self.last = np.zeros(0)  # lengths of the last steps
         self.kept: list[Look] = []
 
-    def take(self, t: float, state: Array, n_q: int, steps: Array) -> None:
-        """Keep this state, after accepted steps of these lengths; of many only every second, fourth, ..."""
+    def pass_by(self, steps: Array) -> None:
+        """Note the lengths of accepted steps."""
         self.n_steps += steps.size
-        if self.plan.stable_to is None or steps.size < LAST_STEPS:
+        self.last = np.append(self.last, steps[-LAST_STEPS:])[-LAST_STEPS:]
+
+    def take(self, t: float, state: Array, n_q: int) -> None:
+        """Keep this state, that after the last steps; of many only every second, fourth, ..."""
+        if self.plan.stable_to is None or self.last.size < LAST_STEPS:
             return
         self.n_seen += 1
         if self.n_seen % self.every != 0:
             return
         q, v, a = state[: 3 * n_q].reshape(3, n_q).copy()
         limits = self.plan.stable_to(self.plan.memory)
-        self.kept.append(Look(t, q, v, a, float(np.median(steps[-LAST_STEPS:])), *limits))
+        self.kept.append(Look(t, q, v, a, float(np.median(self.last)), *limits))
         if len(self.kept) > MOST:
             self.kept = self.kept[1::2]
             self.every *= 2
@@ -63,9 +69,12 @@ def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
     """A sentence where stability limited the steps, else nothing. What stands in the workspace is lost."""
     if not looks.kept or looks.n_steps < MANY:
         return ""
-    directions = [0.3 + 0.1 * (np.arange(work.Q.size) % 7)] * 2
+    start = 0.3 + 0.1 * (np.arange(work.Q.size) % 7)
+    directions = [np.zeros_like(start), np.zeros_like(start)]
     found = []
     for look in looks.kept:
+        for direction in directions:  # that of the look before, in which no coordinate may have been lost for good
+            direction += START * start
         try:
             vibration, decay = _rates(kit, work, look, directions)
         except Exception:  # of a callback at a displaced state, which is none of the run: there is nothing to say

@@ -17,7 +17,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from twoloop import llvm_code, straight_code
-from twoloop.caches import compile_kept, sources_folder
+from twoloop.caches import Newest, compile_kept, sources_folder
 from twoloop.callbacks import VECTOR, f8
 from twoloop.llvm_code import INTEGER, SLACK, Emitter, Value, emitted
 from twoloop.series_groups import WIDTH
@@ -131,16 +131,17 @@ class CompiledStages(NamedTuple):
         return 1 + 4 * self.code.n + self.code.scratch_size()
 
 
-_COMPILED: dict[str, CompiledStages] = {}  # by their digests
+_COMPILED = Newest()
 
 
 def compiled_stages(own: OwnCode, n_stages: int) -> CompiledStages:
     """The code for a mechanism and a method of so many stages, compiled; its machine code is kept on disk."""
     key = f"{own.digest} {n_stages}"
-    if key not in _COMPILED:
+    made: CompiledStages | None = _COMPILED.get(key)
+    if made is None:
         code = StageCode(own, n_stages)
-        _COMPILED[key] = CompiledStages(_compile(code, key), code)
-    return _COMPILED[key]
+        _COMPILED[key] = made = CompiledStages(_compile(code, key), code)
+    return made
 
 
 def _compile(code: StageCode, key: str) -> Dispatcher:

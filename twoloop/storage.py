@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from twoloop.checks import shown
 from twoloop.consistency import check_system
-from twoloop.dense import DenseSolution, Interpolator, Table
-from twoloop.result import Result, Statistics, Status
+from twoloop.dense import DenseSolution, Interpolator, Table, ranks_at
+from twoloop.result import Result
+from twoloop.saved_fields import COUNTS, OF_EVENTS, STATES, Fields, check_sum
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
 FORMAT = "twoloop result 1"
-ALWAYS = ("t", "q", "v", "a", "lam", "h")
-SOMETIMES = ("rejected_error", "rejected_convergence", "partitioned", "redundant")
-OF_EVENTS = ("t_events", "q_events", "v_events")
+ALWAYS = ("t", *STATES, "h")
+SOMETIMES = (*COUNTS, "redundant")
 
 
 def check_path(path: Any) -> Path:
@@ -46,6 +46,7 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
         words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
         if interpolator.parts > 1:
             arrays["sol_interior_t"], arrays["sol_interior_states"] = interpolator.interiors(table)
+    words["check_sums"] = {name: check_sum(array) for name, array in arrays.items()}
     with check_path(path).open("wb") as file:
         np.savez(file, words=np.array(json.dumps(words)), allow_pickle=False, **arrays)
 
@@ -71,47 +72,71 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     FileNotFoundError
         If there is no such file.
     TypeError, ValueError
-        If the file was not written by `Result.save`, or holds a result of a system of other sizes.
+        If the file was not written by `Result.save` or is damaged (says in which field), or holds a result of a system
+        of other sizes.
     """
     if system is not None:
         check_system(system)
     path = check_path(path)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        words = json.loads(str(arrays["words"]))
-    except (KeyError, EOFError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"path must lead to a file written by Result.save; {str(path)!r} is none") from error
-    if not isinstance(words, dict) or words.get("format") != FORMAT:
-        raise ValueError(f"path must lead to a file written by Result.save; {str(path)!r} holds something else")
+    arrays, words = _read(path)
+    known = Fields(str(path), arrays, words)
     if system is not None:
-        sizes, given = (len(arrays["q"]), len(arrays["lam"])), (system.n_q, system.n_c + system.n_a)
+        sizes, given = known.sizes, (system.n_q, system.n_c + system.n_a)
         if sizes != given:
             raise ValueError(
                 f"system must be the one that was solved, with n_q = {sizes[0]} and n_c + n_a = {sizes[1]}; "
                 f"{system.name!r} has {given[0]} and {given[1]}"
             )
     optional: dict[str, Any] = {name: arrays.get(name) for name in SOMETIMES}
-    if words["n_events"] is not None:
-        optional |= {name: [arrays[f"{name}_{k}"] for k in range(words["n_events"])] for name in OF_EVENTS}
+    if known.n_events is not None:
+        optional |= {name: [arrays[f"{name}_{k}"] for k in range(known.n_events)] for name in OF_EVENTS}
     return Result(
         **{name: arrays[name] for name in ALWAYS},
         **optional,
-        status=Status(words["status"]),
-        message=words["message"],
-        stats=Statistics(**words["stats"]),
-        rank=words["rank"],
+        status=known.status,
+        message=known.message,
+        stats=known.statistics,
+        rank=known.rank,
         system=system,
-        method=words.get("method", ""),  # older files have none
+        method=known.method,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 
 
+def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Arrays and words of a file, whatever is in it, or that it is none of ours."""
+    ours = f"path must lead to a file written by Result.save; {str(path)!r}"
+    arrays: dict[str, NDArray[Any]] = {}
+    field = ""
+    with path.open("rb") as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                for name in archive.namelist():
+                    field = f": {name.removesuffix('.npy')} cannot be read"
+                    with archive.open(name) as member:
+                        arrays[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
+                        if member.read(1):  # which also compares the check sum of the archive
+                            raise ValueError("the array is followed by something else")
+            field = ""
+            words = json.loads(str(arrays["words"]))
+        except Exception as error:  # a damaged archive raises nearly anything
+            raise ValueError(f"{ours} is none{field} ({type(error).__name__}: {error})") from error
+    if not isinstance(words, dict) or words.get("format") != FORMAT:
+        raise ValueError(f"{ours} holds something else")
+    return arrays, words
+
+
 def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str, Any]) -> DenseSolution:
-    t, states = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("sol_t", "sol_states"))
+    t, states = (np.ascontiguousarray(arrays[name]) for name in ("sol_t", "sol_states"))
     table = Table(t, states, arrays["sol_kinds"])
-    rank, rank_v = words["sol_ranks"]
-    interpolator = Interpolator(system, float(table.t[0]), table.states[0], words["sol_rtol"], (rank, rank_v))
+    start, row, rtol = float(t[0]), states[0], words["sol_rtol"]
+    ranks = ranks_at(system, start, row[: system.n_q], row[system.n_q : 2 * system.n_q], rtol)
+    if words["sol_ranks"] != list(ranks):
+        raise ValueError(
+            f"system must be the one that was solved: ranks of its constraints are {list(ranks)} at the start of the "
+            f"run; sol_ranks in the file are {words['sol_ranks']}"
+        )
+    interpolator = Interpolator(system, start, row, rtol, np.full(system.n_q, rtol), ranks)
     if "sol_interior_t" in arrays:
         interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])
     return DenseSolution(interpolator, table, words["sol_end"])

@@ -5,6 +5,7 @@ take seconds for some hundred of them. The code is kept on disk as that of the k
 """
 
 import hashlib
+import weakref
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
 from twoloop import llvm_code, llvm_trigonometry, straight_line
-from twoloop.caches import compile_kept, sources_folder
+from twoloop.caches import Newest, compile_kept, sources_folder
 from twoloop.callbacks import VECTOR
 from twoloop.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, Value
 from twoloop.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
@@ -113,13 +114,17 @@ def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: S
 def function_of(graph: Graph, outputs: Outputs) -> Any:
     """A function of the inputs, a tuple of numbers and vectors, and of vectors to fill, for code that numba compiles.
 
-    It returns whether the conditions hold and what it computes is finite, and fills the vectors only then.
+    It returns whether the conditions hold and what it computes is finite, and fills the vectors only then. Numba keeps
+    it for ever; what it is written from must live until it is compiled.
     """
+    graph_there, outputs_there = weakref.ref(graph), weakref.ref(outputs)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def pointer(vectors: Value, k: int) -> Value:
             return make_array(VECTOR)(context, builder, builder.extract_value(vectors, k)).data
 
+        graph, outputs = graph_there(), outputs_there()
+        assert graph is not None and outputs is not None
         given, filled = arguments
         emit, inputs = Emitter(builder), []
         for k, (kind, size) in enumerate(zip(signature.args[0], graph.sizes, strict=True)):
@@ -141,7 +146,7 @@ def function_of(graph: Graph, outputs: Outputs) -> Any:
     return function
 
 
-_INNER: dict[str, Dispatcher] = {}  # by their digests
+_INNER = Newest()
 
 
 class OwnCode:
@@ -163,9 +168,10 @@ class OwnCode:
         for module in (__file__, straight_line.__file__, llvm_code.__file__, llvm_trigonometry.__file__):
             digest.update(Path(str(module)).read_bytes())
         self.digest = digest.hexdigest()
-        if self.digest not in _INNER:
-            _INNER[self.digest] = _inner(equations, (common.stamp("calls"), self.digest))
-        self.inner = _INNER[self.digest]
+        inner = _INNER.get(self.digest)
+        if inner is None:
+            _INNER[self.digest] = inner = _inner(equations, (common.stamp("calls"), self.digest))
+        self.inner: Dispatcher = inner
 
 
 def own_code(system: ConstrainedSystem, t0: float, q0: Array) -> OwnCode:

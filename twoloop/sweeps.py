@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
-import multiprocessing
+import math
 import os
 import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from twoloop.checks import check_choice, check_flag, check_positive, check_size,
 from twoloop.optional import needed
 from twoloop.result import Result, Status
 from twoloop.solve import check_method, solve_dae
+from twoloop.workers import in_processes
 
 if TYPE_CHECKING:
     from twoloop.mechanisms.problem import Problem
@@ -30,7 +32,8 @@ Work = tuple[Callable[..., Any], Callable[..., Any], dict[str, Any]]  # problem_
 OWN = ("status", "message", "seconds")  # columns of every row
 ERROR = "ERROR"  # the status of a run that raised instead of ending
 PARALLEL = ("processes", "threads")
-BATCHES = 16  # tasks for each worker, so that all end at about the same time ...
+LARGEST_INTEGER = 2**63  # of a table's column, and above
+BATCHES = 16  # tasks for each thread or worker of a cluster, so that all end at about the same time ...
 LARGEST_BATCH = 16  # ... of this many runs at most
 SAVE_EVERY = 10.0  # s
 
@@ -62,7 +65,8 @@ def sweep(
     """Solve a mechanism for many sets of parameters.
 
     The first run is made here: it compiles what is missing, once for all workers, and a mistake in `problem_of`,
-    `measure` or `options` comes through at once. After that, a run that fails is a row that says why.
+    `measure` or `options` comes through at once. After that, a run that fails is a row that says why, also one in which
+    its process dies.
 
     Parameters
     ----------
@@ -70,10 +74,12 @@ def sweep(
         problem_of(**parameters) -> Problem, such as a ready mechanism or a function of one's own. A `ValueError` of
         it, for a geometry that does not assemble, is a row.
     parameters : sequence of mappings
-        One for each run, all with the same names. Values are numbers, strings, or True and False.
+        One for each run, all with the same names. Values are numbers, strings, or True and False, under one name of
+        one kind.
     measure : callable
-        measure(problem, result) -> mapping of further columns. By default the last time, counts, and the largest
-        energy error where the energy is an invariant.
+        measure(problem, result) -> mapping of further columns, whose values are numbers, strings, True and False or
+        None, in one column of one kind. By default the last time, counts, and the largest energy error where the
+        energy is an invariant.
     workers : int, optional
         Processes or threads. None: one for each core.
     parallel : {"processes", "threads"}
@@ -85,7 +91,9 @@ def sweep(
         Run on its cluster instead. `workers` and `parallel` do not count then.
     out : path, optional
         A file of Parquet (needs pyarrow) in which rows are kept, every ten seconds and at the end, also after Ctrl-C.
-        If it exists, the runs that it has are not made again, failed ones neither.
+        If it exists, the runs that it has are not made again, failed ones neither. The file knows the code of the
+        functions, what they enclose and the globals that they reach, and the version of this package: with others
+        it is refused.
     progress : bool
         Show a bar (needs rich).
     t_span : (float, float), optional
@@ -119,19 +127,25 @@ def sweep(
         _check_pickles(work)
     pandas = needed("pandas", "pandas", "sweep")
     path = None if out is None else Path(out)
-    settings = saved_sweep.settings(work)
-    rows: dict[int, Row] = {} if path is None else saved_sweep.read(pandas, path, given, settings)
+    rows: dict[int, Row] = {}
+    if path is not None:
+        settings = saved_sweep.settings(work)
+        rows = saved_sweep.read(pandas, path, given, settings)
 
     def table() -> Any:
         made = pandas.DataFrame([rows[number] for number in sorted(rows)], index=sorted(rows)).rename_axis("run")
         return made if len(made) else pandas.DataFrame(columns=[*given[0], *OWN]).rename_axis("run")
 
     left = [number for number in range(len(given)) if number not in rows]
-    with _bar(progress, len(given)) as report:
+    kinds = {name: kind for row in rows.values() for name, value in row.items() if (kind := _kind(value))}
+    with (
+        _bar(progress, len(given)) as report,
+        closing(_all_rows(work, given, left, n_workers, parallel, client)) as made,
+    ):
         saved = time.monotonic()
         try:
-            for number, row in _all_rows(work, given, left, n_workers, parallel, client):
-                rows[number] = {**given[number], **row}
+            for number, row in made:
+                rows[number] = {**given[number], **_fitting(row, kinds)}
                 report(len(rows))
                 if path is not None and time.monotonic() - saved > SAVE_EVERY:
                     saved_sweep.write(table(), path, settings)
@@ -144,33 +158,46 @@ def sweep(
 
 def _all_rows(
     work: Work, given: list[Row], left: list[int], n_workers: int, parallel: str, client: Any
-) -> Iterator[tuple[int, Row]]:
+) -> Generator[tuple[int, Row]]:
     """Numbers and rows of the runs that are left, as they come; the first is made here."""
     if not left:
         return
     yield left[0], one_run(work, given[left[0]], first=True)
-    rest = left[1:]
+    rest = {number: given[number] for number in left[1:]}
+    if client is None and parallel == "processes":
+        for number, row, how in in_processes(partial(one_run, work), rest, n_workers):
+            yield number, row or _failed(how)
+    elif rest:
+        with client.get_executor(pure=False) if client is not None else ThreadPoolExecutor(n_workers) as executor:
+            yield from _by_executor(executor, work, rest, n_workers)
+
+
+def _by_executor(executor: Executor, work: Work, rest: dict[int, Row], n_workers: int) -> Iterator[tuple[int, Row]]:
+    """Rows by threads or a cluster, in batches; a batch that is lost, with the worker that was at it, run by run."""
     size = min(max(len(rest) // (BATCHES * n_workers), 1), LARGEST_BATCH)
-    with _executor(n_workers, parallel, client) as executor:
-        tasks: dict[Future[list[Row]], list[int]] = {}
-        for k in range(0, len(rest), size):
-            numbers = rest[k : k + size]
-            tasks[executor.submit(batch, work, [given[number] for number in numbers])] = numbers
-        try:
-            for task in as_completed(tasks):
-                yield from zip(tasks[task], task.result(), strict=True)
-        finally:
-            for task in tasks:
-                task.cancel()
+    tasks: dict[Future[list[Row]], list[int]] = {}
 
+    def submit(numbers: list[int]) -> None:
+        tasks[executor.submit(batch, work, [rest[number] for number in numbers])] = numbers
 
-def _executor(n_workers: int, parallel: str, client: Any) -> Executor:
-    if client is not None:
-        return client.get_executor(pure=False)  # type: ignore[no-any-return]
-    if parallel == "threads":
-        return ThreadPoolExecutor(n_workers)
-    # not forked: a fork of a process with threads may stand still
-    return ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("spawn"))
+    everything = list(rest)
+    for k in range(0, len(everything), size):
+        submit(everything[k : k + size])
+    try:
+        while tasks:
+            for task in wait(tasks, return_when=FIRST_COMPLETED).done:
+                numbers = tasks.pop(task)
+                try:
+                    yield from zip(numbers, task.result(), strict=True)
+                except Exception as error:
+                    if len(numbers) == 1:
+                        yield numbers[0], _failed(f"{type(error).__name__}: {error}")
+                    else:
+                        for number in numbers:
+                            submit([number])
+    finally:
+        for task in tasks:
+            task.cancel()
 
 
 def batch(work: Work, given: list[Row]) -> list[Row]:
@@ -190,21 +217,56 @@ def one_run(work: Work, given: Row, first: bool = False) -> Row:
             raise KeyboardInterrupt
         seconds = time.perf_counter() - began
         row = {"status": result.status.name, "message": result.message, "seconds": seconds}
-        return row | _check_measured(measure(problem, result), {*given, *OWN})
-    except Exception as error:
+        return row | _check_measured(measure(problem, result), {*given, *OWN, "run"})
+    except (Exception, SystemExit) as error:
         if first and not isinstance(error, ValueError):
             raise
-        seconds = time.perf_counter() - began
-        return {"status": ERROR, "message": f"{type(error).__name__}: {error}", "seconds": seconds}
+        return _failed(f"{type(error).__name__}: {error}", time.perf_counter() - began)
+
+
+def _failed(message: str, seconds: float = math.nan) -> Row:
+    return {"status": ERROR, "message": message, "seconds": seconds}
 
 
 def _check_measured(measured: Any, known: set[str]) -> Row:
     if not isinstance(measured, Mapping):
         raise TypeError(f"measure must return a mapping of columns; it returned {shown(measured)}")
-    twice = sorted(set(measured) & known)
-    if twice:
-        raise TypeError(f"measure must return columns that the row has not already; it returned {twice[0]!r}")
-    return dict(measured)
+    row = {}
+    for name, value in measured.items():
+        if not isinstance(name, str):
+            raise TypeError(f"measure must name its columns by strings; it returned {shown(name)}")
+        if name in known:
+            raise TypeError(f"measure must return columns that the row has not already; it returned {name!r}")
+        plain = value.item() if isinstance(value, (np.generic, np.ndarray)) and np.ndim(value) == 0 else value
+        if not (plain is None or _kind(plain) or (isinstance(plain, float) and math.isnan(plain))):
+            raise TypeError(
+                f"measure must return numbers, strings, True and False or None, cells of a table; {name!r} is "
+                f"{shown(value)} of type {type(value).__name__}"
+            )
+        row[name] = plain
+    return row
+
+
+def _kind(value: Any) -> str | None:
+    """Which kind of column a cell is for; None: any, as what is no number, or that it is for none."""
+    if isinstance(value, bool):
+        return "True and False"
+    if isinstance(value, float) or (isinstance(value, int) and -LARGEST_INTEGER <= value < LARGEST_INTEGER):
+        return None if math.isnan(value) else "numbers"
+    return "strings" if isinstance(value, str) else None
+
+
+def _fitting(row: Row, kinds: dict[str, str]) -> Row:
+    """A row as it fits into the columns, whose kinds grow; a file holds one kind in a column, and no broken text."""
+    row = {k: value.encode(errors="replace").decode() if isinstance(value, str) else value for k, value in row.items()}
+    for name, value in row.items():
+        kind = _kind(value)
+        if kind is not None and kinds.setdefault(name, kind) != kind:
+            message = (
+                f"TypeError: measure must fill a column with one kind; {name!r} had {kinds[name]}, now {shown(value)}"
+            )
+            return _failed(message, row["seconds"])
+    return row
 
 
 def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
@@ -218,6 +280,7 @@ def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
     if not parameters:
         raise ValueError("parameters must be of one run at least; given none")
     signature, made = inspect.signature(problem_of), []
+    kinds: dict[str, str] = {}
     for number, each in enumerate(parameters):
         if not isinstance(each, Mapping):
             raise TypeError(f"parameters[{number}] must be a mapping of names to values; given {shown(each)}")
@@ -228,17 +291,24 @@ def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
         taken = sorted(set(each) & {*OWN, "run"})
         if taken:
             raise ValueError(f"parameters must not be named as the columns of every row are; given {taken[0]!r}")
-        for name, value in each.items():
-            if not isinstance(value, (bool, int, float, str, np.generic)):
+        plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in each.items()}
+        for name, value in plain.items():
+            kind = _kind(value)
+            if kind is None and not (isinstance(value, float) and math.isnan(value)):
                 raise TypeError(
                     f"parameters[{number}][{name!r}] must be a number, a string, True or False, a cell of a table; "
                     f"given {shown(value)}. Give the parts one by one, and let problem_of put them together"
+                )
+            if kind is not None and kinds.setdefault(name, kind) != kind:
+                raise TypeError(
+                    f"parameters must be of one kind under one name, as they fill a column of a table; {name!r} has "
+                    f"{kinds[name]}, and {shown(value)} in [{number}]"
                 )
         try:
             signature.bind(**each)
         except TypeError as error:
             raise TypeError(f"problem_of does not take parameters[{number}]: {error}") from None
-        made.append({name: value.item() if isinstance(value, np.generic) else value for name, value in each.items()})
+        made.append(plain)
     return made
 
 

@@ -21,7 +21,7 @@ from twoloop.adapters import (
 )
 from twoloop.bounds import check_callback
 from twoloop.callbacks import KINDS, STATE, stand_in
-from twoloop.checks import check_flag, check_number, check_real, check_size
+from twoloop.checks import check_flag, check_number, check_real, check_size, shown
 from twoloop.description import Description
 from twoloop.jacobian import differenced_jacobian
 from twoloop.joints import Joint, check_joints
@@ -50,7 +50,7 @@ class ConstrainedSystem:
     n_a : int
         Number of non-holonomic constraints.
     parameters : array_like, optional
-        The vector `p` that every callback gets.
+        The vector `p` that every callback gets. It stays as it is: `with_parameters` makes a system of others.
     constant_mass : bool
         True: M depends neither on t nor on q, and is factored once.
     bandwidth : int, optional
@@ -96,9 +96,7 @@ class ConstrainedSystem:
         self.name = name
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
         self.description = Description()  # a Problem puts its own in its place
-        self.parameters = check_real("parameters", parameters)
-        if self.parameters.ndim != 1 or not np.isfinite(self.parameters).all():
-            raise ValueError(f"parameters must be a vector of finite numbers; given {parameters!r}")
+        p = _checked_parameters(parameters)
         if not isinstance(constant_mass, (bool, np.bool_)):
             raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
         self.constant_mass = bool(constant_mass)
@@ -121,7 +119,7 @@ class ConstrainedSystem:
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
         all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
-        self.functions: Any = Functions(**all_callbacks, p=self.parameters, flags=flags)  # type: ignore[call-arg]
+        self.functions: Any = Functions(**all_callbacks, p=p, flags=flags)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
         self._shapes = {
@@ -130,10 +128,61 @@ class ConstrainedSystem:
         }
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
-        self.made: dict[Any, Any] = {}  # of its equations, by what of them and by the parameters: see `remembered`
+        self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
+
+    @property
+    def parameters(self) -> Array:
+        """The vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
+        p = self.functions.p.copy()  # kernels want an array that may be written
+        p.setflags(write=False)
+        return p.view()  # which nobody can make writable again
+
+    @parameters.setter
+    def parameters(self, value: Any) -> None:
+        raise AttributeError(
+            f"parameters of {self.name!r} cannot be changed, as results refer to them: make another system by "
+            "system.with_parameters(p), which shares the compiled callbacks"
+        )
+
+    def with_parameters(self, parameters: ArrayLike) -> ConstrainedSystem:
+        """Make a system of the same callbacks, of which nothing is compiled again, and other parameters.
+
+        What is told of a system beside its equations may enclose the parameters, too. Kept are the names of the
+        coordinates, joints without a `point` and `equations`, and the energy where it is generated with the equations;
+        another energy and a drawing are given by a `Problem` of the new system.
+
+        Parameters
+        ----------
+        parameters : array_like
+            The vector `p`, of the same length.
+
+        Returns
+        -------
+        ConstrainedSystem
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the parameters are not as many finite numbers, or the system is made of functions that take none.
+        """
+        if self._python is not None or self._returning:
+            raise TypeError(
+                f"{self.name!r} has no parameters: it is made by from_python, whose functions take none. Make another "
+                "system of functions that enclose other numbers, or give callbacks made by @twoloop.callback, which "
+                "get the parameters as p"
+            )
+        p, known = _checked_parameters(parameters), self.functions.p
+        if p.shape != known.shape:
+            raise ValueError(f"parameters of {self.name!r} must be {known.size} numbers, as they are; given {p.size}")
+        other = copy.copy(self)
+        other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
+        other.within_bounds, other.checked, other.made = set(), False, {}
+        other.description = self.description.with_parameters(p)
+        other.joints = tuple(joint for joint in self.joints if joint.point is None and joint.equations is None)
+        return other
 
     @classmethod
     def from_python(
@@ -226,13 +275,12 @@ class ConstrainedSystem:
         return self._python is not None
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
-        """What `make` makes of the equations with the parameters as they are now, once; functions may do otherwise."""
+        """What `make` makes of the equations with these parameters, once; functions may do otherwise."""
         if self.called_in_python:  # what such functions find in their surroundings may change
             return make()
-        key = (what, self.parameters.tobytes())
-        if key not in self.made:
-            self.made[key] = make()
-        return self.made[key]
+        if what not in self.made:
+            self.made[what] = make()
+        return self.made[what]
 
     def arrays_of(self, kind: str) -> list[Array]:
         """Zeros for a kind of callback to fill."""
@@ -301,11 +349,11 @@ class ConstrainedSystem:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ConstrainedSystem:
         other = memo[id(self)] = copy.copy(self)
-        other.parameters = self.parameters.copy()
+        p = self.functions.p.copy()
         if self._python is not None:  # numbers of its own for functions of its own
             other._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo))
-            other.parameters = np.array([other._python.handle], dtype=np.float64)
-        other.functions = self.functions._replace(p=other.parameters, flags=self.functions.flags.copy())
+            p = np.array([other._python.handle], dtype=np.float64)
+        other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
         return other
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -341,6 +389,14 @@ def _made_again(
     system.functions.flags[:] = flags
     system.description = known
     return system
+
+
+def _checked_parameters(parameters: Any) -> Array:
+    """The parameters as a new vector, or what is wrong with them."""
+    p = check_real("parameters", parameters)
+    if p.ndim != 1 or not np.isfinite(p).all():
+        raise ValueError(f"parameters must be a vector of finite numbers; given {shown(parameters)}")
+    return p
 
 
 def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:

@@ -111,6 +111,7 @@ class Taylor:
             factor_max=taylor.GROWTH,
             watchful=True,
             compilable=True,
+            looks_within=True,
             parts=min(max(highest // 3, FEWEST), MOST),
         )
         kept = plan.options.copy()

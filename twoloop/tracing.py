@@ -16,7 +16,6 @@ from twoloop.bounds import Rewritten
 
 # kinds of operation; the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM = range(10)
-LARGEST_POWER = 64  # that is made of products
 
 
 class Untraceable(ValueError):
@@ -142,8 +141,8 @@ class Form:
 
     def __pow__(self, exponent: Any) -> "Form":
         exponent = float(exponent)
-        if exponent != int(exponent) or abs(exponent) > LARGEST_POWER:
-            if 2.0 * exponent == int(2.0 * exponent) and abs(exponent) < LARGEST_POWER:
+        if exponent != math.floor(exponent):
+            if 2.0 * exponent == math.floor(2.0 * exponent):
                 return self ** math.floor(exponent) * self.square_root()
             return (self.logarithm() * exponent).exponential()
         n = abs(int(exponent))

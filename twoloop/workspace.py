@@ -60,6 +60,7 @@ def workspace(
     work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented))
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
+    work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf
     work.notes[common.ROUNDED] = ROUNDING * float(np.abs(q0).max())
     work.notes[common.REUSE] = max(reuse, work.notes[common.ROUNDED])
     work.pattern[:] = pattern

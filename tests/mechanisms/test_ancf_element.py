@@ -81,7 +81,7 @@ def defined_force(q):
 
 def tangent(problem, q):
     K = np.zeros((q.size, q.size))
-    elastic_tangent(0.0, q, np.zeros(q.size), problem.system.parameters, K)
+    elastic_tangent(0.0, q, np.zeros(q.size), problem.system.functions.p, K)
     return K
 
 

@@ -27,9 +27,7 @@ def assembled(L1, L2, L3, ground, theta3, branch):
 
 def system_of(L1, L2, L3, ground):
     """A system of these lengths; its callbacks take any q, so it need not hold together there."""
-    system = four_bar().system
-    system.parameters[:] = L1, L2, L3, ground
-    return system
+    return four_bar().system.with_parameters([L1, L2, L3, ground])
 
 
 @given(lengths, lengths, lengths, lengths, states, states)

@@ -134,7 +134,7 @@ def test_jacobian_is_that_of_the_residual(system, tangent):
     t, cj, y, yp = 0.3, 7.0, rng.normal(size=2 * (n + m)), rng.normal(size=2 * (n + m))
     residual = residual_at(*f[:5], n, m, system.constant_mass)
     matrix = iteration_matrix_at(*f[:5], n, m, system.constant_mass, tangent)
-    space = system.parameters, system.mass(t, y[:n]), np.zeros((m, n))
+    space = system.functions.p, system.mass(t, y[:n]), np.zeros((m, n))
 
     def value(y, yp):
         residual(t, y, yp, *space, res := np.zeros(y.size))

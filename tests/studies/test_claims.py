@@ -10,9 +10,7 @@ from studies import claims
 from studies.claims import experiments, judged, judges
 from studies.claims.rows import STUDIES, Rows, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
-from studies.cli import Call
 from studies.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, QUARTER, gear
-from studies.store import Output
 from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from twoloop.mechanisms import four_bar
 
@@ -343,7 +341,6 @@ def test_circular_and_stand_in_limit_the_verdict():
 def test_report_rows_and_findings(folder):
     text = (folder / "claims.md").read_text()
     rows = pd.read_csv(folder / "claims.csv", comment="#")
-    assert len(text.split()) < 1000
     for claim in load():
         assert f" {claim.statement.removesuffix('.')}" in text
         row = rows[rows["claim"] == claim.key].iloc[0]
@@ -355,29 +352,6 @@ def test_report_is_written_again_from_rows(folder):
     text = (folder / "claims.md").read_text()
     claims.main(["--redraw", "--out", str(folder)])
     assert (folder / "claims.md").read_text() == text
-
-
-SENTENCES = [  # claim, what is printed, verdict after a flip of the list above, what is printed then
-    ("more_efficient", "More efficient than Newmark: holds in part", HOLDS, "More efficient than Newmark: holds** on"),
-    ("more_efficient", "where Newmark is faster at every error", FAILS, "More efficient than Newmark: does not hold"),
-    ("symplectic_stable", "Symplectic, so stable: does not hold", HOLDS, "Symplectic, so stable: holds"),
-    ("jacobian_difficult", "Jacobians are difficult: does not hold", HOLDS, "Jacobians are difficult: holds"),
-    ("stiff_applicable", "so for stiff systems: does not hold", HOLDS, "so for stiff systems: holds"),
-    ("newmark_star", "of claims 20 and 22: err_out", FAILS, "of claim 20: err_out"),
-    ("irk_star", "**No evidence**", CIRCULAR, "of claim 23: of the readings"),
-    ("limit_reset_34", "Because (34) forgets h_max", HOLDS, ""),
-]
-STAYS = ("irk_star", "more_efficient")  # what is printed before may be printed then, too
-
-
-@pytest.mark.parametrize(("key", "before", "turned", "after"), SENTENCES)
-def test_sentences_turn_with_the_verdicts(key, before, turned, after, folder, tables, tmp_path):
-    assert before in (folder / "claims.md").read_text()
-    flip = next(flip for flip in FLIPS if flip[0] == key and flip[4] is turned)
-    with Output(Call("claims", False, tmp_path, False, "")) as output:
-        claims.report(output, Rows(with_changed(tables, *flip[1:4]), EXPERIMENTS), "stamp")
-    text = (tmp_path / "claims.md").read_text()
-    assert after in text and (before not in text or key in STAYS)
 
 
 @pytest.mark.slow

@@ -1,12 +1,13 @@
 """The step-size study: its sentences turn with the rows, and what must hold in the rows of a quick run."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from studies import step_size
 from studies.cli import Call
-from studies.render import number_of_words
 from studies.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
 from studies.step_size import OTHERS, PAPER
 from studies.store import Output
@@ -46,7 +47,8 @@ def rows():
     return pd.DataFrame(lines)
 
 
-def text_of(folder, made, quick=False):
+def found_of(folder, made, quick=False):
+    """The findings, with which the report was written."""
     curve = np.array([[0.0, 1.0, 2.0], [0.06, 0.05, 0.06]])
     paper = {row["solver"]: row for _, row in made[made["group"] == "paper"].iterrows()}
     kinds = ("whole", "zoom", "error", "convergence", "switch")
@@ -54,37 +56,35 @@ def text_of(folder, made, quick=False):
     series[key(paper[IRK], "convergence")] = np.empty((2, 0))  # no such attempt is no error
     with Output(Call("step_size", quick, folder, False, "")) as output:
         step_size.STUDY.report(output, made, series, "stamp")
-    return (folder / "step_size.md").read_text()
+    return json.loads((folder / "step_size.json").read_text())
 
 
-def test_the_report_is_short_and_whole(tmp_path):
-    text = text_of(tmp_path, rows())
-    assert number_of_words(text) < 1000
+def test_the_report_is_whole(tmp_path):
+    found_of(tmp_path, rows())
     for name in ("step_size.png", "step_size.svg"):
         assert (tmp_path / name).stat().st_size > 10_000
-    assert "[step_size.csv](step_size.csv)" in text and "not told" in text and "Runs that did not" not in text
 
 
-def test_sentences_turn_with_the_rows(tmp_path):
-    text = text_of(tmp_path, rows())
-    assert "As the paper says, they are longer than 0.02 s most of the time." in text
-    assert "200 times as long as that of `PaperNewmark`" in text
-    assert "Runge–Kutta has its attempts rejected more often." in text
-    assert f"100 times, 2.2 times a period. In all {len(PRESETS) + 3} two-loop runs" in text
+@pytest.mark.usefixtures("unsaved")
+def test_findings_turn_with_the_rows(tmp_path):
+    found, n = found_of(tmp_path, rows()), len(PRESETS) + 3
+    assert found["holds"] and found["longer"] and found["retries_more"]
+    assert found["ratios"] == pytest.approx([200.0, 200.0])
+    assert found["switches"] == 100 and found["switches_per_period"] == pytest.approx(2.2, abs=0.1)
+    assert (found["n_known"], found["n_worse_at_switch"]) == (n, n)
 
     made = rows()
     ours = made["group"] != "others"
     made.loc[made["solver"] == IRK, ["share_time", "h_median", "retried"]] = [0.3, 1e-4, 1e-4]
     made.loc[ours, "retried_switch"] = 0.0
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
-    text = text_of(tmp_path, made)
-    assert "that does not hold here" in text and "contrary to the paper" in text
-    assert "rejected no more often" in text and f"In none of the {len(PRESETS) + 3} two-loop runs" in text
-    assert "| solver failed |" in text
+    found = found_of(tmp_path, made)
+    assert not found["holds"] and not found["longer"] and not found["retries_more"]
+    assert (found["n_known"], found["n_worse_at_switch"]) == (n, 0)
     made.loc[made["solver"] == "Gauss6", "retried_switch"] = 0.9
-    assert f"In 1 of the {len(PRESETS) + 3} two-loop runs" in text_of(tmp_path, made)
+    assert found_of(tmp_path, made)["n_worse_at_switch"] == 1
     made["retried_switch"] = np.nan
-    assert "No run says how often" in text_of(tmp_path, made)
+    assert found_of(tmp_path, made)["n_known"] == 0
 
 
 def test_of_many_steps_the_extremes_are_drawn():

@@ -8,7 +8,7 @@ import pytest
 
 from studies import deceived, end_states, validation
 from studies.bench import Run
-from studies.render import number_of_words, render
+from studies.render import render
 from studies.solvers import CATALOGUE
 from twoloop import mechanisms, solve_dae
 
@@ -86,34 +86,31 @@ def made_up(**changed):
     return pd.DataFrame(lines)
 
 
-def text_of(rows):
+def found_of(rows):
+    """The findings, of which a report can be written."""
     found = validation.findings_of(rows)
-    empty = dict.fromkeys(("solvers", "models"), "")
-    return render("validation", found, empty, stamp="stamp", quick=False), found
+    render("validation", found, dict.fromkeys(("solvers", "models"), ""), stamp="stamp", quick=False)
+    return found
 
 
-def test_sentences_turn_with_the_rows():
-    text, found = text_of(made_up())
-    assert "Right on every problem at 1e-10: `Gauss12` and `BDF`" in text
-    assert "On no problem is another solver right and none of ours" in text
-    assert "Reached everywhere" in text
+def test_findings_turn_with_the_rows():
+    found = found_of(made_up())
+    assert found["ours_always"] == ["Gauss12", "BDF"] and found["only_others"] == found["ours_short"] == []
     assert found["solvers"][0]["slope"] == pytest.approx([1.0, 1.0, 1.0])
     stopped = {"status": "STEP_TOO_SMALL", "outcome": "said so", "error_q": np.nan, "digits_q": np.nan}
-    text, found = text_of(made_up(where=[("A02, N = 1", "Gauss12"), ("A02, N = 1", "BDF")], what=stopped))
-    assert "None of ours is right on every problem" in text
-    assert "Another solver is right and none of ours: A02, N = 1" in text
-    assert "A02, N = 1: `Gauss12` stops with a message." in text
+    found = found_of(made_up(where=[("A02, N = 1", "Gauss12"), ("A02, N = 1", "BDF")], what=stopped))
+    assert found["ours_always"] == [] and found["only_others"] == ["A02, N = 1"]
+    assert [(line["case"], line["stopped"]) for line in found["ours_short"]] == [("A02, N = 1", ["Gauss12"])]
     wrong = {"outcome": "wrong", "error_q": 1e-3, "digits_q": 3.0}
-    text, found = text_of(made_up(where=[("double pendulum", "BDF")], what=wrong))
-    assert "`BDF` on double pendulum (1e-3)" in text
+    found = found_of(made_up(where=[("double pendulum", "BDF")], what=wrong))
+    (tight,) = found["ours_wrong_tight"]
+    assert (tight["solver"], tight["case"], tight["error_q"]) == ("BDF", "double pendulum", 1e-3)
     assert found["n_wrong"] == {"ours": 4, "others": 0}
-    assert number_of_words(text) < 1000
     refused = {"outcome": "not run", "status": "RAISED", "error_q": np.nan, "digits_q": np.nan}
-    text, _ = text_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))
-    assert "refuse to put the problem to the others: double pendulum." in text
-    assert "Ours alone" not in text
-    text, _ = text_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
-    assert "Ours alone: double pendulum." in text
+    found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))
+    assert (found["not_put"], found["only_ours"]) == (["double pendulum"], [])
+    found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
+    assert found["only_ours"] == ["double pendulum"]
 
 
 def deceived_row(problem, solver, tolerance):
@@ -147,21 +144,18 @@ def test_the_share_of_deceived_steps():
     assert (bad["deceived"], bad["first"], bad["first_worst"]) == (0.2, 0.5, 2.0)
 
 
-def test_sentences_of_steps_and_of_models_follow_their_rows():
+def test_findings_of_steps_and_of_models_follow_their_rows():
     first = {"group": deceived.DECEIVED, "case": "double pendulum", "solver": "BDF", "tol": 1e-8, "n_sampled": 25}
     first |= {"n_deceived": 0, "worst_step": 0.3, "first_step": 8.0}
     exudyn = {"group": validation.MODELLED, "case": "heavy top", "solver": "Exudyn, HHT", "t_end": 1.0, "status": "x"}
     runs = [exudyn | {"h": 1.0 / n, "error_q": 100.0 / n**2} for n in (100, 400)]
-    text, found = text_of(pd.concat([made_up(), pd.DataFrame([first, *runs])]))
-    assert "`BDF` accepts first steps with too large an error" in text
+    found = found_of(pd.concat([made_up(), pd.DataFrame([first, *runs])]))
+    assert found["first_deceived"] == ["BDF"] and found["model_steps"] == [100, 400]
     by_solver = {line[0]: line[-1] for line in validation.lines(found["solvers"], found["steps"])}
     assert by_solver == {"Gauss12": "–", "BDF": "0 %", "LSODA, index 1": "–"}
-    assert "with 400 steps, and the order seen between 100 and 400 " in text
     assert found["models"][0]["solvers"]["Exudyn, HHT"]["order"] == pytest.approx(2.0)
-    text, _ = text_of(pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))
-    assert "first steps with too large an error" not in text
-    assert "Exudyn" not in text
-    assert number_of_words(text) < 1000
+    found = found_of(pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))
+    assert found["first_deceived"] == found["models"] == []
 
 
 def test_a_run_that_did_not_move_has_no_drift():

@@ -16,15 +16,19 @@ from twoloop.kernels.calls import (
 from twoloop.kernels.common import (
     AUGMENTED,
     BY_GENERAL,
+    DEFECT,
     DEPARTURE,
     DONE,
     EXPLICIT_STEP,
     FAULT_KIND,
     FORM,
     GAMMA_GIVEN,
+    GAP,
     INNER_DIVERGED,
     INTEGERS,
+    KINK_AFTER,
     KIT,
+    LARGEST_DEFECT,
     MATRIX,
     N_ACCEPTED,
     N_JACOBIANS,
@@ -41,7 +45,9 @@ from twoloop.kernels.common import (
     SINGULAR,
     STEP_FACTOR,
     STRAIGHT,
+    UNCHECKED,
     VECTOR,
+    WIDEST_GAP,
     WORK,
     f8,
     i8,
@@ -49,6 +55,7 @@ from twoloop.kernels.common import (
     merged,
 )
 from twoloop.kernels.differences import representable
+from twoloop.kernels.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.partition import CHANGED, partition_is_poor
 
@@ -62,7 +69,9 @@ from twoloop.kernels.partition import CHANGED, partition_is_poor
     MAX_STEPS_REACHED,
     ROWS_VIOLATED,
     NEAR_SINGULAR,
-) = range(8)
+    HAS_TO_GIVE_WAY,
+    AT_JUMP,  # of C_t or b; the caller is to put the state beyond it into new_state
+) = range(10)
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
@@ -92,8 +101,10 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
     BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
     SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
+    GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on
+    DRIVEN,  # 1: C_t or b may jump
     N_CONTROL,
-) = range(18)
+) = range(20)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -114,8 +125,11 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     ERROR_BEFORE,
     H_LONG,  # the longest of the last steps, fading
     LARGEST_PIVOT,  # of the smallest pivots of C_q so far
+    JUMP_FROM,  # the interval in which C_t or b jumps, where one lies ahead; else infinite
+    JUMP_TO,
+    LEAPS,  # 1: the next step is that over it, and new_state its end
     N_CLOCK,
-) = range(14)
+) = range(17)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -139,6 +153,20 @@ def start(f, w, t, state):
 def _near_singular(w, control, clock):
     """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know."""
     return control[BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]
+
+
+@merged
+def _kink(f, w, t, size, tolerances, accepted, state, new_state):
+    """What find_kink says of a step whose velocities change by more than its accelerations explain."""
+    n = w.Q.size
+    q, v = state[:n], state[n : 2 * n]
+    if not accepted:
+        return find_kink(f, w, t, t + size, q, v, v, tolerances)
+    if not unexplained(tolerances, size, state, new_state, n) > 1.0:
+        return SMOOTH, t, t
+    for m in range(n):
+        w.y[m] = (new_state[m] - state[m]) / size
+    return find_kink(f, w, t, t + size, q, v, w.y, tolerances)
 
 
 _ADVANCE = i8(
@@ -188,9 +216,13 @@ def advance(
         if w.counters[N_ACCEPTED] >= control[MAX_STEPS]:
             return MAX_STEPS_REACHED
         t = clock[T]
+        leaps = clock[LEAPS] == 1.0
+        if t == clock[JUMP_FROM] and not leaps:
+            return AT_JUMP
         target = outputs[int(clock[NEXT_OUTPUT])]
+        goal = min(target, clock[JUMP_TO] if leaps else clock[JUMP_FROM])
         h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
-        left = target - t
+        left = goal - t
         size = h
         in_grid = 1.0  # steps of the grid that this one is
         if fixed:
@@ -200,19 +232,22 @@ def advance(
             if target <= clock[T_START] + clock[N_FIXED] * h + near:
                 in_grid = 0.0  # a second output time beside the same point of the grid
             end = clock[T_START] + (clock[N_FIXED] + in_grid) * h
-            lands = end >= target - near
+            reaches = goal <= end + near
             if abs(t + h - end) > rounding:
                 size = end - t  # back to the grid after such an output time
-            shortened = lands
+            if reaches and goal < target and abs(goal - end) > rounding:
+                in_grid = 0.0
+            shortened = reaches
         else:
-            lands = h >= left * (1.0 - 1e-10)
-            shortened = lands or h > 0.5 * left
-            if shortened and not lands:
+            reaches = leaps or h >= left * (1.0 - 1e-10)
+            shortened = reaches or h > 0.5 * left
+            if shortened and not reaches:
                 size = 0.5 * left  # two equal steps rather than a long and a tiny one
             size = representable(t, size)
             if size > control[MAX_STEP]:
                 size = representable(t, size - np.spacing(abs(t + size)))
-        if lands:
+        lands = reaches and goal == target
+        if reaches:
             size = left
         elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
             return STEP_TOO_SMALL
@@ -221,8 +256,14 @@ def advance(
         if clock[FAILURE_CODE] == DONE:
             w.notes[FAULT_KIND] = -1.0
         w.notes[STEP_FACTOR] = 0.0
-        code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
-        if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
+        w.notes[DEFECT] = -1.0
+        if leaps:
+            code, error = DONE, 0.0
+            w.notes[DEFECT] = 0.0
+            w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
+        else:
+            code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
+        if code == DONE and np.isfinite(error) and not leaps and control[SYMMETRIC] == 1.0:
             code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
             if code == CHANGED:
                 memory[0] = 0.0  # what the step keeps is of one that is not taken
@@ -231,11 +272,26 @@ def advance(
         if code == DONE and not np.isfinite(error):
             code = NOT_FINITE
         accepted = code == DONE and error <= 1.0
+        if control[DRIVEN] == 1.0 and not leaps:
+            kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
+            if kind == JUMP or (kind == RAMP and accepted and not fixed):
+                memory[0] = 0.0
+                w.counters[N_REJECTED_ERROR] += 1
+                clock[FAILURE_CODE] = DONE
+                if kind == JUMP:
+                    clock[JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
+                    clock[JUMP_TO] = high
+                    w.notes[KINK_AFTER] = clock[JUMP_FROM]
+                else:
+                    clock[H_NEXT] = max(low - t, high - low)
+                continue
         memory[0] = 1.0 if accepted else 0.0
         if code != DONE:
             w.counters[N_REJECTED_CONVERGENCE] += 1
             clock[FAILURE_CODE] = code
             clock[H_FAILED] = size
+            if code == NOT_FINITE and control[GIVES_WAY] == 1.0:
+                return HAS_TO_GIVE_WAY
             if fixed:
                 # the step keeps its size; only a partition that went bad within it may be the reason
                 if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
@@ -278,13 +334,21 @@ def advance(
             clock[H_FAILED] = size
             return ROWS_VIOLATED
         w.counters[N_ACCEPTED] += 1
+        if w.notes[DEFECT] >= 0.0:
+            w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
+        else:
+            w.notes[UNCHECKED] += 1.0
+        gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
+        w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
         clock[H_LONG] = max(size, FADING * clock[H_LONG])
         clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
         clock[N_FIXED] += in_grid
-        if lands:
-            clock[T] = target
+        if reaches:
+            clock[T] = goal
         else:
             clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
+        if leaps:
+            clock[JUMP_FROM], clock[LEAPS] = np.inf, 0.0
         copy(new_state, state)
         w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
         out_steps[filled[1], H] = size
@@ -307,6 +371,8 @@ def advance(
             clock[NEXT_OUTPUT] += 1.0
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
+        if leaps:
+            return PAUSED
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
         if control[SYMMETRIC] == 0.0:
             straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0

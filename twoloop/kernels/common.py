@@ -67,6 +67,7 @@ class Work(NamedTuple):
     mass_pattern: Any  # (n_q, n_q) the same of M; empty without the augmented form
     places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
+    rates: Any  # (9, n_c + n_a) C_t and b at times within a step, see kinks.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -105,7 +106,9 @@ _INTEGER_FIELDS = {
     *("rows", "dependent", "independent", "index", "rows_v", "dependent_v", "independent_v", "index_v"),
     *("index_a", "places", "order", "row_order", "counters", "lapack"),
 }
-_MATRIX_FIELDS = {"M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried"}
+_MATRIX_FIELDS = {
+    *("M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried", "rates")
+}
 WORK = Reference(
     "Work",
     {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-2]},
@@ -157,8 +160,14 @@ def _type_of_work(value: Any, context: Any) -> Any:
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step
+    DEFECT,  # largest that this attempt found of itself, over what the tolerances allow; -1: it did not look
+    LARGEST_DEFECT,  # of the accepted steps
+    UNCHECKED,  # accepted steps that did not look
+    WIDEST_GAP,  # between two places at which accepted steps looked at the equations, s
+    KINK_BEFORE,  # times between which no jump of C_t or b is known
+    KINK_AFTER,
     N_NOTES,
-) = range(25)
+) = range(31)
 
 # what a kernel returns: DONE, or why it could not
 (
@@ -221,9 +230,10 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance; from
-# ATOL on stands the absolute tolerance of each coordinate and its velocity
-RTOL, ESTIMATE, LEAST, ATOL = range(4)
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP
+# the time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of
+# each coordinate and its velocity
+RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
 
 
 @cache

@@ -9,6 +9,7 @@ from numba import types
 
 from twoloop.kernels.calls import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.common import (
+    ATOL,
     DONE,
     FORM,
     GAMMA_INACCURATE,
@@ -17,6 +18,7 @@ from twoloop.kernels.common import (
     KIT,
     MATRIX,
     NULL_SPACE,
+    RTOL,
     SINGULAR,
     VECTOR,
     WORK,
@@ -32,23 +34,31 @@ from twoloop.kernels.intervals import (
     END_TIME,
     FIRST_OWN,
     FIRST_TIME,
+    HIGH,
+    JUMP,
     KIND,
     LAST_OWN,
+    LOW,
+    VELOCITIES,
     WINDOW,
 )
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.partition import partition_is_poor
 
 TABLE = types.int64[:, ::1]
+PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
+LOOKS = len(PLACES)
+EPS = 2.0**-52
+NOISY = 10.0  # of the tolerances of velocities
 
 
 @merged
-def _window(n, i, last):
-    """First and last of the n rows that the polynomial of the interval from row i goes through: centred but at ends."""
+def _window(low, high, i, last):
+    """First and last of the rows that the polynomial of the interval from row i goes through: centred but at ends."""
     if last > i + 1:  # the interval has states of its own
         return i, last
-    size = min(WINDOW, n)
-    lo = max(0, min(i + 1 - size // 2, n - size))
+    size = min(WINDOW, high - low + 1)
+    lo = max(low, min(i + 1 - size // 2, high + 1 - size))
     return lo, lo + size - 1
 
 
@@ -97,8 +107,19 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
             v[m] = value + states[i, n + m]
 
 
-@kernel(i8(KIT, WORK, f8, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
-def between(f, w, tolerance, t, states, groups, times, z, room, out):
+@merged
+def _kind(kind, tolerances, h, states, i):
+    """APART also where an interval is so short that rounding of q is more than the tolerances of its slope."""
+    n = tolerances.size - ATOL
+    for m in range(n):
+        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
+        if EPS * abs(states[i, m]) > NOISY * h * (atol + rtol * abs(states[i, n + m])):
+            return APART
+    return kind
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
+def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
     """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found.
 
     There q and v are those of the polynomials. `z` and `room` hold nodes and coefficients of two polynomials.
@@ -111,7 +132,8 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
         h = t[last] - t[i]
-        lo, hi = _window(t.size, i, last)
+        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
+        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
         order = 3 if kind >= ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
@@ -121,6 +143,9 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
             q, v = out[p, :n], out[p, n : 2 * n]
             if times[p] == t[i] or times[p] == t[last]:
                 copy(states[i if times[p] == t[i] else last, : 2 * n], out[p])
+                continue
+            if kind == JUMP:
+                copy(states[i, : 2 * n], out[p])
                 continue
             s = (times[p] - t[i]) / h
             _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
@@ -137,6 +162,96 @@ def between(f, w, tolerance, t, states, groups, times, z, room, out):
                 failures += 1
                 _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
     return failures
+
+
+@merged
+def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
+    """Largest difference of two states, in positions and velocities, over the tolerances."""
+    n = q.size
+    rtol, largest = tolerances[RTOL], 0.0
+    for m in range(n):
+        atol = tolerances[ATOL + m]
+        largest = max(largest, scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m])))
+        largest = max(largest, scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m])))
+    return largest
+
+
+@merged
+def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
+    """The accelerations that the polynomials have, into `a`."""
+    for m in range(a.size):
+        value, slope, bend = c[size - 1, m], 0.0, 0.0
+        for r in range(size - 2, -1, -1):
+            bend = bend * (s - z[r]) + 2.0 * slope
+            slope = slope * (s - z[r]) + value
+            value = value * (s - z[r]) + c[r, m]
+        a[m] = bend / (h * h)
+    if kind == APART:
+        for m in range(a.size):
+            value, slope = c_v[size_v - 1, m], 0.0
+            for r in range(size_v - 2, -1, -1):
+                slope = slope * (s - z_v[r]) + value
+                value = value * (s - z_v[r]) + c_v[r, m]
+            a[m] = slope / h
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
+def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
+    """How far the polynomials of these intervals are off, over the tolerances, into `out`; 0 where that is soon seen.
+
+    Where its last node changes a polynomial by less than the tolerances, it is taken as it is. Else it is held against
+    the constraints and the equations, at places within the interval: what its accelerations are off, times the time in
+    which a polynomial of its degree can turn, is off in velocity. Accelerations that hold the noise of stiff modes say
+    nothing; of those the change by the last node counts alone.
+    """
+    n = w.Q.size
+    half = z.size // 2
+    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    q, v, q_1, v_1 = rows[0, :n], rows[0, n:], rows[1, :n], rows[1, n:]
+    for g in range(groups.shape[0]):
+        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        h = t[last] - t[i]
+        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
+        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
+        order = 3 if kind >= ACCELERATIONS else 2
+        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        out[g] = 0.0
+        if hi - lo > 1:
+            for k in range(LOOKS):
+                s = PLACES[k]
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                shorter = size_v - 2 if kind == APART else 0
+                _interpolate(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
+                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
+            if out[g] <= 1.0 or kind == VELOCITIES:
+                continue
+        out[g] = 0.0
+        for k in range(LOOKS):
+            s = PLACES[k]
+            time = t[i] + s * h
+            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            _slope_of_velocity(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
+            copy(rows[0], rows[2])
+            code = renew_partition(f, w, t[i], states[i, :n])
+            if code == DONE:
+                code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+            if code != DONE:
+                copy(rows[0], rows[2])
+                code = renew_partition(f, w, time, q)
+                if code == DONE:
+                    code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+            if code == DONE:
+                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
+                code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)
+            if code != DONE:
+                out[g] = np.inf
+                break
+            turn = h / size
+            out[g] = max(out[g], _off(tolerances, turn * turn, turn, states, i, v_1, v_1, q_1, q_1))
+        if not np.isfinite(out[g]):
+            out[g] = np.inf
+    return DONE
 
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))

@@ -12,6 +12,8 @@ from twoloop.kernels.common import (
     GAMMA_REQUIRED,
     GAMMA_SCALE,
     GAMMA_SHARE,
+    KINK_AFTER,
+    KINK_BEFORE,
     compiled,
     exact,
     merged,
@@ -23,6 +25,8 @@ LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference
 LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
 CERTAIN = 1e-9  # relative disagreement below which nothing but rounding is left
 LENGTHEN = 1e-11  # relative disagreement below which a longer length loses nothing and has less rounding
+# of values at 0, e, 2 e and 4 e: derivatives of order 2 over e and over 2 e
+ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ENOUGH = 0.01  # of the required accuracy: a change by less ends the search for a length
 
 
@@ -47,15 +51,24 @@ def longest_difference(q, v):
     return LENGTH * size / speed if speed > size else LENGTH
 
 
+@merged
+def _side(notes, t, e):
+    """On which side of t differences may be taken for the sake of a known jump of C_t or b; 0: on both."""
+    if t + 2.0 * e > notes[KINK_AFTER]:
+        return -1.0
+    return 1.0 if t - 2.0 * e < notes[KINK_BEFORE] else 0.0
+
+
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
     """Gamma by differences over e and 2 e; its largest entry and the largest disagreement of the two."""
     twice = w.Gamma_tried[0]
+    side = _side(w.notes, t, e)
     for i in range(first, last):
         w.Gamma[i] = 0.0
         twice[i] = 0.0
     for k in range(4):
-        shift = (-2.0, -1.0, 1.0, 2.0)[k] * e
+        shift = (-2.0, -1.0, 1.0, 2.0)[k] * e if side == 0.0 else (0.0, 1.0, 2.0, 4.0)[k] * side * e
         for j in range(q.size):
             w.x[j] = q[j] + shift * v[j]
         w.Gx[:, :] = 0.0
@@ -64,7 +77,10 @@ def _differences(f, w, t, q, v, e, first, last):
         for i in range(first, last):
             for j in range(v.size):
                 w.g[i] += w.Gx[i, j] * v[j]
-            if k == 0 or k == 3:
+            if side != 0.0:
+                w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
+                twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
+            elif k == 0 or k == 3:
                 twice[i] -= w.g[i] / (2.0 * shift)
             else:
                 w.Gamma[i] -= w.g[i] / (2.0 * shift)

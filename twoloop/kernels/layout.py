@@ -6,6 +6,7 @@ import numpy as np
 
 from twoloop.kernels.common import N_COUNTERS, N_NOTES, WORK, Work
 from twoloop.kernels.elimination import index_size, values_size
+from twoloop.kernels.kinks import PARTS
 from twoloop.kernels.lapack import N_ROUTINES
 
 
@@ -54,6 +55,7 @@ def make_work(
         mass_pattern=np.zeros((n_q, n_q) if augmented else (0, 0)),
         places=integers(n_rows + 1 + n_rows * n_q),
         Gamma_tried=np.zeros((2, n_rows)),
+        rates=np.zeros((PARTS + 1, n_rows)),
         Q=np.zeros(n_q),
         x=np.zeros(n_q),
         y=np.zeros(n_q),

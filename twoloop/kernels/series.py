@@ -36,15 +36,24 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     PASSED,  # with KEEP: time since the state of the series, s
     TARGET,  # which of the two series is to be found
     SHORTER,  # of LENGTH, what the distance of its end from the constraints allowed of the step before; 0: not known
+    ATTEMPTS,  # at steps, so that each looks at other places
+    SUSPECTED,  # 1: a step was refused for the defect at the time SUSPECT, which no step has passed since
+    SUSPECT,
     N_MEMORY_SCALARS,
-) = range(12)
+) = range(15)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
     """Length of `memory`."""
     rows = order + 2
     scratch = rows * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
-    return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch
+    return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
+
+
+@inlined
+def accelerations_found(memory, n):
+    """Room for the accelerations of the series at one time: the last numbers of `memory`."""
+    return memory[memory.size - n :]
 
 
 @inlined

@@ -22,6 +22,7 @@ from twoloop.kernels.common import (
     ESTIMATE,
     EXPLICIT_STEP,
     FORCE_BY_Q_GIVEN,
+    GAP,
     N_EVALUATIONS,
     N_JACOBIANS,
     OUTER_DIVERGED,
@@ -56,6 +57,7 @@ STRICT = 10.0  # what an error counts as during a trial of the implicit method, 
 MEAN = 0.8  # weight of the steps before in the mean step
 SETTLE = 5.0  # accepted steps of a trial before its price is taken
 WINDOW = 10.0  # accepted steps over which it is
+SAME = 1e-9  # relative: steps that are of one length but for rounding
 GAIN = 1.2  # what a method on trial must be cheaper by
 PATIENCE = 4.0  # looks before the next trial
 
@@ -333,6 +335,10 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             w.notes[EXPLICIT_STEP] = 0.0
             code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
+        # only steps of the first method may look at the equations within them; others have to be short
+        if tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + SAME):
+            w.notes[STEP_FACTOR] = tolerances[GAP] / h
+            return DONE, 1.0 + SAME
         second[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
         code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
@@ -343,4 +349,6 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
     if w.notes[STEP_FACTOR] == 0.0:  # else the method knows better
         w.notes[STEP_FACTOR] = _factor(memory, each, h, error)
+    if not explicit:
+        w.notes[STEP_FACTOR] = min(w.notes[STEP_FACTOR], max(tolerances[GAP] / h, 1.0))
     return code, error

@@ -18,22 +18,28 @@ before, so that no power of a short time underflows. The end of the step is move
 import numpy as np
 
 from twoloop.kernels.accelerations import solve_for_order
-from twoloop.kernels.calls import project
+from twoloop.kernels.calls import evaluate_there, project
 from twoloop.kernels.common import (
     ATOL,
+    DEFECT,
     DEPARTURE,
     DONE,
     ESTIMATE,
+    GAP,
     N_OUTER,
+    NEARLY_SINGULAR,
     RTOL,
     STEP,
     STEP_FACTOR,
+    compiled,
     kernel,
     merged,
 )
+from twoloop.kernels.defect import excess
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure, keep_predicted
 from twoloop.kernels.series import (
+    ATTEMPTS,
     KEEP,
     KNOWN,
     LAST_ACCEPTED,
@@ -43,17 +49,24 @@ from twoloop.kernels.series import (
     ORDER,
     PASSED,
     SHORTER,
+    SUSPECT,
+    SUSPECTED,
     TARGET,
     THETA,
     TRIED,
     UNIT,
     WHICH,
+    accelerations_found,
     expand,
     series_of,
 )
 
 ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
 ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
+LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
+NEAR_BEGIN = 1e-5  # of the step: no force changes within it
+GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly between 0 and 1
+MOST_SHORTENED = 0.1  # a step that is refused for its defect
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
 
 
@@ -94,28 +107,89 @@ def _length(tolerances, series, unit, order, n):
 
 
 @merged
-def _evaluate(series, unit, order, x, q, v):
-    """q and v at x units of time, by Horner's scheme; four coordinates at once, or two, some of the last ones twice."""
+def _evaluate(series, unit, order, x, q, v, a):
+    """q, v and a at x units of time, by Horner's scheme; four coordinates at once, or two, some of the last ones twice.
+
+    The recurrence of the second derivative gives half of it.
+    """
     n, per_unit = q.size, 1.0 / unit
+    twice = 2.0 * per_unit * per_unit
     for first in range(0, n if n > 3 else 0, 4):
         j = min(first, n - 4)
         m = order * n + j
         q0, q1, q2, q3 = series[m], series[m + 1], series[m + 2], series[m + 3]
         v0 = v1 = v2 = v3 = 0.0
+        a0 = a1 = a2 = a3 = 0.0
         for m in range((order - 1) * n + j, -1, -n):
+            a0, a1, a2, a3 = a0 * x + v0, a1 * x + v1, a2 * x + v2, a3 * x + v3
             v0, v1, v2, v3 = v0 * x + q0, v1 * x + q1, v2 * x + q2, v3 * x + q3
             q0, q1 = q0 * x + series[m], q1 * x + series[m + 1]
             q2, q3 = q2 * x + series[m + 2], q3 * x + series[m + 3]
         q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
         v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
+        a[j], a[j + 1], a[j + 2], a[j + 3] = a0 * twice, a1 * twice, a2 * twice, a3 * twice
     for first in range(0, n if n < 4 else 0, 2):
         j = max(min(first, n - 2), 0)
         k = min(j + 1, n - 1)
-        q0, q1, v0, v1 = series[order * n + j], series[order * n + k], 0.0, 0.0
+        q0, q1 = series[order * n + j], series[order * n + k]
+        v0 = v1 = a0 = a1 = 0.0
         for m in range((order - 1) * n, -1, -n):
+            a0, a1 = a0 * x + v0, a1 * x + v1
             v0, v1 = v0 * x + q0, v1 * x + q1
             q0, q1 = q0 * x + series[m + j], q1 * x + series[m + k]
         q[j], q[k], v[j], v[k] = q0, q1, v0 * per_unit, v1 * per_unit
+        a[j], a[k] = a0 * twice, a1 * twice
+
+
+@compiled
+def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
+    """The defect within the step, at the share s of it, over what is allowed; infinite where there is none."""
+    found = accelerations_found(memory, q.size)
+    _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, found)
+    if evaluate_there(f, w, t + s * h, q, v, a) != DONE:
+        return np.inf
+    return excess(tolerances, h, order, found, a, q, v)
+
+
+@compiled
+def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
+    """Whether a defect is that of rounding in the equations: near the beginning, where the series is exact, as well."""
+    if defect > LOUDEST:
+        return False
+    noise = 0.0
+    for k in range(1, 4):
+        noise = max(noise, _defect_at(f, w, memory, t, h, k * NEAR_BEGIN, tolerances, series, order, q, v, a))
+    return defect <= LOUDER * noise
+
+
+@compiled
+def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
+    """The defect for which the step is refused before its end is looked at; 0: for none. Notes the largest found.
+
+    The places looked at are not the same in each attempt, but for the last at which a step was refused.
+    """
+    gap, shift = tolerances[GAP], memory[ATTEMPTS] * GOLDEN % 1.0
+    n_places = 0
+    if h > gap:
+        n_places = int(np.ceil(h / gap))
+    for k in range(-1, n_places):
+        s = (k + shift) / n_places if k >= 0 else (memory[SUSPECT] - t) / h
+        if k < 0 and not (memory[SUSPECTED] == 1.0 and 0.0 < s < 1.0):
+            continue
+        defect = _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a)
+        if defect > 1.0 and not _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
+            if memory[SUSPECTED] == 0.0 or t + s * h < memory[SUSPECT]:
+                memory[SUSPECT] = t + s * h
+            memory[SUSPECTED] = 1.0
+            return defect
+        w.notes[DEFECT] = max(w.notes[DEFECT], defect)
+    return 0.0
+
+
+@merged
+def _shortened(defect, order):
+    """The factor for a step that was refused for its defect."""
+    return max(MOST_SHORTENED, 0.9 * defect ** (-1.0 / order))
 
 
 @merged
@@ -141,14 +215,27 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
             memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
     series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
-    error = 0.0
+    error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
         error = x / memory[LENGTH]  # larger than the estimate of the error, which is a power of it
         if x > memory[LENGTH] * (1.0 + ROUNDING):
             w.notes[STEP_FACTOR] = memory[LENGTH] / x
             return DONE, max(error, 1.0 + ROUNDING)
         error = min(error, 1.0)
-    _evaluate(series, unit, order, x, q1, v1)
+        checked = w.notes[NEARLY_SINGULAR] == 0.0
+        if not checked and h > tolerances[GAP] * (1.0 + ROUNDING):
+            w.notes[STEP_FACTOR] = tolerances[GAP] / h
+            return DONE, 1.0 + ROUNDING
+        if checked:
+            memory[ATTEMPTS] += 1.0
+            if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
+                memory[SUSPECTED] = 0.0
+            w.notes[DEFECT] = 0.0
+            defect = _refused_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
+            if defect > 0.0:
+                w.notes[STEP_FACTOR] = _shortened(defect, order)
+                return DONE, 1.0 + ROUNDING
+    _evaluate(series, unit, order, x, q1, v1, found)
     keep_predicted(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code != DONE:
@@ -162,6 +249,18 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     if w.notes[DEPARTURE] > 1.0:
         w.notes[STEP_FACTOR] = memory[SHORTER] * memory[LENGTH] / x
         return DONE, w.notes[DEPARTURE]
+    if checked:
+        defect = excess(tolerances, h, order, found, a1, q1, v1)
+        if defect > 1.0:
+            noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
+            if not noise:
+                w.notes[STEP_FACTOR] = _shortened(defect, order)
+                return DONE, 1.0 + ROUNDING
+            _evaluate(series, unit, order, x, q1, v1, found)
+            code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+            if code != DONE:
+                return code, np.inf
+        w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     series = series_of(memory, order, n, 1.0 - memory[WHICH])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
     code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH], by_code)

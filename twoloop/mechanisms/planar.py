@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import numba
 import numpy as np
 
+from twoloop.caches import helper
 from twoloop.callbacks import callback
 from twoloop.drawing import Drawing
 from twoloop.joints import Joint, unused
@@ -31,7 +31,7 @@ WIDTH = 9  # numbers of a joint
 GROUND = -1
 
 
-@numba.njit(cache=True)
+@helper
 def place(q, body, a, b):
     """The point (a, b) of a body, and its derivative by the angle: x, y, dx, dy."""
     if body < 0:
@@ -41,7 +41,7 @@ def place(q, body, a, b):
     return q[3 * body] + x, q[3 * body + 1] + y, -y, x
 
 
-@numba.njit(cache=True)
+@helper
 def motion(v, body, dx, dy):
     """Velocity of a point whose derivative by the angle is (dx, dy), and what its acceleration has without v'."""
     if body < 0:
@@ -50,7 +50,7 @@ def motion(v, body, dx, dy):
     return v[3 * body] + w * dx, v[3 * body + 1] + w * dy, -w * w * dy, w * w * dx
 
 
-@numba.njit(cache=True)
+@helper
 def add_row(Cq, row, body, fx, fy, dx, dy):
     """Add to a row the derivative of fx x + fy y of a point by the coordinates of its body."""
     if body >= 0:

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
+from twoloop.caches import helper
 from twoloop.callbacks import callback
 from twoloop.drawing import Drawing
 from twoloop.joints import Joint
@@ -25,7 +25,7 @@ Scalar = Mapping[int | None, float]  # coordinate to coefficient; None: a consta
 ONE: Scalar = {None: 1.0}
 
 
-@numba.njit(cache=True)
+@helper
 def places(n_q, p):
     """Where the constants, the entries of the mass, the linear and the quadratic terms begin."""
     constants = 4 + n_q

@@ -5,14 +5,14 @@ vector that turns with a body is twice R(e') a where e'' = 0. See Nikravesh, Com
 Systems (1988), Sect. 6.
 """
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.caches import helper
 from twoloop.mechanisms.problem import Array
 
 
-@numba.njit(cache=True)
+@helper
 def rotated(e0, e1, e2, e3, x, y, z):
     """R(e) (x, y, z), homogeneous of degree two in e."""
     d = e0 * e0 - e1 * e1 - e2 * e2 - e3 * e3
@@ -24,7 +24,7 @@ def rotated(e0, e1, e2, e3, x, y, z):
     )
 
 
-@numba.njit(cache=True)
+@helper
 def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
     """The derivative of R(e) (x, y, z) where e' = u."""
     d = 2.0 * (e0 * u0 - e1 * u1 - e2 * u2 - e3 * u3)
@@ -37,7 +37,7 @@ def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
     )
 
 
-@numba.njit(cache=True)
+@helper
 def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
     """The derivative of f . R(e) (x, y, z) by e: the generalised force of f at that point."""
     fa = fx * x + fy * y + fz * z
@@ -52,7 +52,7 @@ def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
     )
 
 
-@numba.njit(cache=True)
+@helper
 def half_spin(e0, e1, e2, e3, u0, u1, u2, u3):
     """G(e) u: half the angular velocity in the body's axes where e' = u."""
     return (

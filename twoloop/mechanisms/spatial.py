@@ -11,9 +11,9 @@ The first rows are e.e = 1 of each body, then those of the joints. Vectors are i
 body -1. The mass matrix has the rank 6 of 7 for each body, 4 G^T J G being of rank 3.
 """
 
-import numba
 import numpy as np
 
+from twoloop.caches import helper
 from twoloop.callbacks import callback
 from twoloop.mechanisms.rotation import half_spin, pulled, rotated, rotated_rate
 
@@ -25,7 +25,7 @@ HEAD = 6
 GROUND = -1
 
 
-@numba.njit(cache=True)
+@helper
 def vector(q, body, x, y, z):
     """A vector that turns with a body, in space."""
     if body < 0:
@@ -34,7 +34,7 @@ def vector(q, body, x, y, z):
     return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z)
 
 
-@numba.njit(cache=True)
+@helper
 def vector_rate(q, v, body, x, y, z):
     """Its derivative, and twice R(e') a, which is its second one where e'' = 0."""
     if body < 0:
@@ -45,7 +45,7 @@ def vector_rate(q, v, body, x, y, z):
     return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
 
 
-@numba.njit(cache=True)
+@helper
 def centre(q, body):
     """The centre of mass; also the velocity, of v."""
     if body < 0:
@@ -53,7 +53,7 @@ def centre(q, body):
     return q[7 * body], q[7 * body + 1], q[7 * body + 2]
 
 
-@numba.njit(cache=True)
+@helper
 def turn_row(q, row, body, x, y, z, fx, fy, fz):
     """Add to a row (n_q,) the derivative of f . (vector of a body) by its Euler parameters."""
     if body >= 0:
@@ -65,7 +65,7 @@ def turn_row(q, row, body, x, y, z, fx, fy, fz):
         row[k + 3] += d3
 
 
-@numba.njit(cache=True)
+@helper
 def move_row(row, body, fx, fy, fz):
     """Add to a row the derivative of f . (centre of a body)."""
     if body >= 0:

@@ -1,0 +1,264 @@
+"""Drives whose C_t jumps: velocities change as by an impulse, by every method, or the run says why not."""
+
+import numpy as np
+import pytest
+
+from twoloop import ConstrainedSystem, Status, solve_dae
+from twoloop.impulse import beyond_jump
+from twoloop.methods import PRESETS
+
+# a cart on a driven path, two bars below it, the five coordinates coupled by the mass matrix
+MIXED = np.random.default_rng(5).normal(size=(5, 5)) * 0.3
+MASS = np.diag([1.0, 2.0, 2.0, 1.0, 1.0]) + MIXED @ MIXED.T
+LOW_ORDER = ("TRBDF2", "ESDIRK4", "Newmark", "PaperNewmark", "PaperIRK")
+TRACED = ("Taylor",)  # refuses callbacks that branch
+
+
+def driven(place, speed, acceleration, gamma=True, mass=MASS):
+    def constraint(t, q):
+        return np.array(
+            [
+                q[0] - place(t),
+                0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0),
+                0.5 * ((q[3] - q[1]) ** 2 + (q[4] - q[2]) ** 2 - 1.0),
+            ]
+        )
+
+    def jacobian(t, q):
+        a, b, c, d = q[1] - q[0], q[2], q[3] - q[1], q[4] - q[2]
+        return np.array([[1.0, 0, 0, 0, 0], [-a, a, b, 0, 0], [0, -c, -d, c, d]])
+
+    def right(t, q, v):
+        return np.array(
+            [acceleration(t), -((v[1] - v[0]) ** 2) - v[2] ** 2, -((v[3] - v[1]) ** 2) - (v[4] - v[2]) ** 2]
+        )
+
+    return ConstrainedSystem.from_python(
+        n_q=5,
+        n_c=3,
+        mass=mass,
+        force=lambda t, q, v: np.array([0.0, 0.0, -19.62, 0.0, -9.81]) - 0.1 * v,
+        constraint=constraint,
+        jacobian=jacobian,
+        constraint_rate=lambda t, q: np.array([-speed(t), 0.0, 0.0]),
+        **({"gamma": right} if gamma else {}),
+    )
+
+
+def shaken(jump=0.0, at=np.inf, after_too=True, gamma=True):
+    """The path 0.2 sin 5t, and a ramp of slope `jump` from the time `at` on; whether the slope is there at that time."""
+
+    def on(t):
+        return t >= at if after_too else t > at
+
+    return driven(
+        lambda t: 0.2 * np.sin(5.0 * t) + (jump * (t - at) if on(t) else 0.0),
+        lambda t: np.cos(5.0 * t) + (jump if on(t) else 0.0),
+        lambda t: -5.0 * np.sin(5.0 * t),
+        gamma,
+    )
+
+
+START = np.array([0.0, np.sin(0.7), -np.cos(0.7), np.sin(0.7) + np.sin(0.2), -np.cos(0.7) - np.cos(0.2)])
+END = 0.8
+
+
+def impulse(system, t, q, v):
+    """Velocities after the jump, by the Schur complement."""
+    rows, inverse = system.jacobian(t, q), np.linalg.inv(system.mass(t, q))
+    p = np.linalg.solve(rows @ inverse @ rows.T, rows @ v + system.constraint_rate(t, q))
+    return v - inverse @ rows.T @ p
+
+
+def velocities(system):
+    return impulse(system, 0.0, START, np.zeros(5))
+
+
+def through(pieces, v0):
+    """State at the end of smooth pieces (from, to, system), with an impulse between them."""
+    q, v = START, v0
+    for begin, end, system in pieces:
+        v = impulse(system, begin, q, v)
+        result = solve_dae(system, (begin, end), q, v, "DOP853", 1e-11, 1e-11, check_derivatives=False)
+        assert result.success
+        q, v = result.q[:, -1], result.v[:, -1]
+    return np.concatenate([q, v])
+
+
+@pytest.fixture(scope="module", params=[(1.3, 0.5), (-3e-4, 0.437)])
+def case(request):
+    """A jump and its time, and the state at the end."""
+    jump, at = request.param
+    after = driven(
+        lambda t: 0.2 * np.sin(5.0 * t) + jump * (t - at),
+        lambda t: np.cos(5.0 * t) + jump,
+        lambda t: -5.0 * np.sin(5.0 * t),
+    )
+    smooth = shaken()
+    return jump, at, through([(0.0, at, smooth), (at, END, after)], velocities(smooth))
+
+
+def off(result, expected):
+    return np.abs(np.concatenate([result.q[:, -1], result.v[:, -1]]) - expected).max()
+
+
+@pytest.mark.parametrize("method", [name for name in PRESETS if name not in TRACED])
+def test_a_jump_is_an_impulse(case, method):
+    jump, at, expected = case
+    tol = 1e-5 if method in LOW_ORDER else 1e-7
+    system = shaken(jump, at)
+    result = solve_dae(system, (0.0, END), START, velocities(system), method, tol, tol)
+    assert result.success
+    assert off(result, expected) < (3e3 if method in LOW_ORDER else 1e2) * tol
+    assert f"At t = {at:.4g} C_t or b jumps" in result.message
+    assert np.abs(result.t - at).min() < 1e-14
+
+
+def test_gamma_may_be_differenced(case):
+    jump, at, expected = case
+    system = shaken(jump, at, gamma=False)
+    for method in ("DOP853", "Gauss6", "RadauIIA9"):
+        result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-7, 1e-7)
+        assert off(result, expected) < 1e-5
+
+
+@pytest.mark.parametrize("at", [0.5, 0.437])  # on the grid, and between
+def test_constant_steps(at):
+    system = shaken(1.3, at)
+    result = solve_dae(system, (0.0, END), START, velocities(system), "Gauss6", step_size=0.01)
+    fine = solve_dae(system, (0.0, END), START, velocities(system), "Gauss6", 1e-9, 1e-9)
+    assert off(result, np.concatenate([fine.q[:, -1], fine.v[:, -1]])) < 1e-7
+    assert result.t.size - 1 in (81, 82)
+    assert np.abs(result.t[-1] - END) < 1e-15
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Gauss4", "RadauIIA5"])
+@pytest.mark.parametrize("after_too", [True, False])
+def test_at_the_ends_of_a_run(method, after_too):
+    """The value of C_t at the time of the jump says on which side of it a run begins or ends."""
+    system, smooth = shaken(0.9, 0.3, after_too), shaken()
+    before = through([(0.0, 0.3, smooth)], velocities(smooth))
+    beyond = np.append(before[:5], impulse(shaken(0.9, 0.3), 0.3, before[:5], before[5:]))
+    result = solve_dae(system, (0.0, 0.3), START, velocities(smooth), method, 1e-8, 1e-8)
+    assert off(result, beyond if after_too else before) < 1e-6
+    begun = (beyond if after_too else before)[5:]
+    again = solve_dae(system, (0.3, END), before[:5], begun, method, 1e-8, 1e-8, check_derivatives=False)
+    expected = solve_dae(shaken(0.9, 0.3), (0.0, END), START, velocities(smooth), "DOP853", 1e-10, 1e-10)
+    assert off(again, np.concatenate([expected.q[:, -1], expected.v[:, -1]])) < 1e-5
+    assert ("jumps" in again.message) is not after_too
+
+
+def softplus(x):
+    return x + np.log1p(np.exp(-x)) if x > 0.0 else np.log1p(np.exp(x))
+
+
+def sigmoid(x):
+    return 1.0 / (1.0 + np.exp(-x)) if x > -700.0 else 0.0
+
+
+@pytest.mark.parametrize("method", ["auto", "Gauss4", "Gauss16", "RadauIIA9", "BDF", "SunRadau5"])
+@pytest.mark.parametrize("width", [1e-3, 1e-4, 1e-8])
+def test_a_steep_ramp_is_none(method, width):
+    at, jump = 0.4371, 0.8
+
+    def steep(t):
+        return sigmoid((t - at) / width)
+
+    system = driven(
+        lambda t: jump * width * softplus((t - at) / width),
+        lambda t: jump * steep(t),
+        lambda t: jump / width * steep(t) * (1.0 - steep(t)),
+    )
+    result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-6, 1e-6)
+    expected = solve_dae(system, (0.0, END), START, velocities(system), "DOP853", 1e-10, 1e-10, max_step=0.005)
+    assert off(result, np.concatenate([expected.q[:, -1], expected.v[:, -1]])) < 1e-4
+    assert "jumps" not in result.message
+
+
+@pytest.mark.parametrize("method", ["auto", "Gauss4", "RadauIIA9", "BDF", "Adams", "PaperIRK"])
+def test_a_jump_of_the_acceleration_of_a_drive_is_none(method):
+    at = 0.437
+    system = driven(
+        lambda t: 3.0 * max(0.0, t - at) ** 2, lambda t: 6.0 * max(0.0, t - at), lambda t: 6.0 if t > at else 0.0
+    )
+    v0 = np.zeros(5)
+    rest = driven(lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)
+    after = driven(lambda t: 3.0 * (t - at) ** 2, lambda t: 6.0 * (t - at), lambda t: 6.0)
+    expected = through([(0.0, at, rest), (at, END, after)], v0)
+    result = solve_dae(system, (0.0, END), START, v0, method, 1e-6, 1e-6)
+    assert off(result, expected) < 1e-3
+    assert "jumps" not in result.message
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Gauss8", "Gauss6", "BDF"])
+def test_between_the_steps_no_polynomial_goes_through_the_jump(method):
+    system = shaken(1.3, 0.437)
+    result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-7, 1e-7, dense_output=True)
+    pieces = (shaken(), 0.0, 0.43699), (shaken(1.3, 0.437), 0.43701, END)
+    v0 = velocities(system)
+    for _, begin, end in pieces:
+        t = np.linspace(begin, end, 60)
+        exact = solve_dae(system, (0.0, END), START, v0, "DOP853", 1e-11, 1e-11, t_eval=t, max_step=0.02)
+        state = result.sol(t)
+        assert np.abs(state.q - exact.q).max() < 1e-5
+        assert np.abs(state.v - exact.v).max() < 1e-5
+
+
+def test_a_skate_whose_blade_is_driven_suddenly():
+    """A v + b = 0 with a jump of b, and positions that are free."""
+    system = ConstrainedSystem.from_python(
+        n_q=3,
+        n_c=0,
+        n_a=1,
+        mass=np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.2], [0.0, 0.2, 1.0]]),
+        force=lambda t, q, v: np.zeros(3),
+        constraint=None,
+        nonholonomic=lambda t, q: np.array([[1.0, -1.0, 0.5]]),
+        nonholonomic_rate=lambda t, q: np.array([1.0 if t > 0.5 else 0.0]),
+        nonholonomic_gamma=lambda t, q, v: np.zeros(1),
+    )
+    inverse, row = np.linalg.inv(system.mass(0.0, np.zeros(3))), np.array([1.0, -1.0, 0.5])
+    expected = -inverse @ row / (row @ inverse @ row)
+    for method in ("DOP853", "Gauss6", "RadauIIA5", "BDF"):
+        result = solve_dae(system, (0.0, 1.0), np.zeros(3), np.zeros(3), method)
+        assert np.abs(result.v[:, -1] - expected).max() < 1e-10
+        assert np.abs(result.q[:, -1] - 0.5 * expected).max() < 1e-7
+
+
+def test_drives_that_contradict_one_another_end_the_run():
+    """Two rows for one coordinate, one of which jumps and not the other."""
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=2,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.zeros(2),
+        constraint=lambda t, q: np.array([q[0] - max(0.0, t - 0.5), q[0]]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0], [1.0, 0.0]]),
+        constraint_rate=lambda t, q: np.array([-1.0 if t > 0.5 else 0.0, 0.0]),
+        gamma=lambda t, q, v: np.zeros(2),
+    )
+    assert beyond_jump(system, 0.6, np.zeros(2), np.zeros(2)) is None
+    with pytest.warns(UserWarning, match="rank 1 of 2"):
+        result = solve_dae(system, (0.0, 1.0), np.zeros(2), np.zeros(2), "Gauss6", check_derivatives=False)
+    assert result.status in (Status.RATE_JUMPS, Status.ROWS_CONTRADICT)
+    assert result.t[-1] < 0.51
+
+
+def test_a_smooth_drive_is_left_alone():
+    """The same steps with and without the look at C_t."""
+    from twoloop.run import Run
+
+    system = shaken()
+    with pytest.MonkeyPatch.context() as patch:
+        looked = solve_dae(system, (0.0, END), START, velocities(system), "Gauss16", 1e-10, 1e-10)
+        made = Run.__init__
+
+        def unwatched(self, *arguments):
+            made(self, *arguments)
+            self.control[self.a.DRIVEN] = 0.0
+
+        patch.setattr(Run, "__init__", unwatched)
+        without = solve_dae(system, (0.0, END), START, velocities(system), "Gauss16", 1e-10, 1e-10)
+    assert looked.stats.n_rejected_error == without.stats.n_rejected_error
+    assert (looked.t == without.t).all()
+    assert (looked.q == without.q).all()
