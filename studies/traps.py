@@ -287,7 +287,7 @@ def end_under_force(mechanism: Mechanism) -> Array:
 
 
 def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
-    """Families of sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
+    """Sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
     if quick:
         return [(family, pendulum) for family in QUICK_FORCES]
     every = [(family, bodies) for family in FORCES for bodies in (pendulum, bars, slider_in_space)]

@@ -167,16 +167,7 @@ class Interpolator:
     def _judged(self, table: Table, groups: Groups) -> Array:
         """How far the polynomials of these intervals are off, over the tolerances."""
         out = np.zeros(len(groups))
-        arrays = (
-            self.tolerances,
-            table.t,
-            table.states,
-            np.ascontiguousarray(groups),
-            self.nodes,
-            self.room,
-            self.rows,
-            out,
-        )
+        arrays = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups), self.nodes, self.room, self.rows, out)
         direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
