@@ -57,7 +57,8 @@ def march(mechanism: Mechanism, method: str, tolerance: float, y: Array, begin: 
     RuntimeError, ValueError
         If SciPy's method fails.
     """
-    sharp, states, at = mechanism.sharp, {}, begin
+    sharp, at = mechanism.sharp, begin
+    states: dict[float, Array] = {}
     edges = {*sharp.breaks, *(edge for window in sharp.windows for edge in window)}
     for end in [*sorted(edge for edge in edges if begin < edge < T_END), T_END]:
         longest = LONGEST_IN_X if sharp.follows_x else LONGEST

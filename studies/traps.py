@@ -287,10 +287,11 @@ def end_under_force(mechanism: Mechanism) -> Array:
 
 
 def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
-    """Families of sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
+    """Sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
+    if quick:
+        return [(family, pendulum) for family in QUICK_FORCES]
     every = [(family, bodies) for family in FORCES for bodies in (pendulum, bars, slider_in_space)]
-    every += [(KINK, pendulum), (KINK, masses)]
-    return [(family, pendulum) for family in QUICK_FORCES] if quick else every
+    return [*every, (KINK, pendulum), (KINK, masses)]
 
 
 def under_forces(quick: bool) -> Iterator[Trap]:

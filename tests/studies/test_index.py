@@ -153,7 +153,11 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     wrong = {"default": 0, "compiled": 3, "ours": 5, "others": 7}
     trust = {name: {"n": 50, "wrong": n, "unasked": 0} for name, n in wrong.items()}
     bad = {"ours_bad": [], "others_bad": [], "unasked": 0, "missed_by_all": []}
-    honesty = bad | {"n_traps": 20, "forces": {"n_families": 15, "mechanisms": ["pendulum", "four-bar"]}, "trust": trust}
+    honesty = bad | {
+        "n_traps": 20,
+        "forces": {"n_families": 15, "mechanisms": ["pendulum", "four-bar"]},
+        "trust": trust,
+    }
     text = front(tmp_path, [case()], honesty=honesty)
     assert "under 15 kinds of sharp everyday forces" in text and "on 2 mechanisms, and on 20 other traps" in text
     assert (
@@ -162,7 +166,9 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     assert "step over" not in text and "random mechanisms under such forces" not in text
     trust["default"] |= {"unasked": 2}
     sharp = {"n": 3000, "wrong and silent": 4}
-    text = front(tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []})
+    text = front(
+        tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
+    )
     assert "; 2 more of the default step over a force of 1 ms." in text
     assert "Of 3000 runs of random mechanisms under such forces, by every preset, 4 are" in text
     assert "**Trust**" not in front(tmp_path, [case()])
