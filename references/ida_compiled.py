@@ -81,7 +81,6 @@ def compiled_for_ida(
     return residual_of_ida, jacobian_of_ida, n_memory
 
 
-@lru_cache(maxsize=64)  # the Jacobian differences the same function as a rule
 def residual_at(
     mass: Dispatcher,
     force: Dispatcher,
