@@ -84,7 +84,8 @@ def test_an_absolute_tolerance_for_each_coordinate(method):
     # what x and y may err by is the same; a loose tolerance for both is as loose as one number for all
     tight = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-4, np.array([1e-4, 1e-4]))
     same = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-4, 1e-4)
-    mixed = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-9, np.array([1e-3, 1e-7]))
+    small = 1e-7 if method in ("Newmark", "BDF") else 1e-11  # that asks for more steps of high order, too
+    mixed = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-9, np.array([1e-3, small]))
     loose = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-9, 1e-3)
     assert (tight.q == same.q).all()
     assert mixed.stats.n_accepted > loose.stats.n_accepted

@@ -1,12 +1,17 @@
-"""Figures of made-up rows are made, and not saved: that takes longer than all else."""
+"""What tests of several studies share."""
 
-import matplotlib.pyplot as plt
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 
-from studies import figures
+from studies import energy, figures, motion, step_size, violation
 
 
 @pytest.fixture
 def unsaved(monkeypatch):
-    """Leave figures unsaved within a test."""
-    monkeypatch.setattr(figures, "save", lambda figure, output, name: plt.close(figure))
+    """Make and save no figures, which takes longer than all else of a report."""
+    monkeypatch.setattr(figures, "save", lambda *arguments: None)
+    monkeypatch.setattr(figures, "work_precision", lambda *arguments: SimpleNamespace(axes=[]))
+    for study in (energy, motion, step_size, violation):
+        monkeypatch.setattr(study, "STUDY", replace(study.STUDY, figures=lambda rows, series: {}))
