@@ -101,6 +101,7 @@ class Remaker:
         run.plan.memory[:] = run.memory
         clock = run.clock
         clock[:] = 0.0
+        clock[a.JUMP_FROM] = clock[a.JUMP_TO] = np.inf
         clock[a.T] = clock[a.T_START] = t0
         clock[a.H_LIMIT] = run.plan.limit_start
         clock[a.H_NEXT] = self.next_step if self.next_step < np.inf else FIRST_TRY * (t1 - t0)
@@ -120,6 +121,6 @@ class Remaker:
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(clock[a.H_NEXT])
                 return Remade(found[0], found[-1], longest)
-            if code != a.PAUSED:
+            if code != a.PAUSED and not (code == a.AT_JUMP and run.leap(t1)):
                 break
         return None

@@ -303,7 +303,7 @@ class Run:
             if code == a.HAS_TO_GIVE_WAY:
                 self._give_way()
                 plan, control, kit, code = self.plan, self.control, self.kit, a.PAUSED
-            elif code == a.AT_JUMP and not across and self._leap(t1):
+            elif code == a.AT_JUMP and not across and self.leap(t1):
                 code = a.PAUSED
             elif code == a.NEAR_SINGULAR:
                 plan, control = self._bridge()
@@ -457,7 +457,7 @@ class Run:
         self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
         return self.plan, self.control, a.PAUSED
 
-    def _leap(self, t1: float) -> bool:
+    def leap(self, t1: float) -> bool:
         """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
         a, clock, n = self.a, self.clock, self.system.n_q
         end = float(clock[a.JUMP_TO])

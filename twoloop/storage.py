@@ -89,7 +89,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
                 f"{system.name!r} has {given[0]} and {given[1]}"
             )
     always: dict[str, Any] = {name: arrays[name] for name in ALWAYS}
-    optional: dict[str, Any] = {name: arrays.get(name) for name in SOMETIMES}
+    optional: dict[str, Any] = {name: arrays.get(name) for name in SOMETIMES} | known.numbers
     if known.n_events is not None:
         optional |= {name: [arrays[f"{name}_{k}"] for k in range(known.n_events)] for name in OF_EVENTS}
     return Result(
@@ -101,7 +101,6 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         rank=known.rank,
         system=system,
         method=known.method,
-        **known.numbers,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 
