@@ -13,6 +13,7 @@ MANY = 16  # coordinates from which on evaluations cost more than the algebra of
 CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
 TIGHT_MANY = 1e-10  # ... or the tolerance is below this ...
 VERY_MANY = 64  # ... or there are so many coordinates
+LONG_STEPS = 1e-9  # tolerance whose rule holds at looser ones, too, for runs of few steps
 SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... up to so many operations a coordinate ...
 SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
@@ -69,6 +70,10 @@ class Auto:
     many constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a
     series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8 operations in all below 1e-3, and
     `many` from 64 coordinates on.
+
+    At looser tolerances than these a run begins with `series` as well, as others may take no steps longer than a
+    hundredth of the run: after 10 steps it goes on without, if the next would be no longer than that. It also goes on
+    without where the series is not finite and the functions are.
 
     After 100 evaluations, and then every 600, the largest rate of the motion is estimated, from the derivatives of the
     accelerations. The implicit method is tried for 15 steps where the steps have come near the limit of stability that
@@ -129,8 +134,7 @@ class Auto:
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Whether a step of the series costs less than the steps of the others that it replaces."""
-        if self.series is None or self.series.program is None:
-            return False
+        assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
         if self.compiled:
             short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
@@ -153,11 +157,15 @@ class Auto:
         second = implicit.plan(n_q, rtol, atol, False)
         dearer = self._dearer(n_q) if self.compiled else 1.0
         explicit = self._explicit(n_q, rtol, atol, second, dearer)
-        if self.series is None or not self._series_pays(n_q, tolerance):
+        if self.series is None or self.series.program is None:
+            return explicit
+        pays = self._series_pays(n_q, tolerance)
+        # at looser tolerances as well where steps are long: others may not be longer than a hundredth of the run
+        if not pays and not self._series_pays(n_q, LONG_STEPS):
             return explicit
         series = self.series.plan(n_q, rtol, atol, False)
         chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
-        return replace(chosen, substitute=explicit)
+        return replace(chosen, substitute=explicit, provisional=not pays)
 
     def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
         """The plan without a series."""

@@ -51,6 +51,7 @@ class Plan:
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
     looks_within: bool = False  # whether its steps look at the equations between their ends; if not, they are limited
     substitute: "Plan | None" = None  # what goes on where this one's values are not finite
+    provisional: bool = False  # whether that takes over, too, where steps turn out to be no longer than its own may be
     traced: tuple[Any, ...] = ()  # what the callbacks were traced to, where a step goes by that: see traced_values.py
     within_newton: "Plan | None" = None  # the same, parts included, of steps by Newton's method; None: not divided
 

@@ -36,6 +36,7 @@ SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
 CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
 LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least
+PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
 STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
@@ -121,6 +122,7 @@ class Run:
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
         control[a.GIVES_WAY] = plan.substitute is not None
+        control[a.PROVISIONAL] = PROVISIONAL if plan.provisional else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:

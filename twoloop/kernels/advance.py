@@ -101,10 +101,11 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
     BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
     SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
-    GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on
+    GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on ...
+    PROVISIONAL,  # ... and after this number of steps, if the next is no longer than steps of others may be
     DRIVEN,  # 1: C_t or b may jump
     N_CONTROL,
-) = range(20)
+) = range(21)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -371,6 +372,9 @@ def advance(
             clock[NEXT_OUTPUT] += 1.0
             if int(clock[NEXT_OUTPUT]) == outputs.size:
                 return ALL_OUTPUT_DONE
+        if w.counters[N_ACCEPTED] == control[PROVISIONAL] and clock[H_NEXT] <= tolerances[GAP]:
+            clock[H_FAILED] = clock[H_NEXT]
+            return HAS_TO_GIVE_WAY
         if leaps:
             return PAUSED
         # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
