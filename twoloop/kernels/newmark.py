@@ -3,7 +3,18 @@
 import numpy as np
 
 from twoloop.kernels.calls import evaluate_state, rounding_floor
-from twoloop.kernels.common import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL, STEP, compiled, kernel
+from twoloop.kernels.common import (
+    ATOL,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    OUTER_DIVERGED,
+    RTOL,
+    STEP,
+    compiled,
+    kernel,
+    merged,
+)
 from twoloop.kernels.linalg import copy
 from twoloop.kernels.predictor import departure
 
@@ -11,21 +22,32 @@ MAX_ITERATIONS = 60
 TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
 
 # places in `memory` before the new accelerations; the first is advance()'s
-RATE, N_MEMORY_SCALARS = range(1, 3)
+SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(1, 5)
 
 # places in `options`
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
+@merged
+def _largest(x, least):
+    for m in range(x.size):
+        least = max(least, abs(x[m]))
+    return least
+
+
 @compiled
-def _rate(q, v, a):
-    """Reciprocal of the time in which velocities and accelerations change the coordinates as a whole."""
-    size, speed, acceleration = 0.0, 0.0, 0.0
-    for m in range(q.size):
-        size = max(size, abs(q[m]))
-        speed = max(speed, abs(v[m]))
-        acceleration = max(acceleration, abs(a[m]))
-    return max(speed / size, np.sqrt(acceleration / size)) if size > 0.0 else 0.0
+def _rate(memory, q, v, a, q1, v1, a1):
+    """Reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
+
+    Of the largest of each so far: at one time alone, coordinates are near zero wherever the origin is.
+    """
+    memory[SIZE] = _largest(q, memory[SIZE])
+    memory[SPEED] = _largest(v, memory[SPEED])
+    memory[ACCELERATION] = _largest(a, memory[ACCELERATION])
+    size = _largest(q1, memory[SIZE])
+    if size == 0.0:
+        return 0.0
+    return max(_largest(v1, memory[SPEED]) / size, np.sqrt(_largest(a1, memory[ACCELERATION]) / size))
 
 
 @compiled
@@ -74,8 +96,8 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
             error = 0.0
             if tolerances[ESTIMATE] == 1.0:
-                memory[RATE] = max(memory[RATE], _rate(q, v, a), _rate(q1, v1, a1))
-                error = _error(options, tolerances, memory[RATE], h, q, v, a, a1)
+                rate = _rate(memory, q, v, a, q1, v1, a1)
+                error = _error(options, tolerances, rate, h, q, v, a, a1)
                 if options[ERROR_TOL] == 0.0:  # not in the paper
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
