@@ -12,6 +12,7 @@ import pytest
 
 from tests.problems import pendulum, run, worst
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
+from twoloop.interrupts import CALLS_A_USER
 from twoloop.mechanisms import four_bar
 
 START = ([0.0, -1.0], [3.0, 0.0])
@@ -107,7 +108,7 @@ def test_a_callback_that_writes_to_its_parameters_is_refused():
         Q[0] = -p[0] * q[0]
 
     system = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=force, parameters=[1.0], name="changing")
-    with pytest.raises(ValueError, match=r"force of 'changing' must not change p, in which it wrote entries \[0\]"):
+    with pytest.raises(ValueError, match="force of 'changing' must not change the arrays .*: it changes p. Copy first"):
         solve_dae(system, (0.0, 1.0), [1.0], [0.0])
 
 
@@ -128,6 +129,14 @@ def test_an_event_before_the_first_output_ends_the_run(options):
 
 
 # --- Ctrl-C
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_raises():
+    """Python's own handler of Ctrl-C, without which shells start jobs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 class Counted:
@@ -221,37 +230,39 @@ def test_ctrl_c_in_any_function_at_any_call_returns_what_there_is(method, option
             check_part(part, full)
 
 
-@pytest.mark.parametrize("events", [None, lambda t, q, v: q[0]])
+@pytest.mark.parametrize("events", [None, lambda t, q, v: q[0] - 0.1])
 def test_signals_at_any_instruction_end_the_run_with_its_result(events):
     """A tracing function raises them where no function of a user runs, too: in what boxes arguments, and between."""
     system = pendulum()
     solve_dae(system, (0.0, 0.1), *START, events=events)
-    lines = [0]
+    n = last_call = 0  # lines of Python in a run, and at its last call of a user's function
 
     def every_line(frame, event, argument):
+        nonlocal n, last_call
         if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-            lines[0] += 1
-            if lines[0] == at:
+            n += 1
+            if frame.f_code in CALLS_A_USER:
+                last_call = n
+            if n == at:
                 signal.raise_signal(signal.SIGINT)
         return every_line
 
     def solve():
-        before = sys.gettrace()
+        nonlocal n
+        n, before = 0, sys.gettrace()
         sys.settrace(every_line)
         try:
-            return solve_dae(system, (0.0, 0.5), *START, "DOP853", 1e-4, 1e-4, check_derivatives=False, events=events)
+            return solve_dae(system, (0.0, 0.05), *START, "DOP853", 1e-4, 1e-4, check_derivatives=False, events=events)
         finally:
             sys.settrace(before)
 
     at = 0
     solve()  # what is done once in a process
-    lines[0] = 0
-    solve()
-    total = lines[0]
-    for at in np.linspace(1, total - 100, 23).astype(int):  # the last lines put the result together
-        lines[0] = 0
+    assert solve().success
+    total, within = n, 0.95 * last_call  # the number of lines is not quite the same each time
+    for at in [*np.linspace(1, within, 23).astype(int), *np.linspace(within, total, 12).astype(int)]:
         result = solve()
-        assert result.status is Status.INTERRUPTED, (at, result.message)
+        assert result.status is Status.INTERRUPTED or (result.success and at > within), (at, result.message)
         assert worst_or_zero((result.q**2).sum(axis=0), 1.0) < 1e-9
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -275,16 +286,17 @@ def test_real_signals_while_python_callbacks_and_events_run():
         from tests.problems import pendulum
         from twoloop import solve_dae
 
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         system, start = pendulum(), ([0.0, -1.0], [3.0, 0.0])
         solve_dae(system, (0.0, 0.1), *start)
         for k in range(8):
             events = (lambda t, q, v: q[0]) if k % 2 else None
             threading.Timer(0.1 + 0.0137 * k, os.kill, (os.getpid(), signal.SIGINT)).start()
-            result = solve_dae(system, (0.0, 1e9), *start, events=events, check_derivatives=False)
+            result = solve_dae(system, (0.0, 1e9), *start, events=events, check_derivatives=False, time_limit=20.0)
             assert result.status.name == "INTERRUPTED", result.message
         print("interrupted", flush=True)
     """
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=300, env=os.environ
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=240, env=os.environ
     )
     assert done.stdout.strip() == "interrupted", done.stderr

@@ -1,5 +1,6 @@
 """Starts that are a little off: put right wherever there is one assembly, refused where there are two; what is said."""
 
+import itertools
 import re
 
 import numpy as np
@@ -139,12 +140,11 @@ def test_loss_of_rank_is_said_where_it_is_so(beside):
 
 
 def test_runs_say_what_was_measured_where_steps_went_across():
-    problem = n_four_bar(3)
-    said = {}
-    for method in ("DOP853", "Gauss12"):
-        message = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, 1e-6, 1e-6).message
+    said = []
+    for n, method, tolerance in itertools.product((1, 2, 3), ("auto", "DOP853"), (1e-6, 1e-8)):
+        problem = n_four_bar(n)  # which runs go across hangs on rounding
+        message = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tolerance, tolerance).message
         for part in re.findall(r"Near t = [^(]*\([^)]*\)", message):
-            ratio = float(re.search(r"comes down to (\S+) of the largest", part)[1])
-            said[method, ratio] = "lose rank" in part
+            said.append((float(re.search(r"comes down to (\S+) of the largest", part)[1]), "lose rank" in part))
     assert said
-    assert all((ratio < 0.01) == lost for (_, ratio), lost in said.items())
+    assert all(ratio <= 0.01 if lost else ratio >= 0.01 for ratio, lost in said), said
