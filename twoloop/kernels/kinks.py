@@ -118,4 +118,6 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
             return JUMP, begin, end
     if steepest > STEEP * mean:
         return RAMP, low, high
-    return RAMP, t, t + 0.5 * h  # no polynomial holds it: a ramp as long as the step, or a kink
+    if end - begin < h:  # half the step is not smooth either: a ramp as long as the step, or a kink
+        return RAMP, t, t + 0.5 * h
+    return SMOOTH, t, t + h
