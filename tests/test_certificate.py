@@ -153,7 +153,7 @@ def test_what_lasts_as_long_as_the_gap_is_seen_wherever_it_is(tolerance):
         assert refused(replace(result, system=swing(20.0, at, 0.5 * gap))).defect > 1e3
 
 
-@pytest.mark.parametrize("changed", [{"friction": 0.01, "below": 1e-3}, {"gust": 1e-2, "width": 10.0}])
+@pytest.mark.parametrize("changed", [{"friction": 0.02, "below": 1e-3}, {"gust": 2e-2, "width": 10.0}])
 def test_a_force_that_is_a_little_other(changed):
     refused(replace(calm(), system=swing(**changed)))
 
@@ -235,7 +235,7 @@ def test_a_step_that_grows_errors_is_not_taken_for_a_wrong_one():
     """An inverted pendulum, stored at its ends alone: an error grows ten thousandfold."""
     start = [1e-3, math.sqrt(1.0 - 1e-6)]
     result = solve_dae(swing(), (0.0, 2.5), start, [0.0, 0.0], "RadauIIA9", 1e-4, 1e-4, t_eval=[0.0, 2.5])
-    assert silently(result).defect < 300.0
+    assert silently(result).defect < 200.0
 
 
 def test_wrong_arguments(default_four_bar):

@@ -175,6 +175,30 @@ def test_a_steep_ramp_is_none(method, width):
     assert "jumps" not in result.message
 
 
+@pytest.mark.parametrize(
+    ("method", "tolerance"), [("Newmark", 1e-4), ("TRBDF2", 1e-4), ("TRBDF2", 1e-6), ("auto", 1e-6)]
+)
+@pytest.mark.parametrize("width", [1e-4, 1e-6, 1e-9])
+def test_a_ramp_between_the_ends_of_a_step(method, tolerance, width):
+    """At both ends of a step as long as the ramp its acceleration is zero: such steps left the impulse of it out."""
+    at, jump = 0.4371, 0.8
+
+    def place(t):
+        return jump * (0.5 * min(max(0.0, t - at), width) ** 2 / width + max(0.0, t - at - width))
+
+    system = driven(
+        place,
+        lambda t: jump * min(max(0.0, t - at) / width, 1.0),
+        lambda t: jump / width if at <= t < at + width else 0.0,
+    )
+    rest = driven(lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)
+    after = driven(lambda t: jump * (t - at), lambda t: jump, lambda t: 0.0)
+    expected = through([(0.0, at, rest), (at, END, after)], np.zeros(5))
+    result = solve_dae(system, (0.0, END), START, np.zeros(5), method, tolerance, tolerance)
+    assert result.success
+    assert off(result, expected) < 50.0 * tolerance + 2.0 * width
+
+
 @pytest.mark.parametrize("method", ["auto", "Gauss4", "RadauIIA9", "BDF", "Adams", "PaperIRK"])
 def test_a_jump_of_the_acceleration_of_a_drive_is_none(method):
     at = 0.437

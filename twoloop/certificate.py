@@ -18,7 +18,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 PIECES = 200  # of a run: the longest piece, and the longest step with which one is made again, is this part of it
-LIMIT = 300.0  # tolerances: right steps were at most 140 off, those that passed over something 590 and more
+LIMIT = 200.0  # tolerances: right steps were at most 140 off, those that passed over something 270 and more
 ROUNDING = 1e-14  # of the largest coordinate or velocity: what no step can be expected to hold
 SEVERAL = 100.0  # the defect of several steps in one piece, from which on each is looked at
 ENOUGH = 3  # wrong steps of a piece, after which the others are not looked at

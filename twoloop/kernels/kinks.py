@@ -76,7 +76,11 @@ def unexplained(tolerances, h, state, new_state, n):
 
 @compiled
 def find_kink(f, w, t, end, q, v, way, tolerances):
-    """SMOOTH, RAMP or JUMP, and the interval in which the row that is least smooth rises, from t to `end`."""
+    """SMOOTH, RAMP or JUMP, and the interval in which the row that is least smooth rises, from t to `end`.
+
+    RAMP: a step of at most that length is next. Methods whose accelerations at both ends are zero see nothing of a ramp
+    that fills their step.
+    """
     begin = t
     h = end - t
     _sample(f, w, t, q, way, begin, end)
@@ -112,4 +116,8 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
         _sample(f, w, t, q, way, begin, end)
         if abs(w.rates[PARTS, row] - w.rates[0, row]) > limit:
             return JUMP, begin, end
-    return (RAMP if steepest > STEEP * mean else SMOOTH), low, high
+    if steepest > STEEP * mean:
+        return RAMP, low, high
+    if end - begin < h:  # half the step is not smooth either: a ramp as long as the step, or a kink
+        return RAMP, t, t + 0.5 * h
+    return SMOOTH, t, t + h
