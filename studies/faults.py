@@ -1,4 +1,4 @@
-"""Single faults to plant at run time: in mechanisms, references, tableaux, options of methods, adapters and reports."""
+"""Single faults to plant at run time: in mechanisms, traces, references, tableaux, options, adapters and reports."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ import scipy.integrate
 from numpy.typing import NDArray
 
 from studies import metrics, render, solvers, tables
-from twoloop import ConstrainedSystem, Result, mechanisms, methods, tableaux
+from twoloop import ConstrainedSystem, Result, callback, mechanisms, methods, tableaux
 from twoloop.bdf import BDF
 from twoloop.dop853 import DOP853
 from twoloop.mechanisms import Problem
@@ -26,6 +26,9 @@ TABLES, METRICS, RENDER = (f"tests/studies/test_{name}.py" for name in ("tables"
 
 
 SCIPY = "DOP853, index 1"  # for all adapters of foreign solvers
+TRACING = "Taylor"  # a solver that integrates what callbacks were traced to
+GRAVITY, OTHER = 9.81, 9.80  # m/s^2, of a pendulum and what it is in a wrong trace
+weight = GRAVITY  # a global on purpose: numba takes it as it is when it compiles `frozen`
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,76 @@ def in_mechanism() -> Iterator[Fault]:
     )
 
 
+@callback("mass")
+def unit(t, q, p, M):  # type: ignore[no-untyped-def]
+    M[0, 0] = M[1, 1] = 1.0
+
+
+@callback("force")
+def frozen(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    Q[1] = -weight
+
+
+@callback("constraint")
+def circle(t, q, p, C):  # type: ignore[no-untyped-def]
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+
+
+@callback("jacobian")
+def radius(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    Cq[0, 0], Cq[0, 1] = q[0], q[1]
+
+
+def pendulum_in_python(**changed: Any) -> ConstrainedSystem:
+    """The pendulum of A01 in functions that can be traced, with others in the place of some."""
+    functions = {
+        "mass": lambda t, q: np.eye(2),
+        "force": lambda t, q, v: np.array([0.0, -GRAVITY]),
+        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+        "jacobian": lambda t, q: q.reshape(1, 2),
+        "gamma": lambda t, q, v: np.array([-(v @ v)]),
+    }
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, name="pendulum", **{**functions, **changed})
+
+
+def in_trace() -> Iterator[Fault]:
+    """Callbacks of a pendulum that are not what they are traced to."""
+
+    def swallowed(t: Any, q: Any, v: Any) -> Array:
+        try:
+            return np.array([0.0, -GRAVITY if t < 1e3 else -OTHER])
+        except Exception:
+            return np.array([0.0, -OTHER])
+
+    def by_type(t: Any, q: Any, v: Any) -> Array:
+        return np.array([0.0, -GRAVITY if isinstance(t, float) else -OTHER])
+
+    def counting(most: int) -> Callable[..., Array]:
+        calls = [0]
+
+        def force(t: Any, q: Any, v: Any) -> Array:
+            calls[0] += 1
+            return np.array([0.0, -GRAVITY if calls[0] < most else -OTHER])
+
+        return force
+
+    in_numba = ConstrainedSystem(
+        n_q=2, n_c=1, mass=unit, force=frozen, constraint=circle, jacobian=radius, name="pendulum"
+    )
+    lopsided = pendulum_in_python(mass=lambda t, q: np.array([[1.0, 0.1 * q[1]], [0.0, 1.0]]))
+    changed = lambda: patch("studies.faults.weight", OTHER)  # noqa: E731
+    sound = mechanisms.pendulum()
+    for name, system, plant in (
+        ("a branch that tracing loses behind try/except", pendulum_in_python(force=swallowed), nullcontext),
+        ("a branch on the type of t", pendulum_in_python(force=by_type), nullcontext),
+        ("a global that changed after numba compiled", in_numba, changed),
+        ("M symmetric at the start only", lopsided, nullcontext),
+        ("a callback that changes after 5 calls", pendulum_in_python(force=counting(5)), nullcontext),
+        ("a callback that changes after 100 calls", pendulum_in_python(force=counting(100)), nullcontext),
+    ):
+        yield Fault(name, "trace", plant, problem=replace(sound, system=system), solver=TRACING)
+
+
 def in_reference() -> Iterator[Fault]:
     """The state that runs are compared with."""
     sound = mechanisms.andrews()
@@ -197,14 +270,15 @@ def in_options() -> Iterator[Fault]:
         ("exponent of the error with the other sign", DOP853, "DOP853 (two-loop)", {"exponent": -0.125}),
         ("exponent of the error 1/5 in place of 1", BDF, "BDF", {"exponent": 0.2}),
         ("steps that never grow", methods.RungeKutta, "Gauss12", {"factor_max": 1.0}),
-        ("a safety factor of 9", methods.RungeKutta, "Gauss12", {"safety": 9.0}),
+        ("a safety factor of 9", DOP853, "DOP853 (two-loop)", {"safety": 9.0}),
         ("a safety factor of 0.09", DOP853, "DOP853 (two-loop)", {"safety": 0.09}),
     ):
         yield Fault(name, "options", planned(owner, **change), problem=double if owner is BDF else sound, solver=solver)
     original = solvers.solve_dae
 
     def looser(*arguments: Any, **named: Any) -> Result:
-        return original(*arguments, **(named | {key: 1e4 * named[key] for key in ("rtol", "atol")}))
+        system, t_span, q0, v0, method, rtol, atol = arguments
+        return original(system, t_span, q0, v0, method, 1e4 * rtol, 1e4 * atol, **named)
 
     loose = lambda: patch.object(solvers, "solve_dae", looser)  # noqa: E731
     yield Fault("tolerances handed on 1e4 times too large", "options", loose, problem=pendulum)
@@ -256,5 +330,5 @@ def in_report() -> Iterator[Fault]:
 
 def all_faults() -> list[Fault]:
     """All of them, each on its own."""
-    made = (in_mechanism, in_reference, in_tableau, in_options, in_adapter, in_report)
+    made = (in_mechanism, in_trace, in_reference, in_tableau, in_options, in_adapter, in_report)
     return [fault for make in made for fault in make()]

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from studies import planted_errors
-from studies.faults import Fault, all_faults, python_copy
+from studies.faults import TRACING, Fault, all_faults, pendulum_in_python, python_copy
 from studies.render import render
 from twoloop import mechanisms
 
@@ -16,7 +16,7 @@ FAULTS = {fault.name: fault for fault in all_faults()}
 def test_there_are_many_and_each_has_its_own_name():
     assert len(FAULTS) == len(all_faults()) >= 60
     assert {fault.place for fault in FAULTS.values()} == {
-        "mechanism", "reference", "tableau", "options", "adapter", "report",
+        "mechanism", "trace", "reference", "tableau", "options", "adapter", "report",
     }  # fmt: skip
 
 
@@ -35,7 +35,18 @@ def test_a_fault_is_caught(name, caught_by):
     assert planted_errors.row_of(FAULTS[name])["caught_by"] == caught_by
 
 
+@pytest.mark.parametrize("name", [name for name, fault in FAULTS.items() if fault.place == "trace"])
+def test_a_wrong_trace_is_refused_or_ends_the_run(name):
+    late = name == "a callback that changes after 100 calls"
+    expected = "run stopped: wrong_trace" if late else "start or run refused: cannot be traced"
+    assert planted_errors.row_of(FAULTS[name])["caught_by"] == expected
+
+
 def test_a_sound_run_is_not_caught():
+    fault = Fault(
+        "nothing", "trace", problem=replace(mechanisms.pendulum(), system=pendulum_in_python()), solver=TRACING
+    )
+    assert planted_errors.row_of(fault)["caught_by"] == planted_errors.NONE
     for sound in (mechanisms.andrews(), mechanisms.driven_crank()):
         for problem in (sound, replace(sound, system=python_copy(sound.system))):
             fault = Fault("nothing", "mechanism", problem=problem)
