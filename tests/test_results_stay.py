@@ -108,7 +108,9 @@ def test_a_callback_that_writes_to_its_parameters_is_refused():
         Q[0] = -p[0] * q[0]
 
     system = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=force, parameters=[1.0], name="changing")
-    with pytest.raises(ValueError, match=r"force of 'changing' must not change the arrays .*: it changes p. Copy first"):
+    with pytest.raises(
+        ValueError, match=r"force of 'changing' must not change the arrays .*: it changes p. Copy first"
+    ):
         solve_dae(system, (0.0, 1.0), [1.0], [0.0])
 
 

@@ -10,6 +10,7 @@ from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import (
     andrews,
+    bricard,
     four_bar,
     heavy_top,
     n_four_bar,
@@ -89,6 +90,15 @@ def test_mechanisms_a_little_off(name):
             guess = problem.q0 + size * rng.uniform(-1.0, 1.0, problem.q0.size)
             found = consistent_state(problem.system, t, guess, problem.v0)
             assert off(found, problem.q0) < 1e3 * size
+
+
+@pytest.mark.parametrize("mechanism", [bricard, lambda: n_four_bar(3)], ids=["bricard", "n_four_bar"])
+def test_rounding_that_exceeds_what_counts_as_converged_is_no_failure(mechanism):
+    problem = mechanism()
+    rng, system = np.random.default_rng(2), problem.system
+    for disturbed in (1e-8, 1e-7, 1e-6, 1e-5):
+        guess = problem.q0 + disturbed * rng.uniform(-1.0, 1.0, system.n_q)
+        assert off(consistent_state(system, 0.0, guess, problem.v0), problem.q0) < 10.0 * disturbed
 
 
 @pytest.mark.parametrize("beside", [1e-3, 1e-4, 1e-6])

@@ -135,7 +135,7 @@ def _position(
     cut = WEAK if redundant else NEGLIGIBLE
     if redundant:  # rows that depend on one another do so on the constraints, and beside them only nearly
         found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
-    if found is None or not excess <= CONVERGED:
+    if found is None or not excess <= 1.0:
         where = guess if found is None else found
         raise ValueError(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
@@ -180,7 +180,7 @@ def _another_assembly(
     for other in (-2.0 * moved, weakest, -weakest):
         way = other * scales.columns
         again, excess, _ = _gauss_newton(system, t, found + way, free, cut)
-        if again is None or not excess <= CONVERGED:
+        if again is None or not excess <= 1.0:
             return "does not converge"
         expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
         if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
@@ -188,7 +188,7 @@ def _another_assembly(
         mixed = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
         mixed[columns] = again[columns]
         beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
-        if beside is None or not excess <= CONVERGED:
+        if beside is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
         if distance(beside, found) > SAME * far or sign_at(beside) != sign:
             return f"ends on another one, which differs by {_change(found, beside, scales)}"
@@ -207,7 +207,7 @@ def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
     """Position (None: lost), what it is still off over what is accepted, and how many iterations it took."""
-    best, iteration = np.inf, 0
+    best, nearest, iteration = np.inf, q, 0
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
             jacobian, values = system.jacobian(t, q), system.constraint(t, q)
@@ -219,11 +219,12 @@ def _gauss_newton(
         excess = Violation.of_position(system, t, q, jacobian, scales_of(system, t, q, jacobian)).excess
         if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
             return q, excess, iteration  # as far as rounding lets it
-        best = min(best, excess)
+        if excess < best:
+            best, nearest = excess, q
         q = q + step
         if not np.isfinite(q).all():
             return None, np.inf, iteration
-    return q, best, iteration
+    return nearest, best, iteration  # accepted up to 1: rounding may keep it above what is converged
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
