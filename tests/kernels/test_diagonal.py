@@ -82,13 +82,13 @@ def test_stiff_beam_takes_few_iterations(beam, formula, limit):
 def test_error_of_the_stiff_beam_goes_with_the_tolerance(beam):
     problem, truth = beam
     errors, evaluations = [], []
-    for tol in (1e-3, 1e-5):
+    for tol in (1e-3, 1e-6):
         result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "TRBDF2", tol, tol, t_eval=TIMES)
         errors.append(np.abs(tip_height(result.q) - truth).max())
         evaluations.append(result.stats.n_evaluations)
-    assert errors[0] < 50e-3 and errors[1] < 1e-3
+    assert errors[0] < 5e-3 and errors[1] < 1e-4
     assert errors[1] < errors[0] / 5
-    assert evaluations[1] < 3000  # an explicit method needs 70,000
+    assert evaluations[1] < 8000  # an explicit method needs 70,000
 
 
 def test_without_tangents_the_jacobian_is_kept_and_the_solution_the_same():
@@ -124,4 +124,4 @@ def test_velocities_are_tested_where_asked_for():
         method = ESDIRK(tested=tested)
         result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, 1e-5, 1e-5)
         off.append(worst(result.v[:, -1], tight.v[:, -1]))
-    assert off[1] < 0.5 * off[0]
+    assert off[1] < 0.8 * off[0]

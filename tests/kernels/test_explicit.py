@@ -179,11 +179,12 @@ def test_errors_follow_the_tolerance_and_steps_the_order(linkage, request):
 
 @pytest.mark.parametrize("tol", TOLERANCES)
 def test_a_first_step_that_is_too_large_is_refused(tol):
-    usual, result = (swing(method="DOP853", rtol=tol, atol=tol, first_step=h) for h in (None, 1.0))
+    # so long that a hundredth of it, which no step exceeds, is too large
+    usual, result = (swing(50.0, method="DOP853", rtol=tol, atol=tol, first_step=h) for h in (None, 1.0))
     assert result.success, result.message
     assert result.stats.n_rejected_error + result.stats.n_rejected_convergence > 0
     assert result.stats.n_accepted < 1.2 * usual.stats.n_accepted
-    assert worst(result.q, pendulum_state(result.t)[0]) < 1e2 * tol
+    assert worst(result.q, pendulum_state(result.t)[0]) < 1e3 * tol
 
 
 def test_a_force_that_jumps_is_passed():
