@@ -254,7 +254,8 @@ def test_signals_at_any_instruction_end_the_run_with_its_result(events):
         n, before = 0, sys.gettrace()
         sys.settrace(every_line)
         try:
-            return solve_dae(system, (0.0, 0.05), *START, "DOP853", 1e-4, 1e-4, check_derivatives=False, events=events)
+            options = {"step_size": 0.01, "check_derivatives": False}  # few steps: each line of them is slow here
+            return solve_dae(system, (0.0, 0.05), *START, "DOP853", events=events, **options)
         finally:
             sys.settrace(before)
 

@@ -224,7 +224,7 @@ def _gauss_newton(
         q = q + step
         if not np.isfinite(q).all():
             return None, np.inf, iteration
-    return nearest, best, iteration  # accepted up to 1: rounding may keep it above what is converged
+    return (nearest if best <= 1.0 else q), best, iteration  # up to 1 is accepted: rounding may keep it above CONVERGED
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
