@@ -125,7 +125,8 @@ def test_step_sizes_sum_to_the_span(default_four_bar):
 
 def test_first_step_is_tried_first():
     assert swing(first_step=1e-3).h[0] == 1e-3
-    refused = swing(first_step=0.5, rtol=1e-10, atol=1e-10)
+    # of a run of which it is less than a hundredth, as no longer step is tried
+    refused = solve_dae(pendulum(), (0.0, 60.0), *START, first_step=0.5, rtol=1e-10, atol=1e-10)
     assert refused.h[0] < 0.5
     assert refused.stats.n_rejected_error + refused.stats.n_rejected_convergence > 0
 
@@ -203,7 +204,7 @@ def test_a_step_that_ends_on_a_singular_position_is_a_status():
 def test_an_output_time_on_a_singular_position_is_warned_of():
     with pytest.warns(ConstraintWarning) as caught:
         result = solve_dae(crossing_lines(), *CROSSING, t_eval=[0.5, 1.0, 2.0])
-    assert ["1 of 3 times" in str(each.message) for each in caught] == [True, True]
+    assert ["at 1 of " in str(each.message) for each in caught] == [True, True]
     assert result.success
     assert worst(result.q, np.array([[-0.5, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.0, 0.0]])) < 1e-8
     assert np.isnan(result.a[:, 1]).all() and np.isfinite(result.a[:, [0, 2]]).all()
@@ -241,7 +242,8 @@ def test_counts_are_consistent(default_four_bar, method):
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "PaperNewmark"])
 def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, method, monkeypatch):
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
-    whole = run(default_four_bar, 3.0, **options)
+    t_end = 20.0 if method == "Gauss12" else 3.0  # a hundredth of which is longer than its steps
+    whole = run(default_four_bar, t_end, **options)
     monkeypatch.setattr("twoloop.run.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
     stats = whole.stats
     assert whole.rejected_error.sum() == stats.n_rejected_error
@@ -249,7 +251,7 @@ def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, 
     assert stats.n_rejected_error + stats.n_rejected_convergence > 0
     assert 0 < whole.partitioned.sum() == stats.n_partitions - 1
     for k in (1, 2, 7, 8, 20):  # a run stopped after k steps has counted what the log says of them
-        short = run(default_four_bar, 3.0, **options, max_steps=k)
+        short = run(default_four_bar, t_end, **options, max_steps=k)
         for name, counted in (
             ("rejected_error", short.stats.n_rejected_error),
             ("rejected_convergence", short.stats.n_rejected_convergence),

