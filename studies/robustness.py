@@ -252,7 +252,11 @@ def tables_of(found: dict[str, Any]) -> dict[str, str]:
         ]
         for line in found["long"]
     ]
-    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT))] for line in found["sharp"]["methods"]]
+    always = [line for line in found["sharp"]["methods"] if not line[SAID] and not line[SILENT]]
+    others = [line for line in found["sharp"]["methods"] if line not in always]
+    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT))] for line in others]
+    if always:
+        sharp.append([", ".join(line["method"] for line in always), f"all {always[0][RIGHT]}", 0, 0])
     return {
         "sharp": table(("method", RIGHT, SAID, SILENT), sharp),
         "linkages": table(("method", *kinds, "median error", "worst / allowed"), drawn),

@@ -122,7 +122,7 @@ def text_of(rows):
 
 def test_sentences_turn_with_the_rows():
     good = text_of(rows_of("right"))
-    assert "No run is wrong and silent" in good
+    assert "No run of these linkages" in good
     assert (
         "Of 1 runs of 1 random mechanisms under sharp forces, half of them friction, none is wrong and silent." in good
     )
