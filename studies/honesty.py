@@ -266,6 +266,9 @@ def counts_of(rows: pd.DataFrame) -> dict[str, int]:
 
 def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says: of mistakes and of forces, and of both together how far ours can be trusted."""
+    # what our adapters of solvers that take expressions cannot write down is no answer of theirs
+    refused = all_rows["message"].astype(str).str.startswith("NotSymbolic")
+    all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
     rows, forces = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE))
     found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(all_rows)}
     return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO}
@@ -346,9 +349,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
         if each["trap"] not in alike
     ]
     short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
-    shown = [what for what in ORDER if what != NOT_RUN]
-    counts = [[name, *(each[what] for what in shown)] for name, each in found["counts"].items()]
-    ready = {"cells": table(["trap", *short], cells), "counts": table(["solver", *(x.lower() for x in shown)], counts)}
+    ready = {"cells": table(["trap", *short], cells)}
     of_force = (SILENT, SAID, RIGHT)
     ready["forces"] = table(
         ["force", *(f"{whose}: silent / said / right" for whose in ("ours", "others"))],
@@ -357,13 +358,13 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
             for each in found["forces"]["families"]
         ],
     )
-    ready["solvers"] = table(
-        ["solver", "silent", "said", "right"],
-        [
-            [each["solver"].replace(" (two-loop)", ""), *(each[what] for what in of_force)]
-            for each in found["forces"]["solvers"]
-        ],
-    )
+    of_solvers = [
+        [each["solver"].replace(" (two-loop)", ""), *(each[what] for what in of_force)]
+        for each in found["forces"]["solvers"]
+    ]
+    flawless = [line[0] for line in of_solvers if line[1] == line[2] == 0 and line[3]]
+    lines = [line for line in of_solvers if any(line[1:]) and line[0] not in flawless]
+    ready["solvers"] = table(["solver", "silent", "said", "right"], [*lines, [", ".join(flawless), 0, 0, "all"]])
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 
