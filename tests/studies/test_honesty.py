@@ -32,7 +32,8 @@ def test_a_right_answer():
 
 def test_a_wrong_answer_with_success_is_silent():
     def wrong(trap):
-        return solve_dae(trap.sane, (0.0, trap.t_end), trap.q0, trap.v0, rtol=1e-2, atol=1e-2)
+        result = solve_dae(trap.sane, (0.0, trap.t_end), trap.q0, trap.v0)
+        return replace(result, q=result.q + 0.1)
 
     assert row_of(SOUND, wrong)["outcome"] == honesty.SILENT
 
