@@ -119,8 +119,9 @@ def test_the_search_for_the_period_and_the_integration_end(monkeypatch):
 
 
 def test_an_equation_of_motion_that_is_not_finite_is_an_error(monkeypatch):
+    form = minimal_form(0)
     monkeypatch.setattr(four_bar_minimal, "_tangent_rate", lambda *_: np.full(3, np.nan))
-    rate = four_bar_minimal._counted(minimal_form(0).rate)
+    rate = four_bar_minimal._counted(form.rate)
     with pytest.raises(ValueError, match=r"gives values that are not finite at t = 0\.5 s"):
         rate(0.5, np.array([0.1, 0.2, 0.3, 1.0]))
 
