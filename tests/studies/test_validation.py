@@ -120,7 +120,7 @@ def deceived_row(problem, solver, tolerance):
 
 def test_steps_that_keep_their_tolerance_and_steps_that_do_not():
     problem = mechanisms.double_pendulum()
-    result = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
     assert (deceived.local_errors(problem, result, 1e-6) < 1.0).all()
     assert (deceived.local_errors(problem, result, 1e-12)[1:] > 1.0).sum() > 3
     wrong = replace(result, v=result.v + 1e-4 * (np.arange(result.t.size) == 5))
