@@ -267,8 +267,9 @@ def counts_of(rows: pd.DataFrame) -> dict[str, int]:
 def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says: of mistakes and of forces, and of both together how far ours can be trusted."""
     # what our adapters of solvers that take expressions cannot write down is no answer of theirs
-    refused = all_rows["message"].astype(str).str.startswith("NotSymbolic")
-    all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
+    if "message" in all_rows:
+        refused = all_rows["message"].astype(str).str.startswith("NotSymbolic")
+        all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
     rows, forces = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE))
     found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(all_rows)}
     return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO}
