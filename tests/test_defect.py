@@ -89,7 +89,7 @@ SQUARE = {
     "root of the time": lambda t, q, v: np.array([np.sqrt(t), -9.81]),
     "tanh of large numbers": lambda t, q, v: np.array([2.0 * np.tanh((t - 1.0) / 0.001), -9.81]),
     "decay within a thousandth": lambda t, q, v: np.array([5.0 * np.exp(-t / 1e-3), -9.81]),
-    "a high power of a negative number": lambda t, q, v: np.array([3.0 * (q[0] - 0.9) ** 65, -9.81]),
+    "a high power of a negative number": lambda t, q, v: np.array([3.0 * ((q[0] - 0.9) / 1.6) ** 65, -9.81]),
 }
 
 
