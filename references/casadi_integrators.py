@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, check_choice, check_run, check_tolerances
-from references.expressions import Expressions
+from references.expressions import Expressions, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_size
 from twoloop.consistency import check_start
@@ -185,9 +185,8 @@ def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> di
     casadi, n = _casadi(), system.n_q
     made = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
     t, x = casadi.SX.sym("t"), casadi.SX.sym("x", 2 * n)
-    functions = {"sin": casadi.sin, "cos": casadi.cos, "sqrt": casadi.sqrt}
     q, v = ([x[first + i] for i in range(n)] for first in (0, n))
-    return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions, t, q, v))}
+    return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions_of(casadi), t, q, v))}
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, check_run, check_tolerances
-from references.expressions import Expressions, NotSymbolic
+from references.expressions import Expressions, NotSymbolic, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
@@ -114,7 +114,7 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Cal
         raise RuntimeError("diffrax is not installed: make peers, or pip install 'twoloop[peers]'") from error
     jax.config.update("jax_enable_x64", True)
     n, equations = system.n_q, Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
-    functions = {"sin": jax.numpy.sin, "cos": jax.numpy.cos, "sqrt": jax.numpy.sqrt}
+    functions = functions_of(jax.numpy)
 
     def derivative(t: Any, y: Any, _: Any) -> Any:
         a = equations.accelerations(functions, t, [y[i] for i in range(n)], [y[n + i] for i in range(n)])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, check_run
-from references.expressions import Expressions
+from references.expressions import Expressions, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
@@ -111,9 +111,8 @@ def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol:
     heyoka.llvm_state.set_diskcache_enabled(False)  # or what a building takes would depend on what ran before
     n, state = system.n_q, np.concatenate([np.frombuffer(q0), np.frombuffer(v0)])
     symbols = heyoka.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
-    functions = {"sin": heyoka.sin, "cos": heyoka.cos, "sqrt": heyoka.sqrt}
     equations = Expressions(system, t0, state[:n], state[n:])
-    rates = [*symbols[n:], *equations.accelerations(functions, heyoka.time, symbols[:n], symbols[n:])]
+    rates = [*symbols[n:], *equations.accelerations(functions_of(heyoka), heyoka.time, symbols[:n], symbols[n:])]
     rates = [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates]
     integrator = heyoka.taylor_adaptive(
         list(zip(symbols, rates, strict=True)),
