@@ -18,6 +18,7 @@ JUDGED = "judged by the problem's own condition"  # group of runs
 TIME_LIMIT = 1.5  # s of CPU of a run
 INSTANTS = 101  # of solvers that store none of their steps; not a multiple of a half period of any
 DECADES = 2  # a run is right within so many decades of its tolerance, where the problem has no condition of its own
+EXACT = 1e-3  # what misses its tolerance by more, but is right to this, is inexact and not wrong
 LEVELS = ("q", "v", "lam")
 
 
@@ -131,9 +132,9 @@ def row_of(run: Run) -> Row:
 
 
 def outcome(row: Row, problem: Problem, tolerance: float) -> str:
-    """ "right", "said so" (it did not reach the end), "wrong" (it did, and is not right), or "not run".
+    """ "right", "inexact", "wrong" (it reached the end), "said so" (it did not), or "not run".
 
-    Not run are also those that our adapter of a foreign solver refuses, which says nothing of the solver.
+    An answer that misses its tolerance but has three digits is a matter of calibration. Not run are also those that our adapter of a foreign solver refuses, which says nothing of the solver.
     """
     refused = row["status"] == "RAISED" and row["family"] != "two-loop"
     if refused or row["status"] in NOTHING_RUN:
@@ -142,4 +143,6 @@ def outcome(row: Row, problem: Problem, tolerance: float) -> str:
         return "said so"
     if row["condition"] is not None and problem.condition is not None:
         return "right" if row["condition"] <= problem.condition.high else "wrong"
-    return "right" if row["error_q"] <= 10.0**DECADES * max(tolerance, row["floor"]) else "wrong"
+    if row["error_q"] <= 10.0**DECADES * max(tolerance, row["floor"]):
+        return "right"
+    return "inexact" if row["error_q"] <= EXACT else "wrong"
