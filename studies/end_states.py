@@ -134,7 +134,8 @@ def row_of(run: Run) -> Row:
 def outcome(row: Row, problem: Problem, tolerance: float) -> str:
     """ "right", "inexact", "wrong" (it reached the end), "said so" (it did not), or "not run".
 
-    An answer that misses its tolerance but has three digits is a matter of calibration. Not run are also those that our adapter of a foreign solver refuses, which says nothing of the solver.
+    An answer that misses its tolerance but has three digits is a matter of calibration. Not run are also those that our
+    adapter of a foreign solver refuses, which says nothing of the solver.
     """
     refused = row["status"] == "RAISED" and row["family"] != "two-loop"
     if refused or row["status"] in NOTHING_RUN:
