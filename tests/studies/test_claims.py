@@ -294,7 +294,8 @@ def test_without_rows_nothing_is_judged():
 
 
 def test_a_missing_solver_is_not_run_and_never_an_exception(tables):
-    for solver in sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()}):
+    solvers = sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()})
+    for solver in {*solvers[::6], IRK, NEWMARK, QUARTER, "DOP853, projected"}:
         judged(Rows({name: table[table["solver"] != solver] for name, table in tables.items()}, EXPERIMENTS))
 
 
