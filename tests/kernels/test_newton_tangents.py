@@ -167,7 +167,7 @@ def test_compiled_tangents_are_the_same():
             mass=np.eye(2),
             force=lambda t, q, v: 1e6 * np.array([q[1] - q[0], q[0] - q[1]]),
             constraint=lambda t, q: np.array([q[0] - math.sin(t)]),  # the sine of NumPy 1.24 rounds otherwise
-            jacobian=np.array([[1.0, 0.0]]),
+            jacobian=lambda t, q: np.array([[1.0, 0.0]]),
             constraint_rate=lambda t, q: np.array([-math.cos(t)]),
             force_by_q=by_q,
             compile=compile,
