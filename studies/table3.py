@@ -39,6 +39,7 @@ OTHERS = (
     *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
 )
+COMPILED = ("IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")  # for seconds: no quick runs
 DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C)
 LISTED = (*(name for name in DRAWN if name != ADAMS), "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
@@ -63,7 +64,8 @@ def runs(first: Case, second: Case, quick: bool) -> list[Run]:
     for partition in ("lasting", "symmetric"):
         solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
         made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
-    names = (*PAPER, *OTHERS, *([] if quick else [f"IDA, {form}" for form in IDA_FORMS if form != "stabilised"]))
+    more = [] if quick else [f"IDA, {form}" for form in IDA_FORMS if form != "stabilised"]
+    names = [name for name in (*PAPER, *OTHERS, *more) if not (quick and name in COMPILED)]
     for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
         for name in names_:
             solver = CATALOGUE[name]

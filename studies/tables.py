@@ -18,19 +18,18 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
     The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
     repetition failed is represented by a failed one if half of them or more failed.
     """
-    runs = (rows["repeat"].diff().fillna(-1) <= 0).cumsum()
-    chosen = []
-    for _, run in rows.groupby(runs.to_numpy(), sort=False):
-        order = run["error_q"].astype(float).fillna(np.inf).argsort(kind="stable")
-        row = run.iloc[order.iloc[len(run) // 2]].copy()
-        times = run["cpu_s"].astype(float).dropna()
-        for name, share in (("cpu_q1", 25), ("cpu_s", 50), ("cpu_q3", 75)):
-            row[name] = np.percentile(times, share) if len(times) else np.nan
-        if "build_s" in run:  # which is measured once
-            row["build_s"] = run["build_s"].astype(float).max()
-        row["repeats"] = len(run)
-        chosen.append(row)
-    return pd.DataFrame(chosen).drop(columns="repeat").reset_index(drop=True)
+    firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
+    errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["cpu_s"].to_numpy(float)
+    chosen, quartiles = [], []
+    for run in np.split(np.arange(len(rows)), firsts[1:]):
+        chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
+        known = times[run][~np.isnan(times[run])]
+        quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
+    found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
+    found[["cpu_q1", "cpu_s", "cpu_q3"]] = np.array(quartiles)
+    if "build_s" in rows:  # which is measured once
+        found["build_s"] = np.fmax.reduceat(rows["build_s"].to_numpy(float), firsts)
+    return found.assign(repeats=np.diff(firsts, append=len(rows)))
 
 
 def time_for(rows: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
@@ -39,11 +38,12 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
     Between the two runs on either side of the target, on the log-log line through them: solvers whose settings lie
     far apart are not made to look expensive by it. NaN too where the target is below what the reference resolves.
     """
-    runs = rows[rows["error_q"].notna() & rows[what].notna()].sort_values("error_q")
-    if runs.empty or target < runs["floor"].max():
+    errors, costs, floors = (rows[name].to_numpy(float) for name in ("error_q", what, "floor"))
+    known = np.flatnonzero(~np.isnan(errors) & ~np.isnan(costs))
+    if not known.size or (target < floors[known]).any():
         return float("nan")
-    errors = np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
-    costs = runs[what].to_numpy(float)
+    order = known[np.argsort(errors[known], kind="stable")]
+    errors, costs = np.maximum(errors, floors)[order], costs[order]
     n_good = int((errors <= target).sum())
     if n_good == 0:
         return float("nan")

@@ -213,7 +213,7 @@ def test_two_equal_runs_are_refused(kept):
 
 
 def test_a_made_reference_says_how_far_it_holds():
-    made = make_reference(problem(compile=True), T_END)
+    made = make_reference(problem(), T_END)
     t = np.linspace(0.0, T_END, 77)
     q, v, _ = pendulum_state(t)
     states = made.states(t)

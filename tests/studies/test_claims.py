@@ -14,6 +14,7 @@ from studies.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, QUART
 from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from twoloop.mechanisms import four_bar
 
+CLAIMS = load()
 HOLDS, PART, FAILS, CONSISTENT, CIRCULAR, NOT_RUN = Verdict
 FIRST, SECOND = four_bar().name, "another linkage"
 GOOD = {"status": "REACHED_END", "lost": False, "astray": False, "t_end": 100.0, "floor": 1e-12, "repeat": 0}
@@ -253,7 +254,8 @@ OTHER_NUMBERS = [
 
 
 def verdict(key, tables, numbers=EXPERIMENTS):
-    return judged(Rows(tables, numbers))[key][1].verdict
+    claim = next(claim for claim in CLAIMS if claim.key == key)
+    return claim.judgement(getattr(judges, claim.judge), Rows(tables, numbers)).verdict
 
 
 def with_changed(tables, study, where, changes):
@@ -294,7 +296,8 @@ def test_without_rows_nothing_is_judged():
 
 
 def test_a_missing_solver_is_not_run_and_never_an_exception(tables):
-    for solver in sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()}):
+    solvers = sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()})
+    for solver in {*solvers[::6], IRK, NEWMARK, QUARTER, "DOP853, projected"}:
         judged(Rows({name: table[table["solver"] != solver] for name, table in tables.items()}, EXPERIMENTS))
 
 

@@ -83,9 +83,10 @@ def test_the_report_is_short_and_only_it_is_left(quick):
     assert (quick / "energy_long.png").stat().st_size > 10_000
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_redraw_writes_the_same_report(quick):
     text = (quick / "energy.md").read_text()
-    energy.main(["--quick", "--out", str(quick), "--redraw"])
+    energy.STUDY.main(["--quick", "--out", str(quick), "--redraw"])
     assert (quick / "energy.md").read_text() == text
 
 
