@@ -104,7 +104,7 @@ def sweep(
     **options
         Of `solve_dae`: method, rtol, t_eval, events, time_limit, ... With check_derivatives=False, once the derivatives
         are known to be right, runs of some milliseconds take about two thirds of the time. compiled=True compiles
-        anew for other parameters, some 0.1 s, which pays for long runs only.
+        anew for other parameters, half a second or more, which pays for long runs only.
 
     Returns
     -------
