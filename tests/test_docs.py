@@ -16,7 +16,7 @@ from twoloop.result import explained
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(page.stem for page in DOCS.glob("*.md"))
 ELSEWHERE = {"between_steps": "test_pages.py", "compare": "studies/test_compare.py"}  # whose code other tests run
-WITHOUT_CODE = {"errors", "index", "method", "reference"}
+WITHOUT_CODE = {"errors", "method", "reference"}
 
 
 @pytest.fixture(scope="module")

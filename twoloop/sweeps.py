@@ -74,13 +74,13 @@ def sweep(
     Parameters
     ----------
     problem_of : callable
-        problem_of(**parameters) -> Problem, such as a ready mechanism or a function of one's own. A `ValueError` of
-        it, for a geometry that does not assemble, is a row.
+        ``problem_of(**parameters)`` gives a `Problem`, such as a ready mechanism or a function of one's own.
+        A `ValueError` of it, for a geometry that does not assemble, is a row.
     parameters : sequence of mappings
         One for each run, all with the same names. Values are numbers, strings, or True and False, under one name of
         one kind.
     measure : callable
-        measure(problem, result) -> mapping of further columns, whose values are numbers, strings, True and False or
+        ``measure(problem, result)`` gives a mapping of further columns, whose values are numbers, strings, True and False or
         None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN unless
         the problem says that its energy is an invariant (`conserved`).
     workers : int, optional
