@@ -17,11 +17,11 @@ version = release = twoloop.__version__
 
 # Sphinx links the word for a type in a docstring to attributes of that name, of which classes may share one
 suppress_warnings = ["ref.python"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-exclude_patterns = ["_build", "generated/extra"]
-html_extra_path = ["generated/extra"]  # the animations of the gallery, copied as they are
+extensions = ["myst_parser", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "generated/extra", "generated/takes.md"]  # the last is included by the front page
+html_extra_path = ["generated/extra"]  # the animations, copied as they are
 default_role = "py:obj"  # a name in single backticks, as numpydoc has them, is a link where there is such an object
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3  # as on GitHub: a link to page.md#heading works in both
 napoleon_google_docstring = False
 napoleon_use_ivar = True
@@ -29,8 +29,10 @@ autodoc_typehints = "none"  # the docstrings have types and shapes
 autodoc_member_order = "bysource"
 python_maximum_signature_line_length = 100
 
-html_theme = "alabaster"
-html_theme_options = {"description": release, "page_width": "1100px", "fixed_sidebar": True}
+html_theme = "furo"
+html_title = f"twoloop {release}"
+html_static_path = ["static"]
+html_css_files = ["wide.css"]
 html_show_sourcelink = False
 html_copy_source = False
 

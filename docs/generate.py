@@ -1,11 +1,13 @@
-"""The pages that are made anew with every build, in docs/generated: reports, which method, gallery."""
+"""What is made anew with every build, in docs/generated: reports, which method, gallery, the run of the front page."""
 
+import contextlib
+import io
 import shutil
 from pathlib import Path
 
 import gallery
 
-from studies.which_method import page
+from studies.which_method import page, table
 
 ROOT = Path(__file__).resolve().parents[1]
 SHOWN = (".md", ".png", ".svg", ".csv", ".json", ".html")  # files of a report that its pages show or link
@@ -20,4 +22,14 @@ def write(folder: Path) -> None:
         if file.suffix in SHOWN:
             shutil.copy(file, reports)
     (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")
+    (folder / "takes.md").write_text(table(ROOT / "reports"), encoding="utf-8")
+    run_the_front_page(folder / "extra" / "front")
     gallery.write(folder / "gallery.md", folder / "extra" / "animations")
+
+
+def run_the_front_page(folder: Path) -> None:
+    """Run the code that the front page shows, so that its plot and its animation are what that code writes."""
+    folder.mkdir(parents=True)
+    code = (ROOT / "docs" / "index.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
+        exec(code, {})

@@ -2,8 +2,10 @@
 
 import html
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from io import StringIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,15 @@ MEASURES = {
 SETTINGS = ("h", "err_out", "tol")
 COSTS = {"cpu_s": "CPU time (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
+OPENS = "four-bar, 10 s (work_precision)"
+ALWAYS = ("auto", "auto, compiled")  # shown at first beside the best
+POINTS = {  # marker of the figures: shape and rotation (degrees) of the nearest one of the plotting library
+    **{"o": ("circle", 0), "s": ("rect", 0), "D": ("rectRot", 0), "p": ("rectRounded", 0), "d": ("rectRounded", 45)},
+    **{"^": ("triangle", 0), ">": ("triangle", 90), "v": ("triangle", 180), "<": ("triangle", 270)},
+    **{"*": ("star", 0), "P": ("cross", 0), "X": ("crossRot", 0)},
+}
+VENDOR = Path(__file__).parent / "vendor"
+LIBRARIES = ("chart-4.6.1", "chartjs-plugin-zoom-2.2.0")  # the second extends the first
 
 
 def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
@@ -49,7 +60,13 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
             first, rest = path.read_text().split("\n", 1)
             rows = pd.read_csv(StringIO(rest), low_memory=False).rename(columns=columns)
             rows = tables.medians(rows) if "repeat" in rows else rows
-            parts.append(rows.assign(mechanism=rows["case"].astype(str), study=name))
+            # a study may run one mechanism for several lengths of time, whose costs cannot be compared
+            parts.append(
+                rows.assign(
+                    mechanism=[f"{case}, {end:g} s" for case, end in zip(rows["case"], rows["t_end"], strict=True)],
+                    study=name,
+                )
+            )
         except (ValueError, KeyError) as error:
             raise StudyError(f"{path} is damaged ({error}); make it again by python -m studies.{name}") from None
         stamps[name] = first.removeprefix("# ")
@@ -62,11 +79,9 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
 
 def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
     """What the page is given: mechanisms, solvers with their looks, and the runs as lists."""
-    solvers = []
-    for name, runs in rows.groupby("solver", sort=False):
-        first = runs.iloc[0]
-        look = figures.style(str(name), first["family"])
-        solvers.append({"name": name, "ours": first["family"] == "two-loop", "color": look["color"]})
+    families = rows.groupby("solver", sort=False)["family"].first()
+    seen = looks(families.index)
+    solvers = [{"name": name, "ours": family == "two-loop", **seen[name]} for name, family in families.items()]
     numbers = {solver["name"]: k for k, solver in enumerate(solvers)}
     mechanisms = [
         {"name": f"{name} ({of})", "floor": float(runs["floor"].max())}
@@ -79,9 +94,13 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
         values = [_rounded(abs(row[name])) if name in row and pd.notna(row[name]) else None for name in columns]
         done = row["status"] == "REACHED_END"
         said = "" if done else f"{row['status']}: {str(row['message']).split('. ')[0]}"
+        if done and row.get("astray") in (True, "True"):
+            said = "reached the end, but lost the motion"
         mechanism = places[f"{row['mechanism']} ({row['study']})"]
         runs.append([mechanism, numbers[row["solver"]], tables.setting(row), row["called_from"], *values, said])
     return {
+        "opens": OPENS if OPENS in places else mechanisms[0]["name"],
+        "always": ALWAYS,
         "mechanisms": mechanisms,
         "solvers": solvers,
         "columns": ["mechanism", "solver", "setting", "called", *columns, "said"],
@@ -90,6 +109,22 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
         "runs": runs,
         "stamps": stamps,
     }
+
+
+def looks(solvers: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Colour and point of each solver: those of the figures, another pair where one is taken or has no such point."""
+    known = sorted(solvers, key=lambda name: name not in figures.STYLES)  # others take what is left
+    free = list(product(dict.fromkeys(color for color, _ in figures.STYLES.values()), POINTS))
+    made = {}
+    for name in known:
+        style = figures.style(name)
+        pair = (str(style["color"]), str(style["marker"]))
+        if pair not in free:
+            pair = next((each for each in free if each[0] == pair[0]), free[0])
+        free.remove(pair)
+        point, rotation = POINTS[pair[1]]
+        made[name] = {"color": pair[0], "point": point, "rotation": rotation}
+    return made
 
 
 def _rounded(value: float) -> float:
@@ -101,7 +136,10 @@ def page(data: dict[str, Any]) -> str:
     text = json.dumps(plain(data), separators=(",", ":"), ensure_ascii=False).replace("</", "<\\/")
     stamps = "".join(f"<li>{html.escape(name)}: {html.escape(stamp)}</li>" for name, stamp in data["stamps"].items())
     template = (TEMPLATES / FILE).read_text(encoding="utf-8")
-    return template.replace("STAMPS", stamps).replace("DATA", text, 1)
+    scripts = "\n".join((VENDOR / f"{name}.min.js").read_text(encoding="utf-8") for name in LIBRARIES)
+    licences = "\n".join(file.read_text(encoding="utf-8") for file in sorted(VENDOR.glob("*-LICENSE.md")))
+    parts = {"STAMPS": stamps, "LICENCES": licences, "LIBRARY": scripts, "DATA": text}
+    return re.sub("|".join(parts), lambda found: parts[found[0]], template)
 
 
 def _work(output: Output) -> None:

@@ -16,7 +16,7 @@ from twoloop.result import explained
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(page.stem for page in DOCS.glob("*.md"))
 ELSEWHERE = {"between_steps": "test_pages.py", "compare": "studies/test_compare.py"}  # whose code other tests run
-WITHOUT_CODE = {"errors", "index", "method", "reference"}
+WITHOUT_CODE = {"errors", "method", "reference"}
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +57,21 @@ def test_start_here_has_the_right_motion(names):
     assert page["error"] < 1e-7 and page["violation"] < 1e-13
     assert np.ptp(page["energies"]) < 1e-6
     assert page["problem"].q0 == pytest.approx([0.04, -1.0, 1.54, 0.32], abs=0.005)  # as drawn in four_bar.svg
+
+
+def test_a_fit_with_the_step_that_the_page_names_finds_the_masses(names):
+    page = names("your_mechanism")
+    assert page["fit"].success and page["fit"].x == pytest.approx([page["m2"], page["m3"]], rel=1e-4)
+
+
+@pytest.mark.parametrize(("tol", "step"), [(1e-8, 1e-4), (1e-12, 1.5e-8)])
+def test_so_are_the_derivatives_right_with_each_of_its_two_remedies(names, tol, step):
+    slider, masses = names("your_mechanism")["slider"], np.array([2.0, 1.5])
+    for k in range(2):
+        change = np.where(np.arange(2) == k, masses, 0.0)
+        smooth = (slider(masses + 1e-3 * change, 1e-13) - slider(masses - 1e-3 * change, 1e-13)) / 2e-3
+        by_steps = (slider(masses + step * change, tol) - slider(masses, tol)) / step
+        assert np.linalg.norm(by_steps - smooth) < 0.02 * np.linalg.norm(smooth)
 
 
 def test_every_kind_of_constraint_does_what_its_section_says(names):

@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[1]
 FILE = """
 from twoloop.mechanisms import four_bar, heavy_top
 import dataclasses
+import twoloop
 
 def linkage():
     return four_bar()
@@ -32,6 +33,15 @@ def steep():
 
 def number():
     return 3
+
+def mass(t, q):
+    return [[1.0]]
+
+@twoloop.callback("mass")
+def compiled_mass(t, q, p, M):
+    M[0, 0] = 1.0
+
+length = 2.0
 """
 
 
@@ -100,6 +110,12 @@ def test_solve_compiles_the_equations_when_asked_to(where, capsys, monkeypatch):
     assert capsys.readouterr().out.count("auto: REACHED_END.") == 2
 
 
+def test_solve_takes_a_ready_mechanism_by_name(tmp_path, capsys):
+    main(["solve", "double_pendulum", "--t-end", "0.2", "--out", str(tmp_path / "run.csv")])
+    assert "double pendulum, auto: REACHED_END. Reached the end, t = 0.2" in capsys.readouterr().out
+    assert pd.read_csv(tmp_path / "run.csv", index_col=0).index[-1] == 0.2
+
+
 def test_a_failed_run_ends_with_one(where, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("twoloop.__main__.solve_dae", lambda *words, **options: stopped)
     problem = four_bar()
@@ -111,7 +127,16 @@ def test_a_failed_run_ends_with_one(where, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["solve", "mine.py"], "give FILE.py:FUNCTION, such as crane.py:crane; given mine.py"),
+        (["solve", "mine.py"], "give FILE.py:FUNCTION, such as crane.py:crane, or a ready mechanism"),
+        (["solve", "mine.py"], "such as four_bar; given mine.py"),
+        (["solve", "fuor_bar"], "there is no mechanism fuor_bar among ancf_beam, andrews, bricard, "),
+        (["solve", "Problem"], "there is no mechanism Problem among"),
+        (["solve", "ancf_beam"], "ancf_beam must be a function without arguments that returns a twoloop.mechanisms.P"),
+        (["solve", "{mine}:mass"], "mass must be a function without arguments that returns a twoloop.mechanisms.Prob"),
+        (["solve", "{mine}:mass"], "it takes t, q. If the problem needs these, write a function that calls it"),
+        (["solve", "{mine}:compiled_mass"], "it takes t, q, p, M."),
+        (["solve", "{mine}:length"], "has no function length; length is of type float"),
+        (["solve", "{mine}:lonkage"], "functions without arguments are linkage, bare, steep, number"),
         (["solve", "nothing.py:linkage"], "there is no file"),
         (["solve", "{mine}:lonkage"], "has no function lonkage"),
         (["solve", "{mine}:number"], "must return a twoloop.mechanisms.Problem; it returned int"),

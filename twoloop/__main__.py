@@ -1,4 +1,4 @@
-"""python -m twoloop: what is installed, compile everything, solve a mechanism from a file."""
+"""python -m twoloop: what is installed, compile everything, solve a ready mechanism or one from a file."""
 
 import argparse
 import os
@@ -60,7 +60,7 @@ def compile_all() -> None:
 
 
 def solve(given: argparse.Namespace) -> None:
-    """Solve a problem of a file, say how the run ended, and write what was asked for.
+    """Solve a problem, say how the run ended, and write what was asked for.
 
     Raises
     ------
@@ -120,7 +120,12 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("info", help="versions, where compiled code is kept, threads")
     commands.add_parser("compile", help="compile all kernels now: the first run then starts at once")
     one = commands.add_parser("solve", help="solve a mechanism and write tables, figures, animations")
-    one.add_argument("where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem")
+    one.add_argument(
+        "where",
+        metavar="MECHANISM",
+        help="FILE.py:FUNCTION, a function without arguments that returns a twoloop.mechanisms.Problem, or the name of "
+        "a ready mechanism, such as four_bar",
+    )
     one.add_argument("--method", default="auto", choices=list(PRESETS), metavar="NAME", help=", ".join(PRESETS))
     one.add_argument("--rtol", type=float, default=1e-8, help="default: 1e-8")
     one.add_argument("--atol", type=float, default=1e-8, help="default: 1e-8")

@@ -122,7 +122,7 @@ def solve_dae(
         states of every run, outside the time that `stats.cpu_time` counts.
     compiled : bool
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
-        "DOP853" and "Adams": two to eight times as fast, after 0.1 to 0.5 s (spatial mechanisms: 1 to 5 s), once for
+        "DOP853" and "Adams": two to eight times as fast, after 0.4 to 7 s, which grow with the mechanism, once for
         the same equations and parameters, as the code is kept on disk. The callbacks must not branch on t, q or v. What
         near a singular position cannot be trusted to this code is computed without.
 

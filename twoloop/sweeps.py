@@ -74,13 +74,13 @@ def sweep(
     Parameters
     ----------
     problem_of : callable
-        problem_of(**parameters) -> Problem, such as a ready mechanism or a function of one's own. A `ValueError` of
-        it, for a geometry that does not assemble, is a row.
+        ``problem_of(**parameters)`` gives a `Problem`, such as a ready mechanism or a function of one's own.
+        A `ValueError` of it, for a geometry that does not assemble, is a row.
     parameters : sequence of mappings
         One for each run, all with the same names. Values are numbers, strings, or True and False, under one name of
         one kind.
     measure : callable
-        measure(problem, result) -> mapping of further columns, whose values are numbers, strings, True and False or
+        ``measure(problem, result)`` gives a mapping of further columns, whose values are numbers, strings, True and False or
         None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN unless
         the problem says that its energy is an invariant (`conserved`).
     workers : int, optional
@@ -104,7 +104,7 @@ def sweep(
     **options
         Of `solve_dae`: method, rtol, t_eval, events, time_limit, ... With check_derivatives=False, once the derivatives
         are known to be right, runs of some milliseconds take about two thirds of the time. compiled=True compiles
-        anew for other parameters, some 0.1 s, which pays for long runs only.
+        anew for other parameters, half a second or more, which pays for long runs only.
 
     Returns
     -------

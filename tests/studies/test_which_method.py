@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from studies.which_method import page
+from studies.which_method import call, page, table, takes
 
 SOLVER = {"family": "two-loop", "right": 9, "wrong": 0, "said so": 1, "ratio": 0.1}
 VALIDATION = {"n": 4, "tight": 1e-10, "decades": 2}
@@ -51,3 +51,31 @@ def test_sentences_follow_the_findings(text_of, changed, said, unsaid):
     text = text_of([SOLVER | {"solver": "Gauss12"} | changed])
     assert said in text and unsaid not in text
     assert "traps" not in text
+
+
+@pytest.mark.parametrize(
+    ("solver", "asked"),
+    [
+        ("auto", "`auto`"),
+        ("auto, compiled", "`compiled=True`"),
+        ("DOP853 (two-loop)", '`method="DOP853"`'),
+        ("Taylor, compiled", '`method="Taylor", compiled=True`'),
+        ("DOP853, projected", "`DOP853, projected`"),  # SciPy's
+        ("heyoka", "`heyoka`"),
+    ],
+)
+def test_a_solver_is_asked_for_as_a_user_does(solver, asked):
+    assert call(solver) == asked
+
+
+def test_the_table_has_a_row_for_each_class_with_the_cheapest():
+    picked = [{"solver": "TRBDF2", "accuracies": ["1e-2", "1e-4"]}, {"solver": "auto, compiled", "accuracies": ["1e-6"]}]
+    entries = [{"class": "stiff", "name": name, "picks": picked} for name in ("a beam", "another")]
+    (row,) = takes(entries)
+    assert row["what"] == "stiff (a beam; another)"
+    assert row["take"] == '`method="TRBDF2"` for errors of 1e-2 and 1e-4; `compiled=True` for errors of 1e-6'
+
+
+def test_both_pages_have_the_same_table(tmp_path):
+    shown = page(tmp_path).partition("## By what the problem needs\n\n")[2]
+    assert table(tmp_path) == shown.replace("](../", "](").replace("](reports", "](generated/reports")
