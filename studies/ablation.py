@@ -17,7 +17,6 @@ from studies.bench import Case, Run, Solver
 from studies.cases import beam, four_bar
 from studies.cli import StudyError
 from studies.metrics import violations
-from studies.render import listed, number
 from studies.study import Series, Study, key
 from twoloop import Result
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
@@ -84,9 +83,8 @@ def runs(quick: bool) -> list[Run]:
                 values = {"tol": along[4:9:2] if quick else along, "h": STEPS[name][7:10] if quick else STEPS[name]}
                 for setting, group in (("tol", "controlled"), ("h", "fixed")):
                     one = solver(variant, tableau, setting)
-                    repeats = (
-                        3 if setting == "tol" and tableau is SUN and not quick else 1
-                    )  # those whose times are drawn
+                    drawn = setting == "tol" and tableau is SUN  # with their times
+                    repeats = 3 if drawn and not quick else 1
                     made += [Run(case, one, float(value), group, repeats) for value in values[setting]]
     return made
 
@@ -162,9 +160,10 @@ def verdict(span: list[float] | None) -> str:
 
 
 def _longest(rows: pd.DataFrame, case: str, variant: str) -> float | None:
+    """The longest fixed step of a run that reaches its end and is in phase there."""
     fixed = rows[(rows["group"] == "fixed") & (rows["case"] == case) & (rows["tableau"] == SUN.name)]
-    reached = fixed[(fixed["solver"] == variant) & (fixed["status"] == "REACHED_END")]["h"]
-    return None if reached.empty else float(reached.max())
+    good = fixed[(fixed["solver"] == variant) & (fixed["status"] == "REACHED_END") & ~fixed["astray"].astype(bool)]["h"]
+    return None if good.empty else float(good.max())
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
