@@ -48,9 +48,9 @@ def _known(problem: Problem, t_end: float) -> ReferenceMotion:
     return ReferenceMotion(motion, float(max(differ, apart, motion.uncertainty(), 1e-13)), source)
 
 
-def case(kind: str, name: str, quick: bool) -> Case:
-    """One of the beams, SOFT or STIFF, over 2 s; quick: 0.1 s."""
-    problem, t_end = MAKE[kind](), T_END_QUICK if quick else T_END
+def case(kind: str, name: str, quick: bool, t_end: float | None = None) -> Case:
+    """One of the beams, SOFT or STIFF, over 2 s; quick: 0.1 s; or over `t_end`."""
+    problem, t_end = MAKE[kind](), t_end or (T_END_QUICK if quick else T_END)
     # the base does work on the beam: its energy is no invariant
     return Case(
         name,
