@@ -15,10 +15,7 @@ from studies.render import TEMPLATES
 from studies.store import Output, plain
 
 FILE = "compare.html"
-SOURCES = {  # study: its columns under the names of the page
-    "work_precision": {},
-    "validation": {"cpu_time": "cpu_s"},
-}
+SOURCES = ("work_precision", "validation")
 MEASURES = {
     "error_q": "largest position error (m, rad)",
     "error_v": "largest velocity error",
@@ -28,7 +25,7 @@ MEASURES = {
     "violation_v": "largest violation of velocities",
 }
 SETTINGS = ("h", "err_out", "tol")
-COSTS = {"cpu_s": "CPU time (s)", "n_evaluations": "evaluations"}
+COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 
 
@@ -41,13 +38,13 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         If there are no rows at all, or a file is damaged.
     """
     parts, stamps = [], {}
-    for name, columns in SOURCES.items():
+    for name in SOURCES:
         path = folder / f"{name}.csv"
         if not path.is_file():
             continue
         try:
             first, rest = path.read_text().split("\n", 1)
-            rows = pd.read_csv(StringIO(rest), low_memory=False).rename(columns=columns)
+            rows = pd.read_csv(StringIO(rest), low_memory=False)
             rows = tables.medians(rows) if "repeat" in rows else rows
             parts.append(rows.assign(mechanism=rows["case"].astype(str), study=name))
         except (ValueError, KeyError) as error:

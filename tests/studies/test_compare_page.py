@@ -26,7 +26,7 @@ RUNS = [  # case, solver, family, called from, tolerance, repetition, CPU, statu
     ("crane", "BDF", "two-loop", "compiled", 1e-9, 0, 1.0, "REACHED_END", "", 5000, 1e-13, 1e-12),
     ("swing", "Adams", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
 ]
-COLUMNS = ["case", "solver", "family", "called_from", "tol", "repeat", "cpu_s", "status", "message"]
+COLUMNS = ["case", "solver", "family", "called_from", "tol", "repeat", "call_s", "status", "message"]
 COLUMNS += ["n_evaluations", "error_q", "energy"]
 DOCUMENT = """
 const elements = {}, listeners = {};
@@ -80,7 +80,7 @@ def test_the_data_are_the_rows(folder):
     place = {name: k for k, name in enumerate(data["columns"])}
     assert len(data["runs"]) == 6  # of the three repetitions the median
     first = data["runs"][0]
-    assert [first[place[name]] for name in ("setting", "cpu_s", "error_q", "energy")] == ["tol 1e-4", 0.02, 1e-4, 1e-5]
+    assert [first[place[name]] for name in ("setting", "call_s", "error_q", "energy")] == ["tol 1e-4", 0.02, 1e-4, 1e-5]
     assert data["runs"][3][place["said"]] == "TIME_LIMIT: Stopped"
     assert data["runs"][3][place["error_q"]] is None
 
