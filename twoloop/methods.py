@@ -155,7 +155,14 @@ class RungeKutta:
         if self.outer == "paper":
             step = kernels.paper_step
             return replace(
-                plan, step=step, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0, lands=True, rough=1.0
+                plan,
+                step=step,
+                factor_min=0.5,
+                limit_start=1.0,
+                limit_factor=1.0,
+                limit_memory=0,
+                lands=True,
+                rough=1.0,
             )
         plan = replace(plan, predictive=True, symmetric=self.partition == "symmetric", parts=self._parts())
         if self.variables == "momenta":
