@@ -155,7 +155,14 @@ class RungeKutta:
         if self.outer == "paper":
             step = kernels.paper_step
             return replace(
-                plan, step=step, factor_min=0.5, limit_start=1.0, limit_factor=1.0, limit_memory=0, lands=True
+                plan,
+                step=step,
+                factor_min=0.5,
+                limit_start=1.0,
+                limit_factor=1.0,
+                limit_memory=0,
+                lands=True,
+                rough=1.0,
             )
         plan = replace(plan, predictive=True, symmetric=self.partition == "symmetric", parts=self._parts())
         if self.variables == "momenta":
@@ -298,6 +305,8 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     - "Once in a time step or several time steps": the partition is looked at after every step, and chosen anew when
       max|C_qd^-1 C_qi| has grown to three times what it was, or when a step failed in the inner loop.
     - Steps are shortened to end at output times and at the end of the run.
+    - A step is refused as well where the force jumps between its start and the first stage: the step and its halves
+      do not see that, and were off by 1e5 tolerances.
 
     Parameters
     ----------

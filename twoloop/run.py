@@ -49,6 +49,8 @@ CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go o
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
+NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
@@ -515,7 +517,8 @@ class Run:
         failure = int(self.clock[a.FAILURE_CODE])
         if code == a.ALL_OUTPUT_DONE:
             fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
-            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{self._said_of_events()}"
+            said = self._said_of_events() + self._said_of_end()
+            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
         if code == INTERRUPTED:
             return Status.INTERRUPTED, ""
         if code == a.MAX_STEPS_REACHED:
@@ -556,7 +559,7 @@ class Run:
                 Status.RANK_LOST,
                 f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
                 "coordinates exists at this singular position, and no step led across: end t_span before, take another "
-                "method, or change the geometry.",
+                f"method, or change the geometry.{self._end_is_near(t1)}",
             )
         if failure == common.GAMMA_INACCURATE:
             reached, required = self.work.notes[common.GAMMA_ACCURACY], self.work.notes[common.GAMMA_REQUIRED]
@@ -575,7 +578,7 @@ class Run:
         return (
             Status.STEP_TOO_SMALL,
             f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-            f"{self._near_singular()}{self._near_massless()}Look for a discontinuity near this time, loosen rtol and "
+            f"{self._near_singular(t1)}{self._near_massless()}Look for a discontinuity near this time, loosen rtol and "
             "atol, or use coordinates of similar scale.",
         )
 
@@ -589,7 +592,29 @@ class Run:
             "they are independent but for the start: start from another position, or correct the constraints."
         )
 
-    def _near_singular(self) -> str:
+    def _said_of_end(self) -> str:
+        """A warning, and the sentence, where the run ends with constraints that have lost rank."""
+        if not self.crossings and not (self.plan.watchful and self.work.notes[common.NEARLY_SINGULAR] == 1.0):
+            return ""
+        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
+        if ratio > LOST_AT_END:
+            return ""
+        said = (
+            f"the run ends where the constraints lose rank (the smallest singular value of the constraint Jacobian is "
+            f"{ratio:.1g} of the largest): they do not determine velocities and accelerations there. End t_span a "
+            "little before, or beyond"
+        )
+        warnings.warn(said, ConstraintWarning, stacklevel=4)
+        return f" {said[0].upper()}{said[1:]}."
+
+    def _end_is_near(self, t1: float) -> str:
+        """A sentence where the end of the run is what was not reached, else nothing."""
+        left = t1 - float(self.clock[self.a.T])
+        if left > NEXT_TO_END * (t1 - self.t0):
+            return ""
+        return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
+
+    def _near_singular(self, t1: float) -> str:
         """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
         ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
         if ratio > NEARLY_SINGULAR:
@@ -597,7 +622,7 @@ class Run:
         return (
             f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
             f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
-            "method, or change the geometry. "
+            f"method, or change the geometry.{self._end_is_near(t1)} "
         )
 
     def _near_massless(self) -> str:

@@ -39,6 +39,7 @@ MAX_ITERATIONS = 60
 MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
 GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
 SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
+SUDDEN = 10.0  # what that has to be in the paper's procedure, which has no such estimate, before it counts
 PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
 # places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
@@ -349,6 +350,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     A_stage = _block(memory, s, n, TRIAL)
+    A_full = _block(memory, s, n, HALF)
     Q_stage = _block(memory, s, n, Q_STAGE)
     V_stage = _block(memory, s, n, V_STAGE)
     q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
@@ -361,6 +363,8 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if tolerances[ESTIMATE] == 1.0:
         copy(q1, q_full)
         copy(v1, v_full)
+        for j in range(s):
+            copy(A_stage[j], A_full[j])
         g = 0.5 * h
         code = iterate_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
         if code == DONE:
@@ -376,4 +380,8 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code != DONE:
             return code, np.inf
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    if code == DONE and tolerances[ESTIMATE] == 1.0:
+        beside = SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, A_full)
+        if beside > SUDDEN:
+            error = max(error, beside)
     return code, error
