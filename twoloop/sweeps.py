@@ -80,9 +80,9 @@ def sweep(
         One for each run, all with the same names. Values are numbers, strings, or True and False, under one name of
         one kind.
     measure : callable
-        ``measure(problem, result)`` gives a mapping of further columns, whose values are numbers, strings, True and False or
-        None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN unless
-        the problem says that its energy is an invariant (`conserved`).
+        ``measure(problem, result)`` gives a mapping of further columns, whose values are numbers, strings, True and
+        False or None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN
+        unless the problem says that its energy is an invariant (`conserved`).
     workers : int, optional
         Processes or threads. None: one for each core.
     parallel : {"processes", "threads"}
