@@ -79,5 +79,5 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
 
 
 def test_both_pages_have_the_same_table(tmp_path):
-    shown = page(tmp_path).partition("## By what the problem needs\n\n")[2]
+    shown = page(tmp_path).partition("## In short\n\n")[2]
     assert table(tmp_path) == shown.replace("](../", "](").replace("](reports", "](generated/reports")
