@@ -8,6 +8,7 @@ C_q a = Q_d, is then eliminated symbolically, without what is zero by its struct
 import builtins
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
@@ -24,7 +25,9 @@ from twoloop.traced_values import Traced
 from twoloop.tracing import Graph, Untraceable
 
 Array = NDArray[np.float64]
-Functions = Mapping[str, Callable[[Any], Any]]  # "sin", "cos", "sqrt" of the package
+Functions = Mapping[str, Callable[[Any], Any]]  # those of FUNCTIONS that the package has, by name
+
+FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "sinh", "cosh", "tanh", "asin", "acos", "atan")
 
 SAMPLES = 4  # states, displaced from the start, at which an entry that is zero is zero by its structure
 DISPLACED = 0.3
@@ -93,7 +96,7 @@ class Expressions:
     def equations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> SimpleNamespace:
         """M, Q, C, C_q, C_t and Q_d as arrays of expressions; what is zero is the number 0.0."""
         f, n, m = self.system.functions, self.system.n_q, self.system.n_c
-        p, positions, velocities = [float(value) for value in f.p], _objects(q), _objects(v)
+        p, positions, velocities = _objects(f.p.tolist()), _objects(q), _objects(v)
         made = SimpleNamespace()
         for name, shape, state in _kinds(n, m, positions, velocities):
             out = np.full(shape, 0.0, dtype=object)
@@ -103,7 +106,7 @@ class Expressions:
                 except Exception as error:  # each package has its own for what it cannot do
                     raise NotSymbolic(
                         f"{name} of {self.system.name!r} does not run on symbols; it must not branch on t, q or v, nor "
-                        f"call but sin, cos, sqrt and hypot on them: {error}"
+                        f"call but hypot and {', '.join(functions)} on them: {error}"
                     ) from error
             setattr(made, name, out)
         return made
@@ -129,6 +132,11 @@ class Expressions:
                 if self.jacobian_pattern[k, i]:
                     right[i] = right[i] + Cq[k, i] * gamma[k]
         return _solved(matrix, [*right, *gamma], self.order)[:n]
+
+
+def functions_of(package: Any) -> dict[str, Callable[[Any], Any]]:
+    """Those of FUNCTIONS that a package has under these names."""
+    return {name: getattr(package, name) for name in FUNCTIONS if hasattr(package, name)}
 
 
 def _kinds(n: int, m: int, q: Any, v: Any) -> list[tuple[str, tuple[int, ...], tuple[Any, ...]]]:
@@ -260,7 +268,8 @@ class _Mathematics:
     def __getattr__(self, name: str) -> Any:
         if name == "hypot":
             return lambda x, y: self.sqrt(x * x + y * y)
-        if name not in self._functions:
+        plain = re.sub("^arc", "a", name)  # as numpy has arctan for atan
+        if plain not in self._functions:
             return getattr(self._module, name)
-        known, own = getattr(math, name), self._functions[name]
+        known, own = getattr(math, plain), self._functions[plain]
         return lambda x: known(x) if isinstance(x, float | int) else own(x)

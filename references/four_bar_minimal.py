@@ -11,6 +11,7 @@ With th' = N u and the kinetic energy m(th) u^2 / 2, the motion is one scalar eq
 
 import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -190,7 +191,13 @@ class MinimalFourBar:
 
 def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:
     """States of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
-    return MinimalFourBar.from_parameters(parameters).states(times)
+    return _linkage(tuple(sorted(parameters.items()))).states(times)
+
+
+@lru_cache(maxsize=64)
+def _linkage(parameters: tuple[tuple[str, Any], ...]) -> MinimalFourBar:
+    """Integrate the motion once for all times that are asked of it."""
+    return MinimalFourBar.from_parameters(dict(parameters))
 
 
 def _counted(rate: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:

@@ -4,6 +4,7 @@ The equations come from `references.expressions`: every loop unrolled, every zer
 That is the fastest right-hand side that a foreign solver driven from compiled code can be given here.
 """
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from references.expressions import Expressions
+from references.expressions import FUNCTIONS, Expressions, functions_of
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -39,7 +40,7 @@ class Program:
 
     def functions(self) -> dict[str, Callable[["Value"], "Value"]]:
         """The functions that `Expressions` asks for."""
-        return {name: lambda x, name=name: self.value(name, x.name) for name in ("sin", "cos", "sqrt")}  # type: ignore[misc]
+        return {name: lambda x, name=name: self.value(name, x.name) for name in FUNCTIONS}  # type: ignore[misc]
 
 
 class Value:
@@ -90,9 +91,10 @@ class Value:
         return self._with("-", 0.0, True)
 
     def __pow__(self, exponent: int) -> Any:
-        if exponent != 2:
-            raise TypeError(f"expressions of straight-line code have squares alone; given the power {exponent!r}")
-        return self * self
+        if exponent != int(exponent) or exponent < 1:
+            raise TypeError(f"expressions of straight-line code have powers 1, 2, 3, ... alone; given {exponent!r}")
+        half = self ** (int(exponent) // 2) if exponent > 1 else 1.0
+        return half * half * self if exponent % 2 else half * half
 
 
 def program_of(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Program, list[str]]:
@@ -114,7 +116,7 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Cal
     program, names = program_of(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
     lines = [f"q{i} = y[{i}]" for i in range(n)] + [f"v{i} = y[{n + i}]" for i in range(n)] + program.lines
     lines += [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
-    scope: dict[str, Any] = {"sin": np.sin, "cos": np.cos, "sqrt": np.sqrt}
+    scope: dict[str, Any] = functions_of(math)
     text = "\n    ".join(["def derivative(t, y, rate):", *lines])
     exec(compile(text, f"<straight-line code of {system.name}>", "exec"), scope)
     return njit(**_OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]

@@ -26,13 +26,14 @@ from studies.render import render, table
 from studies.sharp_forces import T_END
 from studies.store import Output, Row
 from studies.traps import AGREE as TRUE_TO
-from studies.traps import FORCE, MISTAKE, Trap, traps
+from studies.traps import FORCE, INPUT, MISTAKE, Trap, traps
 from twoloop import ConstrainedSystem, Result, solve_dae
 
 Array = NDArray[np.float64]
 
 OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA_C, CVODE_C, HEYOKA = "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
+COMPILED_ONLY = (IDA_C, CVODE_C, HEYOKA)
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
     *("auto, compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14", "Gauss16", "SunRadau5"),
@@ -99,7 +100,7 @@ def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     ours = (*OWN, *(OF_FORCES if group == FORCE else ()))
     made: dict[str, Call] = {f"{name} (two-loop)": partial(own, name) for name in (QUICK_OWN if quick else ours)}
     made |= {} if quick else {"IDA, stabilised": ida, IDA_C: ida_c}
-    made |= {CVODE_C: cvode_c, HEYOKA: heyoka} if group == FORCE and not quick else {}
+    made |= {} if quick else {CVODE_C: cvode_c, HEYOKA: heyoka}
     return made | {f"{name}, index 1": partial(scipy, name) for name in (QUICK_SCIPY if quick else SCIPY)}
 
 
@@ -225,7 +226,7 @@ def why_not(name: str, trap: Trap) -> str:
         return "its adapter takes no steps"
     if name == HEYOKA and find_spec("heyoka") is None:
         return "heyoka is not installed"
-    return "it takes compiled functions only" if name == IDA_C and trap.system.called_in_python else ""
+    return "it takes compiled functions only" if name in COMPILED_ONLY and trap.system.called_in_python else ""
 
 
 def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
@@ -270,8 +271,9 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     if "message" in all_rows:
         refused = all_rows["message"].astype(str).str.startswith("NotSymbolic")
         all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
-    rows, forces = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE))
-    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(all_rows)}
+    rows, forces, inputs = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT))
+    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(pd.concat([rows, forces]))}
+    found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO}
 
 
@@ -339,18 +341,23 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     return found
 
 
+def outcomes(found: dict[str, Any], without: set[str]) -> str:
+    """A line for each trap, a column for each solver."""
+    short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
+    lines = [
+        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in found["solvers"])]
+        for each in found["cells"]
+        if each["trap"] not in without
+    ]
+    return table(["trap", *short], lines)
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings and report."""
     found = findings_of(rows)
     output.save_findings(found)
     alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
-    cells = [
-        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in found["solvers"])]
-        for each in found["cells"]
-        if each["trap"] not in alike
-    ]
-    short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
-    ready = {"cells": table(["trap", *short], cells)}
+    ready = {"cells": outcomes(found, alike), "input": outcomes(found["input"], set())}
     of_force = (SILENT, SAID, RIGHT)
     ready["forces"] = table(
         ["force", *(f"{whose}: silent / said / right" for whose in ("ours", "others"))],

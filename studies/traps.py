@@ -25,7 +25,8 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 Array = NDArray[np.float64]
 
 NEVER = 1e30  # s
-MISTAKE, FORCE = "mistake", "force"  # what a trap is made of: a model or a setting, or a force that is sharp
+# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp
+INPUT, MISTAKE, FORCE = "input", "mistake", "force"
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 13  # of the numbers of the forces
 FORCES = (  # families of `sharp_forces`
@@ -161,7 +162,7 @@ class Trap:
     positions : callable or None
         positions(t) -> q, where they are known.
     group : str
-        MISTAKE or FORCE.
+        INPUT, MISTAKE or FORCE.
     tolerance, time_limit : float
     steps : mapping
         `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
@@ -238,13 +239,13 @@ def of_chain(n: int) -> list[Trap]:
     push, pulse = system(BEGIN=0.7, END=NEVER, PUSH=20.0), system(BEGIN=1.0, END=1.001, PUSH=1e3)
     spring, heavy = system(SPRING=1e7, REST=q0[-2]), system(LAST=1e10)
     return [
-        trap("inconsistent positions", system(), None, q0=q0 + across / 10.0),
-        trap("inconsistent velocities", system(), None, v0=across),
+        trap("inconsistent positions", system(), None, q0=q0 + across / 10.0, group=INPUT),
+        trap("inconsistent velocities", system(), None, v0=across, group=INPUT),
         trap("NaN in the force after 1 s", system(NAN=1.0), None),
         trap("exception in a callback after 1 s", system(RAISES=1.0), None),
         trap("exception in a Python callback after 1 s", python_copy(system(), force=fails), None),
         trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=misshapes), None),
-        trap("one wrong entry of C_q", system(WRONG=1e-3), system()),
+        trap("one wrong entry of C_q", system(WRONG=1e-3), system(), group=INPUT),
         trap("force that jumps", push, push, breaks=(0.7,)),
         trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001), unnoticed=system()),
         trap("pulse of 1 ms, max_step half of it", pulse, pulse, breaks=(1.0, 1.001), steps={"max_step": 5e-4}),

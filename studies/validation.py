@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from studies import deceived, figures, study
 from studies.bench import Run, warm_up
-from studies.end_states import DECADES, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
+from studies.end_states import DECADES, EXACT, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
 from studies.render import number, percent, power, render, table
-from studies.solvers import ADAMS, CATALOGUE, DEFAULT, EXUDYN, IDA_C, OWN_BDF, OWN_EXPLICIT, TAYLOR
+from studies.solvers import ADAMS, CATALOGUE, CVODE_C, DEFAULT, EXUDYN, HEYOKA, IDA_C, OWN_BDF, OWN_EXPLICIT, TAYLOR
 from studies.store import Output
 from twoloop import mechanisms
 from twoloop.mechanisms import Problem
@@ -45,7 +45,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
 )
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
-OTHERS = (IDA_C, "LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1")
+OTHERS = (IDA_C, HEYOKA, CVODE_C, "IDAS, CasADi", "LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1")
 QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 QUICK_TOLERANCES = (1e-6, 1e-10)
@@ -64,6 +64,7 @@ REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (DEFAULT, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
+OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
 SHORT = {
     "RANK_LOST": "rank",
     "TIME_LIMIT": "time",
@@ -116,7 +117,7 @@ def make(output: Output) -> pd.DataFrame:
                     warm.add(what)
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore")
-                        warm_up(run, 0, COMPILING)
+                        warm_up(run, 0, set(), COMPILING)
                 kept.add(run.key(0), deceived.row_of(run) if run.group == deceived.DECEIVED else row_of(run))
         return pd.DataFrame([kept[run.key(0)] for run in todo])
 
@@ -133,7 +134,7 @@ def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
     """What the table says of a solver over all problems."""
     tight = own[own["tol"] == TIGHT]
     found: dict[str, Any] = {"solver": name, "family": str(own["family"].iloc[0])}
-    found |= {what: int((own["outcome"] == what).sum()) for what in ("right", "wrong", "said so", "not run")}
+    found |= {what: int((own["outcome"] == what).sum()) for what in OUTCOMES}
     slopes = [p for _, each in own.groupby("case", sort=False) if (p := slope(each)) is not None]
     found["slope"] = [float(x) for x in np.percentile(slopes, [25, 50, 75])] if slopes else None
     ratios = (own["error_q"] / own["tol"])[own["error_q"].notna()].astype(float)
@@ -269,6 +270,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found["judged"].append(line | {"passed": list(dict.fromkeys(passed))})
     ours = [line for line in found["wrong"] if line["family"] == "two-loop"]
     found["ours_wrong_tight"] = [line for line in ours if line["tol"] == TIGHT]
+    inexact = rows[rows["outcome"] == "inexact"]["family"] == "two-loop"
+    found["n_inexact"] = {"ours": int(inexact.sum()), "others": int((~inexact).sum())}
+    found["exact"] = EXACT
     found["n_wrong"] = {"ours": len(ours), "others": len(found["wrong"]) - len(ours)}
     return found | {"time_limit": TIME_LIMIT}
 
@@ -303,12 +307,12 @@ def picture(rows: pd.DataFrame) -> Figure:
 def lines(found: Sequence[dict[str, Any]], steps: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
     """Of the table of solvers, by their runs and by their steps."""
     stepped = {line["solver"]: percent(line["deceived"]) for line in steps if line["n"]}
-    keys = ("right", "wrong", "said so", "ratio", "digits_q", "digits_v", "digits_lam")
+    keys = ("right", "inexact", "wrong", "said so", "ratio", "digits_q", "digits_v", "digits_lam")
     for line in found:
         yield [line["solver"], *(line[key] for key in keys), stepped.get(line["solver"], "–")]
 
 
-HEADER = ("solver", "right", "wrong", "said so", "error/tol", "q", "v", "λ", "deceived")
+HEADER = ("solver", "right", "inexact", "wrong", "said so", "error/tol", "q", "v", "λ", "deceived")
 
 
 def _of_exudyn(line: dict[str, Any] | None) -> str:

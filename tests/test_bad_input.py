@@ -258,7 +258,7 @@ def test_what_cannot_be_compiled_says_which_function_and_why():
 
 @pytest.mark.parametrize(
     ("kind", "function"),
-    [("jacobian", lambda t, q: q), ("force", lambda t, q, v: np.zeros(3))],
+    [pytest.param("jacobian", lambda t, q: q, marks=pytest.mark.slow), ("force", lambda t, q, v: np.zeros(3))],
     ids=["jacobian", "force"],
 )
 def test_compiled_functions_of_the_wrong_shape(kind, function):

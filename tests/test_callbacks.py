@@ -40,7 +40,7 @@ print(solve_dae(system, (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0]).success)
 """
 
 
-@pytest.mark.parametrize("how", ["-c", "stdin"])
+@pytest.mark.parametrize("how", [pytest.param("-c", marks=pytest.mark.slow), "stdin"])
 def test_callbacks_may_be_typed_at_a_prompt(how):
     command, given = ([sys.executable, "-c", SOURCE], None) if how == "-c" else ([sys.executable, "-"], SOURCE)
     done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=300)

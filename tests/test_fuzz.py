@@ -162,14 +162,14 @@ def try_one(call, name, value):
 @pytest.mark.parametrize(("call", "name"), ARGUMENTS)
 def test_a_result_or_an_error_that_names_the_argument(call, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where files are written
-    for sort in SORTS.values():
 
-        @settings(max_examples=2, database=None)
-        @given(sort)
-        def each(value):
+    @settings(max_examples=2, database=None)
+    @given(st.tuples(*SORTS.values()))
+    def each(values):
+        for value in values:
             try_one(call, name, value)
 
-        each()
+    each()
 
 
 def test_there_are_many_kinds():

@@ -41,7 +41,7 @@ def start(system, speed):
 @pytest.mark.parametrize("speed", [1.0, 10.0, 1e3, 4e3, 2.0 * np.pi * 16e3])
 def test_a_fast_drive(speed, method):
     exact, differenced = shaken_pendulum(speed), shaken_pendulum(speed, gamma=False)
-    span = (0.0, 30.0 / speed)
+    span = (0.0, min(3.0, 30.0 / speed))
     q0, v0 = start(exact, speed)
     given = solve_dae(exact, span, q0, v0, method, 1e-8, 1e-8)
     run = solve_dae(differenced, span, q0, v0, method, 1e-8, 1e-8, t_eval=[span[1]])

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from twoloop.checks import check_choice
-from twoloop.plan import INNER_TOL, LARGEST_MOVE, Plan, check_tolerances, least_tolerance
+from twoloop.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_tolerances, least_tolerance
 from twoloop.stage_code import compiled_stages
 from twoloop.straight_code import OwnCode
 from twoloop.system import ConstrainedSystem
@@ -100,6 +100,7 @@ class DOP853:
             predictive=free,
             watchful=free,
             least_error=LEAST_ERROR,
+            rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,
             compilable=free,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),

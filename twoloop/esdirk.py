@@ -39,6 +39,9 @@ def _esdirk4() -> tuple[Array, Array]:
 
 
 FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # and their orders
+# `rough` of their plans: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, and if a force jumps in
+# the first half of a step, the estimate is 1/300 of the error
+ROUGH = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
 
 
 @dataclass(frozen=True)
@@ -119,4 +122,5 @@ class ESDIRK:
             exponent=exponent,
             safety=SAFETY,
             predictive=True,
+            rough=ROUGH[self.formula],
         )

@@ -11,7 +11,7 @@ from twoloop.bdf import BDF
 from twoloop.checks import check_choice, check_number, check_positive, shown
 from twoloop.dop853 import DOP853
 from twoloop.esdirk import ESDIRK
-from twoloop.plan import INNER_TOL, Method, Plan, check_tolerances, outer_tolerance
+from twoloop.plan import INNER_TOL, ROUGH, Method, Plan, check_tolerances, outer_tolerance
 from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 from twoloop.taylor import Taylor
 
@@ -151,7 +151,7 @@ class RungeKutta:
             tableau.order - 1.0,
         )
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
-        plan = Plan(kernels.runge_kutta_step, options, memory, 1.0 / (tableau.order + 1))
+        plan = Plan(kernels.runge_kutta_step, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
         if self.outer == "paper":
             step = kernels.paper_step
             return replace(

@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 # Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
+ROUGH = 10.0  # `rough` of a Plan, as measured for most methods
 LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
@@ -38,6 +39,7 @@ class Plan:
     symmetric: bool = False
     predictive: bool = False
     least_error: float = LEAST_ERROR
+    rough: float = 1.0  # how many times less than its error the estimate of a step may be where a force jumps
     reuse: float = 0.0  # correction of a position up to which the Jacobian before it serves, within a step
     watchful: bool = False  # whether short steps are a reason to look how near a singular position is
     lands: bool = False  # whether steps are shortened to end at output times

@@ -102,6 +102,7 @@ class Remaker:
         clock = run.clock
         clock[:] = 0.0
         clock[a.JUMP_FROM] = clock[a.JUMP_TO] = np.inf
+        clock[a.ROUGH_TO] = -np.inf
         clock[a.T] = clock[a.T_START] = t0
         clock[a.H_LIMIT] = run.plan.limit_start
         clock[a.H_NEXT] = self.next_step if self.next_step < np.inf else FIRST_TRY * (t1 - t0)

@@ -106,6 +106,7 @@ class Run:
         self._control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
+        self.clock[advance.ROUGH_TO] = -np.inf
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self._begin()
@@ -121,6 +122,7 @@ class Run:
         )
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
+        control[a.ROUGH] = plan.rough
         control[a.GIVES_WAY] = plan.substitute is not None
         control[a.PROVISIONAL] = PROVISIONAL if plan.provisional else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -148,10 +149,15 @@ def known(motion, end):
 
 
 def integrate(rate, start, end):
-    """The solution of y' = rate(t, y) as a function of t, by scipy at a tolerance of 1e-13."""
-    solution = solve_ivp(rate, (0.0, end), start, max_step=min(0.02, end / 100.0), **TIGHT)
-    assert solution.success, solution.message
-    return solution.sol
+    """The solution of y' = rate(t, y) as a function of t, by scipy at a tolerance of 1e-13, once it is asked for."""
+
+    @cache
+    def solution():
+        solved = solve_ivp(rate, (0.0, end), start, max_step=min(0.02, end / 100.0), **TIGHT)
+        assert solved.success, solved.message
+        return solved.sol
+
+    return lambda t: solution()(t)
 
 
 def one_coordinate(kinematics, mass, force, start, end):

@@ -9,7 +9,7 @@ from tests.general.runs import relative_error, run
 
 METHODS = ("Gauss12", "DOP853", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
-CONSERVATIVE = [name for name in REGULAR if mechanism.__wrapped__(name).energy is not None]
+CONSERVATIVE = [name for name in REGULAR if mechanism(name).energy is not None]
 both = pytest.mark.parametrize("method", METHODS)
 
 

@@ -66,7 +66,7 @@ def _check_derivatives(m, t, q, v):
     assert -bend == pytest.approx(gamma, rel=1e-7, abs=1e-7)
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if mechanism.__wrapped__(name).energy is not None])
+@pytest.mark.parametrize("name", [name for name in ALL if mechanism(name).energy is not None])
 def test_energy_of_the_known_motion(name):
     m = mechanism(name)
     energies = [m.energy(*m.state(t)) for t in times(m)]

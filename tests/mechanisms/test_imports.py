@@ -12,21 +12,26 @@ from twoloop import mechanisms
 ROOT = Path(__file__).parents[2]
 
 
-def imported(statement):
-    """Modules of mechanisms after a statement in a new process."""
-    source = f"import sys; {statement}; print(*(m for m in sys.modules if m.startswith('twoloop.mechanisms.')))"
+def imported(*statements):
+    """Modules of mechanisms after each of the statements in a new process."""
+    told = "print(*(m for m in sys.modules if m.startswith('twoloop.mechanisms.')))"
+    source = "\n".join(["import sys", *(f"{statement}; {told}" for statement in statements)])
     done = subprocess.run([sys.executable, "-c", source], cwd=ROOT, capture_output=True, text=True, check=True)
-    return {name.removeprefix("twoloop.mechanisms.") for name in done.stdout.split()}
+    lines = done.stdout.removesuffix("\n").split("\n")
+    return [{name.removeprefix("twoloop.mechanisms.") for name in line.split()} for line in lines]
 
 
-def test_a_mechanism_imports_no_other():
-    assert imported("import twoloop.mechanisms") == set()
-    assert imported("from twoloop.mechanisms import four_bar") == {"four_bar", "points", "problem", "rotation"}
+def test_a_mechanism_imports_no_other_and_its_name_is_a_function_also_after_an_import_of_the_module():
+    none, one, other = imported(
+        "import twoloop.mechanisms",
+        "from twoloop.mechanisms import four_bar",
+        "import twoloop.mechanisms.heavy_top; from twoloop.mechanisms import heavy_top; assert callable(heavy_top)",
+    )
+    assert none == set() and one == {"four_bar", "points", "problem", "rotation"}
+    assert {"four_bar", "heavy_top"} <= other and "andrews" not in other
 
 
-def test_names_are_functions_also_after_an_import_of_the_module():
-    source = "import twoloop.mechanisms.four_bar; from twoloop.mechanisms import four_bar; assert callable(four_bar)"
-    assert "andrews" not in imported(source)
+def test_names_are_functions():
     assert not [name for name in mechanisms.__all__ if isinstance(getattr(mechanisms, name), ModuleType)]
     assert set(mechanisms.__all__) <= set(dir(mechanisms))
 

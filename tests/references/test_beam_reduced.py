@@ -17,7 +17,7 @@ def problem():
     return very_flexible_beam()
 
 
-@pytest.mark.parametrize("solver", ["RK45", "LSODA"])
+@pytest.mark.parametrize("solver", [pytest.param("RK45", marks=pytest.mark.slow), "LSODA"])
 def test_solvers_agree(problem, solver):
     expected, got = (reduced_motion(problem, TIMES, 1e-10, name) for name in ("DOP853", solver))
     assert np.abs(got[0] - expected[0]).max() < 1e-8

@@ -22,7 +22,8 @@ PROBLEM = four_bar()
 # largest error of q at 1001 instants over 10 s: three times the largest of 15 runs that differ in rounding
 BOUNDS = {1e-5: 5.4e-2, 1e-7: 1.3e-3, 1e-9: 2.4e-5, 1e-11: 3e-7}
 SCALES = {"q": 1.0, "v": 10.0, "a": 250.0, "lam": 250.0}  # errors against those of q, about
-GOOD, NAN, RAISES, SPRING = range(4)  # what the force of the pendulum below does (2 of them after t = 1): its parameter
+# what the functions of the pendulum below do, most of it after t = 1: its parameter; the last three are NaN like NAN
+GOOD, NAN, RAISES, SPRING, MASS, CONSTRAINT, JACOBIAN = range(7)
 
 
 def run(t_end, tolerance, **options):
@@ -36,7 +37,7 @@ def run(t_end, tolerance, **options):
 def mass(t, q, p, M):
     M[0, 0] = 1.0 + 0.1 * q[1] ** 2
     M[0, 1] = M[1, 0] = 0.2
-    M[1, 1] = 1.0
+    M[1, 1] = np.nan if t > 1.0 and p[0] == 4.0 else 1.0
 
 
 @callback("force")
@@ -60,12 +61,14 @@ def spring_tangent(t, q, v, p, K):
 @callback("constraint")
 def constraint(t, q, p, C):
     C[0] = 0.5 * ((q[0] - 0.3 * np.sin(4.0 * t)) ** 2 + q[1] ** 2 - 1.0)
+    if t > 1.0 and p[0] == 5.0:
+        C[0] = np.nan
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
     Cq[0, 0] = q[0] - 0.3 * np.sin(4.0 * t)
-    Cq[0, 1] = q[1]
+    Cq[0, 1] = np.nan if t > 1.0 and p[0] == 6.0 else q[1]
 
 
 @callback("constraint_rate")
@@ -171,8 +174,11 @@ def test_counts_follow_the_tolerance_and_not_the_output():
 # --- failures
 
 
-@pytest.mark.parametrize(("kind", "flag"), [(NAN, "IDA_CONV_FAIL (-4)"), (RAISES, "IDA_RES_FAIL (-8)")])
-def test_a_force_that_fails_comes_back_as_a_row(kind, flag, capfd):
+@pytest.mark.parametrize(
+    ("kind", "flag"),
+    [(RAISES, "IDA_RES_FAIL (-8)"), *((kind, "IDA_CONV_FAIL (-4)") for kind in (NAN, MASS, CONSTRAINT, JACOBIAN))],
+)
+def test_a_function_that_fails_comes_back_as_a_row(kind, flag, capfd):
     system, q0, v0 = pendulum(kind)
     result = solve_ida_c(system, (0.0, 2.0), q0, v0, 1e-6, 1e-6, t_eval=[0.5, 0.9, 1.5, 2.0])
     good = solve_ida_c(*pendulum()[:1], (0.0, 2.0), q0, v0, 1e-6, 1e-6, t_eval=[0.5, 0.9])
@@ -192,17 +198,23 @@ def test_too_many_steps_end_the_run(monkeypatch):
     assert result.t.tolist() == [1e-6]
 
 
-def test_python_functions_are_refused_and_compiled_ones_are_not():
-    functions = {
-        "mass": np.eye(2),
-        "force": lambda t, q, v: np.array([0.0, -9.81]),
-        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-        "jacobian": lambda t, q: q.reshape((1, 2)),
-    }
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions)
+FUNCTIONS = {
+    "mass": np.eye(2),
+    "force": lambda t, q, v: np.array([0.0, -9.81]),
+    "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+    "jacobian": lambda t, q: q.reshape((1, 2)),
+}
+
+
+def test_python_functions_are_refused():
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **FUNCTIONS)
     with pytest.raises(ValueError, match=r"system must have compiled callbacks.*compile=True.*solve_ida"):
         solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, compile=True, **functions)
+
+
+@pytest.mark.slow  # what is compiled is as in the tests above, but by from_python
+def test_functions_that_from_python_compiles_are_taken():
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, compile=True, **FUNCTIONS)
     result = solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
     assert result.success
     assert np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4

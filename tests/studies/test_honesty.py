@@ -9,7 +9,7 @@ import pytest
 
 from studies import honesty
 from studies.render import render
-from studies.traps import FORCE, MISTAKE, forces, of_linkages, traps, under_forces
+from studies.traps import FORCE, INPUT, MISTAKE, forces, of_linkages, traps, under_forces
 from twoloop import solve_dae
 from twoloop.methods import PRESETS
 
@@ -114,7 +114,7 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = dict.fromkeys(("cells", "counts", "forces", "solvers"), "")
+        tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
     assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
@@ -153,7 +153,7 @@ def rows_of_forces(wrong=()):
 
 def told_of_forces(rows):
     found = honesty.findings_of(rows)
-    tables = dict.fromkeys(("cells", "counts", "forces", "solvers"), "")
+    tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
     return found, render("honesty", found, tables, stamp="stamp", quick=False)
 
 
@@ -172,6 +172,14 @@ def test_trust_is_counted_over_mistakes_and_forces():
     assert "gust (BDF, auto, compiled)." in text
     line = found["forces"]["families"][0]
     assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == 1
+
+
+def test_checks_of_the_input_are_counted_apart():
+    line = rows_of_forces().assign(group=INPUT, trap="inconsistent positions", outcome=honesty.SILENT)
+    found, text = told_of_forces(pd.concat([rows_of_forces(), line], ignore_index=True))
+    assert {name: each["wrong"] for name, each in found["trust"].items()} == dict.fromkeys(found["trust"], 0)
+    assert found["n_traps"] == 1 and found["input"]["n_traps"] == 1
+    assert "6 of 6 runs of ours" in text and "2 of 2 of others" in text
 
 
 def test_a_force_has_a_known_end_and_all_presets_are_asked():

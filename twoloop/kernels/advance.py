@@ -80,6 +80,7 @@ FADING = 0.98  # of the longest step, with each accepted one
 KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
+SUDDEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run
@@ -104,8 +105,9 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on ...
     PROVISIONAL,  # ... and after this number of steps, if the next is no longer than steps of others may be
     DRIVEN,  # 1: C_t or b may jump
+    ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see SUDDEN
     N_CONTROL,
-) = range(21)
+) = range(22)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -129,8 +131,9 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_FROM,  # the interval in which C_t or b jumps, where one lies ahead; else infinite
     JUMP_TO,
     LEAPS,  # 1: the next step is that over it, and new_state its end
+    ROUGH_TO,  # where the last step ended that was refused for a sudden error
     N_CLOCK,
-) = range(17)
+) = range(18)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -272,7 +275,9 @@ def advance(
                 code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and not np.isfinite(error):
             code = NOT_FINITE
-        accepted = code == DONE and error <= 1.0
+        # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
+        strict = control[ROUGH] if t < clock[ROUGH_TO] else 1.0
+        accepted = code == DONE and error * strict <= 1.0
         if control[DRIVEN] == 1.0 and not leaps:
             kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
             if kind == JUMP or (kind == RAMP and accepted and not fixed):
@@ -310,8 +315,13 @@ def advance(
                 return RANK_LOST
             continue
         factor = control[FACTOR_MAX]
+        if error > SUDDEN and not accepted:
+            clock[ROUGH_TO] = t + size
+        error *= strict
         if w.notes[STEP_FACTOR] > 0.0:
             factor = w.notes[STEP_FACTOR]
+            if strict > 1.0:
+                factor = max(control[FACTOR_MIN], factor * strict ** -control[EXPONENT])
         elif error > 0.0:
             power = 1.0 / error if control[EXPONENT] == 1.0 else error ** -control[EXPONENT]
             factor = control[SAFETY] * power

@@ -10,6 +10,10 @@ import numpy as np
 from twoloop.kernels.common import ATOL, RTOL, compiled
 from twoloop.kernels.newton_memory import LASTING
 
+# An error that turns back as slowly as the motion itself does is none of a vibration, and those of the next steps go
+# the same way: it counts as if it lasted so many times as long
+TURNS = 10.0
+
 
 @compiled
 def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state):
@@ -18,18 +22,23 @@ def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state):
     Over that of a position where it has turned back or decayed before it is off by more, else over that of a velocity.
     """
     n = w.Q.size
-    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
+    q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
     count = w.independent.size
-    largest, turn = 0.0, 0.0
+    largest, turn, fastest, change = 0.0, 0.0, 0.0, 0.0
     for i in range(count):
+        fastest = max(fastest, abs(v[w.independent[i]]))
+        change = max(change, abs(a[w.independent[i]]))
         largest = max(largest, abs(twice[i]))
         turn = max(turn, abs(twice[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
     if largest > 0.0:
         memory[LASTING] = z * np.sqrt(largest / turn)
+    lasting = memory[LASTING]
+    if lasting * change * TURNS > fastest:
+        lasting *= min(TURNS, lasting * change * TURNS / fastest) if fastest > 0.0 else TURNS
     error = 0.0
     for i in range(count):
         j = w.independent[i]
         scale_q = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
         scale_v = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
-        error = max(error, abs(twice[i]) * min(memory[LASTING] / scale_q, 1.0 / scale_v))
+        error = max(error, abs(twice[i]) * min(lasting / scale_q, 1.0 / scale_v))
     return error

@@ -1,0 +1,294 @@
+"""Does the paper's idea pay: positions solved in every stage, against four other ways in the same Runge-Kutta code."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from references.ablation import VARIANTS, solve_variant
+from studies import figures, tables
+from studies.bench import Case, Run, Solver
+from studies.cases import beam, four_bar
+from studies.cli import StudyError
+from studies.metrics import violations
+from studies.study import Series, Study, key
+from twoloop import Result
+from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
+
+Array = NDArray[np.floating]
+
+PAPER, FROZEN, PROJECTED, STABILISED, UNPROJECTED = VARIANTS
+RIVALS = (PROJECTED, STABILISED, UNPROJECTED)
+SUN, GAUSS, RADAU = sun_radau_iib(3), gauss(2), radau_iia(3)
+TIME = "call_s"  # the column of times
+COSTS = {"n_evaluations": "evaluations", "n_factorizations": "factorisations", TIME: "CPU time"}
+LINKAGE, FLEXIBLE = "four-bar", "very flexible beam"
+
+T_END, T_END_QUICK = 10.0, 1.0  # s, of the linkage
+BEAM_END, BEAM_END_QUICK = 0.2, 0.01  # s: a hundred of its fastest periods, and five
+HALVES = 10.0 ** (-0.5 * np.arange(2, 19))  # 1e-1 to 1e-9
+TOLERANCES = {LINKAGE: HALVES, FLEXIBLE: HALVES[:13]}
+FROZEN_TOLERANCES = {LINKAGE: HALVES[:12], FLEXIBLE: HALVES[:9]}  # tighter ones take thousands of steps a second
+STEPS = {
+    LINKAGE: (0.2, 0.16, 0.125, 0.1, 0.08, 0.0625, 0.05, 0.04, 0.02, 0.01, 0.005),  # s
+    FLEXIBLE: (4e-3, 3.2e-3, 2.5e-3, 2e-3, 1.6e-3, 1.25e-3, 1e-3, 8e-4, 5e-4, 2.5e-4, 1.25e-4),
+}
+DRAWN_STEP, DRAWN_STEP_QUICK = 0.02, 0.01  # s, of the figure over time
+TARGETS = {LINKAGE: (1e-2, 1e-3, 1e-4, 1e-5, 1e-6), FLEXIBLE: (1e-4, 1e-5, 1e-6, 1e-7)}  # m, rad
+TOLD = {LINKAGE: (1e-2, 1e-4, 1e-6), FLEXIBLE: (1e-5, 1e-7)}  # those of the table
+DECADE = 10.0  # in error: between runs farther apart no cost is told
+MARGIN = 1.2  # times the cost: dearer; less is no difference
+KEPT = 1e-12  # m, m/s
+SAME_TOLERANCE = HALVES[8]  # 1e-5, the paper's, at which step lengths are compared
+
+COLORS = dict(
+    zip(VARIANTS, (figures.RED, figures.GREY, figures.BLUE, figures.GREEN, figures.ORANGE), strict=True),
+)
+MARKERS = dict(zip(VARIANTS, "ovsD^", strict=True))
+
+
+def _solve(variant: str, tableau: Tableau, setting: str, case: Case, value: float, repeat: int) -> Result:
+    problem, options = case.problem, {"step" if setting == "h" else "tol": value}
+    given = (problem.system, (0.0, case.t_end), problem.q0, problem.v0, variant, tableau)
+    return solve_variant(*given, time_limit=case.time_limit, **options)[0]
+
+
+def solver(variant: str, tableau: Tableau, setting: str) -> Solver:
+    """A variant with fixed steps ("h") or under control ("tol")."""
+    keeps, run = variant != UNPROJECTED, partial(_solve, variant, tableau, setting)
+    return Solver(variant, "ablation", "compiled", keeps, setting, run, fixed={"tableau": tableau.name})
+
+
+def cases(quick: bool) -> dict[str, Case]:
+    """The linkage and the very flexible beam, by name."""
+    t_end, timed = (T_END_QUICK, 0.0) if quick else (T_END, 0.02)
+    linkage = replace(four_bar.cases(quick)[0], t_end=t_end, timed=timed)
+    soft = beam.case(beam.SOFT, FLEXIBLE, quick, BEAM_END_QUICK if quick else BEAM_END)
+    return {LINKAGE: linkage, FLEXIBLE: replace(soft, timed=timed)}
+
+
+def runs(quick: bool) -> list[Run]:
+    """Every variant along tolerances and fixed steps: three tableaux on the linkage, the paper's on the beam."""
+    made = []
+    for name, case in cases(quick).items():
+        for tableau in (SUN, GAUSS, RADAU) if name == LINKAGE and not quick else (SUN,):
+            for variant in VARIANTS:
+                along = (FROZEN_TOLERANCES if variant == FROZEN else TOLERANCES)[name]
+                values = {"tol": along[4:9:2] if quick else along, "h": STEPS[name][7:10] if quick else STEPS[name]}
+                for setting, group in (("tol", "controlled"), ("h", "fixed")):
+                    one = solver(variant, tableau, setting)
+                    drawn = setting == "tol" and tableau is SUN  # with their times
+                    repeats = 3 if drawn and not quick else 1
+                    made += [Run(case, one, float(value), group, repeats) for value in values[setting]]
+    return made
+
+
+def measure(run: Run, result: Result) -> dict[str, Any]:
+    """Lengths of steps; of the runs that a figure shows, violation and energy over time."""
+    row: dict[str, Any] = {"series": {}}
+    if result.h.size:
+        row |= {"h_median": float(np.median(result.h)), "h_max": float(result.h.max())}
+    drawn = DRAWN_STEP_QUICK if run.case.t_end < T_END else DRAWN_STEP
+    if run.settings.get("h") == drawn and run.case.name == LINKAGE and run.settings["tableau"] == SUN.name:
+        problem = run.case.problem
+        energy = problem.energy(result.t, result.q, result.v) - problem.energy(0.0, problem.q0, problem.v0)
+        t, sizes = violations(problem.system, result)
+        row["series"] = {"violation": np.array([t, sizes["q"]]), "energy": np.array([result.t, np.abs(energy)])}
+    return row
+
+
+def cost(along: pd.DataFrame, target: float, what: str) -> float:
+    """Cost of this error, on the line between two runs at most a decade of error apart; NaN where there are none."""
+    errors = along["error_q"].dropna()
+    above, below = errors[errors > target], errors[errors <= target]
+    if above.empty or below.empty or above.min() > DECADE * below.max():
+        return float("nan")
+    return tables.time_for(along, target, what)
+
+
+def ratios(rows: pd.DataFrame, rival: str, what: str) -> list[float]:
+    """Costs of a rival over those of positions in every stage, for all cases, tableaux and errors that both have."""
+    found = []
+    controlled = rows[rows["group"] == "controlled"]
+    for (case, _), both in controlled.groupby(["case", "tableau"], sort=False):
+        one, other = (both[both["solver"] == name] for name in (rival, PAPER))
+        found += [cost(one, target, what) / cost(other, target, what) for target in TARGETS[case]]
+    return [ratio for ratio in found if np.isfinite(ratio)]
+
+
+def frozen_ratios(rows: pd.DataFrame, what: str = "n_evaluations") -> list[float]:
+    """Least costs of the best runs with dependents frozen over those of the paper's runs that are as good or better."""
+    found = []
+    controlled = rows[(rows["group"] == "controlled") & rows["error_q"].notna()]
+    for _, both in controlled.groupby(["case", "tableau"], sort=False):
+        one, other = (both[both["solver"] == name] for name in (FROZEN, PAPER))
+        if len(one) and (other["error_q"] <= one["error_q"].min()).any():
+            finest = one.loc[one["error_q"].astype(float).idxmin()]
+            found.append(float(finest[what] / other[other["error_q"] <= finest["error_q"]][what].min()))
+    return found
+
+
+def order(rows: pd.DataFrame, variant: str, tableau: str, case: str = LINKAGE) -> float:
+    """Slope of the error over the two shortest of the fixed steps whose errors the reference resolves."""
+    along = rows[(rows["group"] == "fixed") & (rows["solver"] == variant) & (rows["tableau"] == tableau)]
+    along = along[(along["case"] == case) & (along["error_q"] > 5.0 * along["floor"])].sort_values("h")
+    if len(along) < 2:
+        return float("nan")
+    h, errors = (along[name].astype(float).to_numpy()[:2] for name in ("h", "error_q"))
+    return float(np.log(errors[1] / errors[0]) / np.log(h[1] / h[0]))
+
+
+def _span(values: Sequence[float]) -> list[float] | None:
+    return [min(values), max(values)] if values else None
+
+
+def verdict(span: list[float] | None) -> str:
+    """What ratios of a rival's cost to the paper's say of the paper's."""
+    if span is None:
+        return "unknown"
+    if span[0] > MARGIN:
+        return "cheaper"
+    if span[1] < 1.0 / MARGIN:
+        return "dearer"
+    return "equal" if span[0] >= 1.0 / MARGIN and span[1] <= MARGIN else "mixed"
+
+
+def _longest(rows: pd.DataFrame, case: str, variant: str) -> float | None:
+    """The longest fixed step of a run that reaches its end and is in phase there."""
+    fixed = rows[(rows["group"] == "fixed") & (rows["case"] == case) & (rows["tableau"] == SUN.name)]
+    good = fixed[(fixed["solver"] == variant) & (fixed["status"] == "REACHED_END") & ~fixed["astray"].astype(bool)]["h"]
+    return None if good.empty else float(good.max())
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says, from the medians."""
+    if not {*VARIANTS} <= set(rows["solver"]) or "tableau" not in rows:
+        raise StudyError("the rows lack variants; make them again by python -m studies.ablation")
+    controlled, fixed = (rows[rows["group"] == group] for group in ("controlled", "fixed"))
+    names = list(dict.fromkeys(rows["case"]))
+    against = {}
+    for rival in RIVALS:
+        spans = {what: _span(ratios(rows, rival, what)) for what in COSTS}
+        against[rival] = {"spans": spans, "verdicts": {what: verdict(span) for what, span in spans.items()}}
+    kept = {name: _worst(rows, name, "violation_q") for name in VARIANTS}
+    tableaux = list(dict.fromkeys(rows["tableau"]))
+    orders = {variant: {tableau: order(rows, variant, tableau) for tableau in tableaux} for variant in VARIANTS}
+    nominal = {each.name: each.order for each in (SUN, GAUSS, RADAU)}
+    told = {name: [target for target in TOLD[name]] for name in names}
+    at_tolerance = controlled[np.isclose(controlled["tol"].astype(float), SAME_TOLERANCE)]
+    return {
+        "cases": [{"name": name, "t_end": float(rows[rows["case"] == name]["t_end"].iloc[0])} for name in names],
+        "tableaux": tableaux,
+        "against": against,
+        "n_compared": len(ratios(rows, PROJECTED, "n_evaluations")),
+        "frozen": {"at_least": _span(frozen_ratios(rows)), "best": _best_frozen(controlled)},
+        "orders": orders,
+        "frozen_order_one": all(value < 1.5 for value in orders[FROZEN].values() if value == value),
+        "full_order": [
+            name
+            for name in (PAPER, *RIVALS)
+            if all(value > nominal[tableau] - 0.5 for tableau, value in orders[name].items() if value == value)
+        ],
+        "kept": kept,
+        "drift": _drift(fixed),
+        "longest": {name: {variant: _longest(rows, name, variant) for variant in VARIANTS} for name in names},
+        "median_h": {name: {v: _median_step(at_tolerance, name, v) for v in VARIANTS} for name in names},
+        "tolerance": float(SAME_TOLERANCE),
+        "costs": {name: {v: _costs(controlled, name, v, told[name]) for v in VARIANTS} for name in names},
+        "told": told,
+        "energy": {variant: _energy(fixed, variant) for variant in VARIANTS},
+        "drawn_step": _drawn(fixed),
+        "margin": MARGIN,
+        "limit": KEPT,
+    }
+
+
+def _worst(rows: pd.DataFrame, variant: str, column: str) -> float:
+    reached = rows[(rows["solver"] == variant) & (rows["status"] == "REACHED_END")]
+    return float(reached[column].max())
+
+
+def _drawn(fixed: pd.DataFrame) -> float:
+    steps = set(fixed["h"])
+    return DRAWN_STEP if DRAWN_STEP in steps and fixed["t_end"].max() >= T_END else DRAWN_STEP_QUICK
+
+
+def _at_drawn(fixed: pd.DataFrame, variant: str) -> pd.Series | None:
+    chosen = fixed[(fixed["case"] == LINKAGE) & (fixed["tableau"] == SUN.name) & (fixed["solver"] == variant)]
+    chosen = chosen[chosen["h"] == _drawn(fixed)]
+    return None if chosen.empty else chosen.iloc[0]
+
+
+def _drift(fixed: pd.DataFrame) -> list[float] | None:
+    """Largest violation without projection in the first and in the last tenth of the run that the figure shows."""
+    row = _at_drawn(fixed, UNPROJECTED)
+    return None if row is None else [float(row["violation_early"]), float(row["violation_late"])]
+
+
+def _energy(fixed: pd.DataFrame, variant: str) -> float | None:
+    row = _at_drawn(fixed, variant)
+    return None if row is None or pd.isna(row["energy"]) else abs(float(row["energy"]))
+
+
+def _median_step(rows: pd.DataFrame, case: str, variant: str) -> float | None:
+    chosen = rows[(rows["case"] == case) & (rows["tableau"] == SUN.name) & (rows["solver"] == variant)]
+    return None if chosen.empty or pd.isna(chosen["h_median"].iloc[0]) else float(chosen["h_median"].iloc[0])
+
+
+def _best_frozen(controlled: pd.DataFrame) -> dict[str, float]:
+    chosen = controlled[controlled["solver"] == FROZEN].groupby("case", sort=False)["error_q"].min()
+    return {str(name): float(value) for name, value in chosen.items()}
+
+
+def _costs(controlled: pd.DataFrame, case: str, variant: str, targets: Sequence[float]) -> dict[str, list[float]]:
+    """Costs with the paper's tableau at the errors of the table."""
+    along = controlled[(controlled["case"] == case) & (controlled["tableau"] == SUN.name)]
+    along = along[along["solver"] == variant]
+    return {what: [cost(along, target, what) for target in targets] for what in COSTS}
+
+
+def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+    """Cost over error by three measures on both mechanisms; violation and energy over time."""
+    names = list(dict.fromkeys(rows["case"]))
+    made, axes = plt.subplots(len(names), 3, figsize=(10.5, 3.0 * len(names)), sharex="row", layout="constrained")
+    controlled = rows[(rows["group"] == "controlled") & (rows["tableau"] == SUN.name) & rows["error_q"].notna()]
+    for name, line in zip(names, np.atleast_2d(axes), strict=True):
+        for (what, text), panel in zip(COSTS.items(), line, strict=True):
+            for variant in VARIANTS:
+                along = controlled[(controlled["case"] == name) & (controlled["solver"] == variant)]
+                along = along[along["error_q"] > along["floor"]].sort_values("tol")
+                panel.plot(along["error_q"].astype(float), along[what].astype(float), **_look(variant))
+            unit = " (s)" if what == TIME else ""
+            panel.set(xscale="log", yscale="log", ylabel=text + unit, title=f"{name}: {text}")
+        for panel in line:
+            panel.set_xlabel("largest position error (m, rad)")
+    figures.legend(made, np.ravel(axes))
+    drift, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.2), layout="constrained")
+    fixed = rows[(rows["group"] == "fixed") & (rows["tableau"] == SUN.name)]
+    for variant in VARIANTS:
+        row = _at_drawn(fixed, variant)
+        if row is not None and key(row, "violation") in series:
+            for panel, name in ((left, "violation"), (right, "energy")):
+                t, size = series[key(row, name)]
+                panel.plot(t, np.maximum(size, 1e-18), **_look(variant) | {"marker": ""})
+    left.set(yscale="log", xlabel="t (s)", ylabel="largest |C| (m)")
+    right.set(yscale="log", xlabel="t (s)", ylabel="|E − E(0)| (J)")
+    figures.legend(drift, [left])
+    return {"ablation": made, "ablation_drift": drift}
+
+
+def _look(variant: str) -> dict[str, Any]:
+    return {"color": COLORS[variant], "marker": MARKERS[variant], "label": variant, "markersize": 3.5}
+
+
+STUDY = Study("ablation", __doc__, runs, measure, findings_of, figures_of)
+main = STUDY.main
+
+if __name__ == "__main__":
+    main()
