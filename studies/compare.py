@@ -24,7 +24,7 @@ REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
 
 
 def load_problem(where: str) -> Problem:
-    """The problem that FILE.py:FUNCTION makes.
+    """The problem that FILE.py:FUNCTION makes, or a ready mechanism by its name.
 
     Raises
     ------
@@ -107,7 +107,9 @@ def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Se
 def _work(words: Sequence[str] | None) -> None:
     parser = cli.parser("compare", __doc__)
     parser.add_argument(
-        "where", metavar="FILE.py:FUNCTION", help="a function that returns a twoloop.mechanisms.Problem"
+        "where",
+        metavar="MECHANISM",
+        help="FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism",
     )
     parser.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     parser.add_argument("--solvers", nargs="+", metavar="NAME", help=f"of {', '.join(CATALOGUE)}")

@@ -133,6 +133,15 @@ def generator(name):
     return module
 
 
+def test_the_front_page_shows_what_its_code_writes(tmp_path):
+    generator("gallery")
+    generator("generate").run_the_front_page(tmp_path / "front")
+    assert {file.name for file in (tmp_path / "front").iterdir()} == {"run.png", "run.html"}
+    text = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert '<iframe src="front/run.html"' in text and "generated/extra/front/run.png" in text
+    assert "{include} generated/takes.md" in text  # the table "your mechanism, take"
+
+
 def test_the_gallery_shows_every_ready_mechanism(tmp_path, monkeypatch):
     gallery = generator("gallery")
     monkeypatch.setattr(gallery, "LONGEST", 0.01)  # s: whole motions are for the build

@@ -130,6 +130,7 @@ def test_a_failed_run_ends_with_one(where, tmp_path, monkeypatch, capsys):
         (["solve", "mine.py"], "give FILE.py:FUNCTION, such as crane.py:crane, or a ready mechanism"),
         (["solve", "mine.py"], "such as four_bar; given mine.py"),
         (["solve", "fuor_bar"], "there is no mechanism fuor_bar among ancf_beam, andrews, bricard, "),
+        (["solve", "four-bar"], "there is no mechanism four-bar among"),
         (["solve", "Problem"], "there is no mechanism Problem among"),
         (["solve", "ancf_beam"], "ancf_beam must be a function without arguments that returns a twoloop.mechanisms.P"),
         (["solve", "{mine}:mass"], "mass must be a function without arguments that returns a twoloop.mechanisms.Prob"),

@@ -81,8 +81,8 @@ def sweep(
         one kind.
     measure : callable
         ``measure(problem, result)`` gives a mapping of further columns, whose values are numbers, strings, True and
-        False or None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN unless
-        the problem says that its energy is an invariant (`conserved`).
+        False or None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN
+        unless the problem says that its energy is an invariant (`conserved`).
     workers : int, optional
         Processes or threads. None: one for each core.
     parallel : {"processes", "threads"}

@@ -23,7 +23,7 @@ def problem_from(where: str) -> Problem:
         If there is no such file, function or mechanism, or it takes arguments, or does not return a `Problem`; an
         exception of the file itself comes through.
     """
-    if where.isidentifier():
+    if where.replace("-", "_").isidentifier():
         names = [name for name in mechanisms.__all__ if inspect.isfunction(getattr(mechanisms, name))]
         if where not in names:
             raise ValueError(f"{EXPECTED}; there is no mechanism {where} among {', '.join(names)}")
