@@ -14,7 +14,8 @@ from studies.store import Output
 # claims and compare_page read the others' rows
 STUDIES = (
     *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam", "validation"),
-    *("honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "claims", "compare_page"),
+    *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "claims"),
+    "compare_page",
 )
 CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen
     ("smooth",): "smooth, rigid",

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 
+from studies import ablation
 from studies.claims.rows import DEFAULT, LONG, NotRun, Rows, common_costs
 from studies.claims.verdicts import Judgement, decide, span
 from studies.metrics import ASTRAY
@@ -75,6 +76,16 @@ def projection_inefficient(rows: Rows) -> Judgement:
     return decide((ratio > DEARER for ratio in ratios), ratio=span(ratios))
 
 
+def every_stage(rows: Rows) -> Judgement:
+    table, spans = rows.pick("ablation", ablation.T_END), {}
+    for key, rival in (("projected", ablation.PROJECTED), ("stabilised", ablation.STABILISED)):
+        found = [ratio for what in ("n_evaluations", ablation.TIME) for ratio in ablation.ratios(table, rival, what)]
+        if not found:
+            raise NotRun(f"ablation.csv has no error common to {rival} and {ablation.PAPER}")
+        spans[key] = span(found)
+    return decide((least > DEARER for least, _ in spans.values()), **spans)
+
+
 def jacobian_difficult(rows: Rows) -> Judgement:
     soft, stiff = ([time_for(rows.beam(case, name), TIP) for name in ("differences", IRK)] for case in BEAMS)
     values = {"stiff": stiff[0], "stiff_paper": stiff[1], "soft": soft[0], "soft_paper": soft[1]}
@@ -113,6 +124,15 @@ def symplectic_stable(rows: Rows) -> Judgement:
 def euler_predictor(rows: Rows) -> Judgement:
     euler, continued = rows.number("iterations from Euler"), rows.number("iterations from the step before")
     return decide([continued > (1.0 - NEEDLESS) * euler], euler=euler, continued=continued)
+
+
+def dependents_in_the_loop(rows: Rows) -> Judgement:
+    table = rows.pick("ablation", ablation.T_END)
+    ratio = ablation.frozen_ratios(table)
+    if not ratio:
+        raise NotRun("ablation.csv has no run as good as the best with dependents frozen")
+    orders = [ablation.order(table, ablation.FROZEN, name) for name in table["tableau"].unique()]
+    return decide([min(ratio) > DEARER, max(orders) < ablation.ONE], ratio=span(ratio), order=span(orders))
 
 
 def richardson_cheap(rows: Rows) -> Judgement:

@@ -13,7 +13,7 @@ from studies import tables
 from studies.cli import StudyError
 from twoloop.mechanisms import four_bar
 
-STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam")
+STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam", "ablation")
 DEFAULT = four_bar().name
 LONG = 100.0  # s, the length of the paper's runs
 BEAM_END = 2.0  # s, of a full run of the beams

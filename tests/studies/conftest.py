@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from studies import energy, figures, motion, step_size, violation
+from studies import ablation, energy, figures, motion, step_size, violation
 
 
 @pytest.fixture
@@ -13,5 +13,5 @@ def unsaved(monkeypatch):
     """Make and save no figures, which takes longer than all else of a report."""
     monkeypatch.setattr(figures, "save", lambda *arguments: None)
     monkeypatch.setattr(figures, "work_precision", lambda *arguments: SimpleNamespace(axes=[]))
-    for study in (energy, motion, step_size, violation):
+    for study in (ablation, energy, motion, step_size, violation):
         monkeypatch.setattr(study, "STUDY", replace(study.STUDY, figures=lambda rows, series: {}))
