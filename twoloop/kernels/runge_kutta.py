@@ -382,6 +382,6 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         beside = SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, A_full)
-        if beside > SUDDEN:
-            error = max(error, beside)
+        if error <= 1.0 and beside > SUDDEN:
+            error = beside
     return code, error
