@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -56,6 +57,9 @@ def test_start_here_has_the_right_motion(names):
     assert page["result"].success and page["other"].success
     assert page["error"] < 1e-7 and page["violation"] < 1e-13
     assert np.ptp(page["energies"]) < 1e-6
+    q = page["result"].q
+    bars = [np.linalg.norm(b - a, axis=0) for a, b in pairwise(page["problem"].drawing.at(q))]  # O to A, A to B, B to D
+    assert np.abs(np.array(bars) - np.array([[1.0], [2.0], [1.5]])).max() < 1e-9
     assert page["problem"].q0 == pytest.approx([0.04, -1.0, 1.54, 0.32], abs=0.005)  # as drawn in four_bar.svg
 
 
