@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from references.ablation import VARIANTS, solve_variant
-from studies import figures, tables
+from studies import figures
 from studies.bench import Case, Run, Solver
 from studies.cases import beam, four_bar
 from studies.cli import StudyError
@@ -110,22 +110,29 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
     return row
 
 
-def cost(along: pd.DataFrame, target: float, what: str) -> float:
-    """Cost of this error, on the line between two runs at most a decade of error apart; NaN where there are none."""
-    errors = along["error_q"].dropna()
-    above, below = errors[errors > target], errors[errors <= target]
-    if above.empty or below.empty or above.min() > DECADE * below.max():
-        return float("nan")
-    return tables.time_for(along, target, what)
+def costs_at(along: pd.DataFrame, targets: Sequence[float], what: str) -> Array:
+    """Costs of these errors, on the line between two runs at most a decade of error apart; NaN where there are none."""
+    told = along[["error_q", "floor", what]].to_numpy(dtype=float)
+    told = told[np.isfinite(told).all(axis=1)]
+    errors, costs = np.maximum(told[:, 0], told[:, 1]), told[:, 2]
+    places = np.argsort(errors)
+    errors, costs = errors[places], costs[places]
+    found = np.full(len(targets), np.nan)
+    for k, n_good in enumerate(np.searchsorted(errors, targets, side="right")):
+        if 0 < n_good < errors.size and errors[n_good] <= DECADE * errors[n_good - 1]:
+            beside = slice(n_good - 1, n_good + 1)
+            between = np.exp(np.interp(np.log(targets[k]), np.log(errors[beside]), np.log(costs[beside])))
+            found[k] = min(between, costs[:n_good].min())
+    return found
 
 
 def ratios(rows: pd.DataFrame, rival: str, what: str) -> list[float]:
     """Costs of a rival over those of positions in every stage, for all cases, tableaux and errors that both have."""
-    found = []
+    found: list[float] = []
     controlled = rows[rows["group"] == "controlled"]
     for (case, _), both in controlled.groupby(["case", "tableau"], sort=False):
-        one, other = (both[both["solver"] == name] for name in (rival, PAPER))
-        found += [cost(one, target, what) / cost(other, target, what) for target in TARGETS[case]]
+        one, other = (costs_at(both[both["solver"] == name], TARGETS[case], what) for name in (rival, PAPER))
+        found += (one / other).tolist()
     return [ratio for ratio in found if np.isfinite(ratio)]
 
 
@@ -246,7 +253,7 @@ def _costs(controlled: pd.DataFrame, case: str, variant: str, targets: Sequence[
     """Costs with the paper's tableau at the errors of the table."""
     along = controlled[(controlled["case"] == case) & (controlled["tableau"] == SUN.name)]
     along = along[along["solver"] == variant]
-    return {what: [cost(along, target, what) for target in targets] for what in COSTS}
+    return {what: costs_at(along, targets, what).tolist() for what in COSTS}
 
 
 def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies import ablation as study
 from studies import claims
 from studies.claims import experiments, judged, judges
 from studies.claims.rows import STUDIES, Rows, read
@@ -135,6 +136,20 @@ def violation():
     return pd.DataFrame([ours, *theirs])
 
 
+def ablation():
+    """Projecting is as good in evaluations and takes half the time; frozen dependents are of order 1."""
+    rows = []
+    for variant, evaluations, seconds in zip(study.VARIANTS, (1, 20, 1, 2, 1), (2, 20, 1, 5, 1), strict=True):
+        row = {"case": study.LINKAGE, "tableau": study.SUN.name, "solver": variant, "t_end": 10.0}
+        order = 1 if variant == study.FROZEN else 5
+        rows += [row | {"group": "order", "h": h, "error_q": h**order} for h in study.ORDER_STEPS]
+        for k in range(2, 9):
+            error = 3e-4 if variant == study.FROZEN else 3.0 * 10.0**-k
+            costs = {"n_evaluations": 1e3 * k * evaluations, "cpu_s": 0.01 * k * seconds}
+            rows.append(row | {"group": "controlled", "tol": 10.0**-k, "error_q": error, **costs})
+    return pd.DataFrame([GOOD | row for row in rows])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Rows of a full run, made up, and the report on them."""
@@ -146,6 +161,7 @@ def folder(tmp_path_factory):
         "energy": energy(),
         "step_size": steps(),
         "violation": violation(),
+        "ablation": ablation(),
     }
     for name, rows in made.items():
         (out / f"{name}.csv").write_text(f"# full {name}; made up; 2026-01-01; commit 0\n{rows.to_csv(index=False)}")
@@ -168,7 +184,7 @@ def tables(whole):
 
 EXPECTED = {
     **dict.fromkeys(("more_efficient", "because_of_order", "baumgarte_inexact", "projection_exact"), PART),
-    **dict.fromkeys(("tolerances_and_steps", "values_alone", "general"), PART),
+    **dict.fromkeys(("tolerances_and_steps", "values_alone", "general", "every_stage"), PART),
     **dict.fromkeys(("gstiff_short", "gstiff_long"), CONSISTENT),
     **dict.fromkeys(("newmark_tolerances", "newmark_star"), CIRCULAR),
     **dict.fromkeys(
@@ -179,6 +195,7 @@ EXPECTED = {
             "large_steps",
             "works_long",
             "beams_work",
+            "dependents_in_the_loop",
         ),
         HOLDS,
     ),
@@ -240,6 +257,10 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("beam_seconds", "beam", "case == 'moderately stiff'", {"cpu_s": 111.6}, HOLDS),
     ("any_method", "motion", "solver == 'BDF'", {"status": "NOT_CONVERGED"}, PART),
     ("beams_work", "beam", "case == 'very flexible'", {"error_q": np.nan}, NOT_RUN),
+    ("every_stage", "ablation", "solver == 'projected once a step'", {"n_evaluations": 1e6, "cpu_s": 9.0}, HOLDS),
+    ("every_stage", "ablation", "solver == 'stabilised index 2'", {"cpu_s": 0.01}, FAILS),
+    ("dependents_in_the_loop", "ablation", "solver == 'dependents frozen'", {"n_evaluations": 1.0}, PART),
+    ("dependents_in_the_loop", "ablation", "solver != 'dependents frozen'", {"error_q": 1.0}, NOT_RUN),
 ]  # fmt: skip
 OTHER_NUMBERS = [
     ("euler_predictor", "iterations from the step before", 4.0, FAILS),
