@@ -162,6 +162,8 @@ class _Look:
             found = self._defect(i, j)
             if SEVERAL < found < np.inf and j > i + 1:
                 yield from self._steps_of(i, j)
+                if self.untested[i]:  # what a velocity is off by shows in the positions of later steps only
+                    yield i, j, found / (j - i)
             else:
                 yield i, j, found
             i = j
