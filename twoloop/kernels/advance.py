@@ -81,6 +81,7 @@ KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a 
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 SUDDEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
+REFUSED = 0.95  # of a refused step is what the next one is at most
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run
@@ -320,8 +321,8 @@ def advance(
         error *= strict
         if w.notes[STEP_FACTOR] > 0.0:
             factor = w.notes[STEP_FACTOR]
-            if strict > 1.0:
-                factor = max(control[FACTOR_MIN], factor * strict ** -control[EXPONENT])
+            if strict > 1.0 and error > 0.0:  # the step does not know of `strict`, and may want to grow
+                factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         elif error > 0.0:
             power = 1.0 / error if control[EXPONENT] == 1.0 else error ** -control[EXPONENT]
             factor = control[SAFETY] * power
@@ -335,9 +336,8 @@ def advance(
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1
             clock[FAILURE_CODE] = DONE
-            clock[H_NEXT] = min(
-                proposal, size - np.spacing(abs(t + size))
-            )  # a tiny one may else be rounded to what it was
+            # shorter in any case, a tiny one by a spacing, to which it would else be rounded
+            clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
             if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
                 return NEAR_SINGULAR
             continue
