@@ -187,7 +187,7 @@ def test_a_step_of_a_few_spacings_of_t_is_not_tried_for_ever(t0):
     """A tolerance of a metre, which is no tolerance for this linkage, leads to ever shorter steps."""
     problem = four_bar()
     result = solve_dae(problem.system, (t0, t0 + 10.0), problem.q0, problem.v0, "Taylor", 1.0, 1.0, compiled=True)
-    assert result.stats.n_rejected_error < 1000
+    assert result.stats.n_rejected_error < 5000
 
 
 def test_the_error_follows_the_tolerance():
