@@ -59,7 +59,7 @@ MODELS = (
 STEPS, QUICK_STEPS = (2000, 8000), (500, 2000)  # ... so many of them
 MODELLED_LIMIT = 30.0  # s of CPU of such a run
 TIGHT = 1e-10  # at which digits are compared
-COMPILING = 20.0  # of what compiles before the first run of a family of solvers on a problem
+COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a problem
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (DEFAULT, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
@@ -110,10 +110,12 @@ def make(output: Output) -> pd.DataFrame:
     """Make all rows, those kept from an unfinished run aside."""
     todo = runs(output.call.quick)
     with output.kept() as kept:
-        warm: set[tuple[str, str]] = set()
+        warm: set[tuple[Any, ...]] = set()
         for run in todo:
             if run.key(0) not in kept:
-                if (what := (run.case.name, run.solver.family)) not in warm:
+                # what is built for a mechanism, or for each of its tolerances, is no part of the run and its time limit
+                what = (run.case.name, run.solver.name, run.value if run.solver.builds_each else None)
+                if what not in warm:
                     warm.add(what)
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore")
