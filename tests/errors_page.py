@@ -21,6 +21,17 @@ as they were raised; do not edit it by hand.
 """
 
 
+# what stands above the table of a group
+MEANT = {
+    "result.certify": """\
+A certificate that passes means: made again by an unlike method, no step of the run ends more than 200 tolerances from
+where the equations lead, and nothing that lasts longer than `certificate.gap` was passed over. It does not bound how
+errors of steps grow over the run, and does not know whether the model is right. One that does not pass gives a
+`CertificateWarning` that says where. [The certificate](certificate.md) has the details.
+""",
+}
+
+
 def message(case: Case) -> str:
     """What a mistake gets: the type of the error and its message, without what differs between machines."""
     try:
@@ -57,7 +68,8 @@ def page() -> str:
     """The whole page."""
     parts = [BEGINNING, "## How a run ends\n", *statuses(), ""]
     for group, cases in groupby(CASES, key=lambda case: case.group):
-        parts += [f"## {group}\n", "| What you did | What you get | What to do |", "|---|---|---|"]
+        parts += [f"## {group}\n", *([MEANT[group]] if group in MEANT else [])]
+        parts += ["| What you did | What you get | What to do |", "|---|---|---|"]
         parts += [f"| {cell(case.what)} | {cell(message(case))} | {cell(case.advice)} |" for case in cases]
         parts.append("")
     return "\n".join(parts)
