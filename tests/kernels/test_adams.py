@@ -69,7 +69,7 @@ def test_price_of_ten_seconds(default_four_bar, tol, steps):
 def test_it_takes_fewer_evaluations_than_others_at_equal_error(default_four_bar):
     own, error = four_bar_run(default_four_bar, 1e-12)
     other, other_error = four_bar_run(default_four_bar, 1e-10, method="Gauss12")
-    assert error < 10.0 * other_error
+    assert max(error, other_error) < 3e-11  # rounding has its share in both
     assert own.stats.n_evaluations < 0.5 * other.stats.n_evaluations
 
 
