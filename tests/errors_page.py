@@ -24,10 +24,11 @@ as they were raised; do not edit it by hand.
 # what stands above the table of a group
 MEANT = {
     "result.certify": """\
-A certificate that passes means: made again by an unlike method, no step of the run ends more than 200 tolerances from
-where the equations lead, and nothing that lasts longer than `certificate.gap` was passed over. It does not bound how
-errors of steps grow over the run, and does not know whether the model is right. One that does not pass gives a
-`CertificateWarning` that says where. [The certificate](certificate.md) has the details.
+A certificate that passes means: made again by an unlike method, which looked at the equations at places no further
+apart than `certificate.gap`, no step of the run ends more than 200 tolerances from where they lead. What lasts less
+than the gap may be missed, and so may what moves every step by less than that. How errors of steps grow over the run
+is not bounded, and whether the model is right is not known. One that does not pass gives a `CertificateWarning` that
+says where. [The certificate](certificate.md) has the details.
 """,
 }
 
