@@ -8,7 +8,6 @@ peers`, or the extra `peers`.
 
 import shutil
 import tempfile
-import time
 from contextlib import chdir
 from functools import lru_cache, partial
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_choice, check_run, check_tolerances
+from references.driver import TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.expressions import Expressions, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_size
@@ -144,14 +143,15 @@ def _solved(
     made = partial(_integrator, plugin, system, t0, q0.tobytes(), v0.tobytes(), tuple(options.items()))
     start = np.concatenate([q0, v0])
     t1, name = float(timed[-1]), {"idas": "IDAS of CasADi", "collocation": "CasADi's collocation"}[plugin]
-    limit, failure, cpu, states = TimeLimit(time_limit), "", 0.0, np.empty((start.size, 0))
+    limit, failure, cpu, states = TimeLimit(time_limit), "", None, np.empty((start.size, 0))
     counts: dict[str, Any] = {}
     after = times[times > t0]
     try:
         integrator = made(timed.tobytes())
-        limit, began = TimeLimit(time_limit), time.process_time()
-        states = np.array(integrator(x0=start)["xf"])
-        cpu = time.process_time() - began
+        limit = TimeLimit(time_limit)
+        with user_call as clock:
+            states = np.array(integrator(x0=start)["xf"])
+        cpu = clock.seconds
         counts = integrator.stats() if plugin == "idas" else {}
         if limit.passed():
             failure = limit.message(name, t1, "take looser tolerances, or fewer steps")
@@ -167,7 +167,7 @@ def _solved(
     statistics = Statistics(
         n_accepted=counts.get("nsteps", timed.size if plugin == "collocation" else None),
         n_evaluations=counts.get("nfevals"),
-        cpu_time=cpu,
+        cpu_time=cpu or 0.0,
     )
     return ode_result(system, kept, states, failure, f"{name} reached the end, t = {t1:g}.", statistics)
 

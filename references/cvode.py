@@ -3,13 +3,13 @@
 The equations are those of `references.index1` without stabilisation. Without Python in its way: `references.cvode_c`.
 """
 
-import time
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances
+from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.index1 import RightHandSide
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.consistency import check_start
@@ -91,13 +91,10 @@ def solve_cvode(
     asked = np.unique(np.concatenate([[t0, 0.5 * (t0 + t1), t1], times]))
     options: dict[str, Any] = {"method": method, "rtol": float(rtol), "atol": float(atol), "max_num_steps": MOST_STEPS}
     integrator = CVODE(right_hand_side, **options)
-    began = time.process_time()
-    try:
+    solution = None
+    with user_call as clock, suppress(OutOfTimeError):
         solution = integrator.solve(asked, y0)
-    except OutOfTimeError:
-        solution = None
-    cpu = time.process_time() - began
-    statistics = Statistics(n_evaluations=int(equations.counters[0]), cpu_time=cpu)
+    statistics = Statistics(n_evaluations=int(equations.counters[0]), cpu_time=clock.seconds or 0.0)
     if solution is None:
         failure = limit.message("CVODE", t0, "take looser tolerances")
         return ode_result(system, times[:0], np.empty((y0.size, 0)), failure, "", statistics)

@@ -4,7 +4,6 @@ The equations are those that `references.expressions` makes of the callbacks. Co
 optional: `make peers`, or the extra `peers`.
 """
 
-import time
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_run, check_tolerances
+from references.driver import TimeLimit, check_run, check_tolerances, user_call
 from references.expressions import Expressions, NotSymbolic, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.consistency import check_start
@@ -85,9 +84,9 @@ def solve_diffrax(
 
     end, soon = np.array([t1]), t0 + 1e-6 * (t1 - t0)
     solve(t0, soon, start, rtol, atol, np.array([soon]))  # compiles
-    limit, began = TimeLimit(time_limit), time.process_time()
-    _, status, steps, rejected = solve(t0, t1, start, rtol, atol, end)
-    cpu = time.process_time() - began
+    limit = TimeLimit(time_limit)
+    with user_call as clock:
+        _, status, steps, rejected = solve(t0, t1, start, rtol, atol, end)
     states = solve(t0, t1, start, rtol, atol, times)[0].T
     failure = ""
     if limit.passed():
@@ -99,7 +98,10 @@ def solve_diffrax(
         kept = np.isfinite(states).all(axis=0)
         times, states = times[kept], states[:, kept]
     statistics = Statistics(
-        n_accepted=steps, n_rejected_error=rejected, n_evaluations=13 * (steps + rejected), cpu_time=cpu
+        n_accepted=steps,
+        n_rejected_error=rejected,
+        n_evaluations=13 * (steps + rejected),
+        cpu_time=clock.seconds or 0.0,
     )
     return ode_result(system, times, states, failure, f"diffrax reached the end, t = {t1:g}.", statistics)
 

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,34 @@ from twoloop.mechanisms.problem import Problem
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
+
+
+class UserCall:
+    """The CPU time of the call that a user of a solver writes, by the clock of the process.
+
+    An adapter does more than that: our checks, the building of what a user keeps, a second run for the output,
+    accelerations and multipliers. It puts what its solver's documentation has for a second run into
+    `with user_call:`. Whatever marks nothing is timed whole.
+
+    Attributes
+    ----------
+    seconds : float or None
+        Of the last call that was marked.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: float | None = None
+        self._began = 0.0
+
+    def __enter__(self) -> Self:
+        self._began = time.process_time()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds = time.process_time() - self._began
+
+
+user_call = UserCall()  # one: a process makes one run at a time
 
 
 class OutOfTimeError(Exception):

@@ -1,7 +1,6 @@
 """What the Exudyn models share: sensors, a run with a fixed step, silence, statistics."""
 
 import contextlib
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from exudyn.itemInterface import SensorNode
 from numpy.typing import NDArray
 
-from references.driver import TimeLimit, check_choice, check_time_limit
+from references.driver import TimeLimit, check_choice, check_time_limit, user_call
 from twoloop.checks import check_positive, check_size
 from twoloop.result import Result, Statistics, Status
 
@@ -74,10 +73,8 @@ def run(
         settings.linearSolver.ignoreSingularJacobian = True
     settings.timeIntegration.generalizedAlpha.spectralRadius = radius
     limit = TimeLimit(time_limit)
-    with _silence():
-        began = time.process_time()
+    with _silence(), user_call as clock:
         failure = _solve_hht(mbs, settings, alpha, limit) if solver == "HHT" else _solve(mbs, settings, solver, limit)
-        cpu = time.process_time() - began
     tables = [[mbs.GetSensorStoredData(sensor) for sensor in node] for node in sensors]  # (n_t, 1 + n), time first
     t = tables[0][0][:, 0]
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
@@ -101,7 +98,7 @@ def run(
             n_accepted=made,
             n_outer=did.newtonStepsCount,
             n_factorizations=did.newtonJacobiCount,
-            cpu_time=cpu,
+            cpu_time=clock.seconds or 0.0,
         ),
     )
 

@@ -4,14 +4,13 @@ The equations are those of `references.ida` in the form "stabilised", residual a
 are Python. The package is optional: `pip install solve_dae`, or the extra `peers` of this project.
 """
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances
+from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.ida import compiled_residual, start_of
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -82,10 +81,9 @@ def solve_fully_implicit(
     y0, yp0 = start_of(system, "stabilised", t0, q0, v0)
     run = _Run(system, times, time_limit)
     options = {"rtol": float(rtol), "atol": float(atol), **METHODS[method]}
-    began = time.process_time()
-    run.go(solver_type, t0, t1, y0, yp0, options)
-    cpu = time.process_time() - began
-    return _result(method, run, t1, cpu)
+    with user_call as clock:
+        run.go(solver_type, t0, t1, y0, yp0, options)
+    return _result(method, run, t1, clock.seconds or 0.0)
 
 
 def _solver_type(method: str) -> Callable[..., Any]:

@@ -17,7 +17,7 @@ from numba import njit, types
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
-from references.driver import TimeLimit, check_choice, check_run
+from references.driver import TimeLimit, check_choice, check_run, user_call
 from references.index1 import solve_index1
 from twoloop.caches import compile_kept, watch
 from twoloop.checks import check_positive, check_size, check_times
@@ -170,30 +170,29 @@ def solve_gear(
     past = np.zeros((HIGHEST, given.shape[1]))
     code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
     formulas = _formulas()
-    began = time.process_time()
-    while code == DONE and made < n_steps and not limit.passed():
-        called = time.monotonic()
-        last = min(made + stride, n_steps)
-        code = _integrate(
-            Kit(system.functions),
-            system.n_q,
-            given,
-            past,
-            made + 1,
-            last,
-            t0,
-            h,
-            order,
-            formulas,
-            float(newton_tol),
-            keep,
-            rows,
-            counters,
-        )
-        made = last
-        stride *= 2 if time.monotonic() - called < CALL else 1
-    cpu = time.process_time() - began
-    return _result(system, order, t0, h, code, keep, rows, counters, cpu, limit)
+    with user_call as clock:
+        while code == DONE and made < n_steps and not limit.passed():
+            called = time.monotonic()
+            last = min(made + stride, n_steps)
+            code = _integrate(
+                Kit(system.functions),
+                system.n_q,
+                given,
+                past,
+                made + 1,
+                last,
+                t0,
+                h,
+                order,
+                formulas,
+                float(newton_tol),
+                keep,
+                rows,
+                counters,
+            )
+            made = last
+            stride *= 2 if time.monotonic() - called < CALL else 1
+    return _result(system, order, t0, h, code, keep, rows, counters, clock.seconds or 0.0, limit)
 
 
 def _first_states(system: ConstrainedSystem, times: Array, q0: Array, v0: Array, limit: TimeLimit) -> Result:

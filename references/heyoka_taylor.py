@@ -5,14 +5,13 @@ compiles a Taylor series of the whole for each mechanism and each tolerance, whi
 radius of convergence. It does not keep the constraints. The package is optional: `make peers`, or the extra `peers`.
 """
 
-import time
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_run
+from references.driver import TimeLimit, check_run, user_call
 from references.expressions import Expressions, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_positive
@@ -40,7 +39,8 @@ def solve_heyoka(
 
     What it was given: the accelerations eliminated symbolically, without structural zeros, in an order of least fill;
     `fast_math`; the unrolled form (`compact_mode=False`, up to twice as fast and ten times as long in the building) up
-    to `LARGEST_UNROLLED` coordinates; one call of `propagate_until`, without output, is what is timed.
+    to `LARGEST_UNROLLED` coordinates; timed is a second use of the integrator, as its tutorials have it: time and state
+    are set, and `propagate_until` is called, without output.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def solve_heyoka(
     -------
     Result
         `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_accepted and cpu_time, that
-        of the integration. The building of the integrator, in `cpu_time` of no run, is kept for the next run of the
-        same system, start and tolerance. A failure gives what was computed before it, and `Status.SOLVER_FAILED`.
+        of the call. The integrator is kept for the next run of the same system, start and tolerance, its machine code
+        in heyoka's own cache on disk. A failure gives what was computed before it, and `Status.SOLVER_FAILED`.
 
     Raises
     ------
@@ -80,14 +80,15 @@ def solve_heyoka(
     integrator, outcomes = _integrator(system, t0, q0.tobytes(), v0.tobytes(), float(tol))
     start = np.concatenate([q0, v0])
 
-    integrator.time, integrator.state[:] = t0, start
-    limit, steps, began = TimeLimit(time_limit), 0, time.process_time()
-    while True:
-        outcome, _, _, taken, *_ = integrator.propagate_until(t1, max_steps=STEPS_A_CALL)
-        steps += taken
-        if outcome != outcomes.step_limit or limit.passed():
-            break
-    cpu, reached = time.process_time() - began, float(integrator.time)
+    limit, steps = TimeLimit(time_limit), 0
+    with user_call as clock:
+        integrator.time, integrator.state[:] = t0, start
+        while True:
+            outcome, _, _, taken, *_ = integrator.propagate_until(t1, max_steps=STEPS_A_CALL)
+            steps += taken
+            if outcome != outcomes.step_limit or limit.passed():
+                break
+    cpu, reached = clock.seconds or 0.0, float(integrator.time)
     failure = ""
     if outcome == outcomes.step_limit:
         failure = limit.message("heyoka", reached, "take looser tolerances")
@@ -108,7 +109,6 @@ def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol:
         import heyoka
     except ImportError as error:
         raise RuntimeError("heyoka is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    heyoka.llvm_state.set_diskcache_enabled(False)  # or what a building takes would depend on what ran before
     n, state = system.n_q, np.concatenate([np.frombuffer(q0), np.frombuffer(v0)])
     symbols = heyoka.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
     equations = Expressions(system, t0, state[:n], state[n:])

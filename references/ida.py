@@ -18,7 +18,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import compiled_gamma
-from references.driver import TimeLimit, check_choice, check_run, check_tolerances
+from references.driver import TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.ida_options import (
     HIGHEST_ORDER,
     NOT_TESTED,
@@ -137,11 +137,9 @@ def solve_ida(
         max_step=t1 - t0,
         max_num_steps=10**9,  # per output time
     )
-    with redirect_stdout(said):
-        began = time.process_time()
+    with redirect_stdout(said), user_call as clock:
         outcome = solver.solve(tspan, y0, yp0)
-        cpu = time.process_time() - began
-    return _result(system, form, outcome, times, said.getvalue(), cpu, limit)
+    return _result(system, form, outcome, times, said.getvalue(), clock.seconds or 0.0, limit)
 
 
 def compiled_residual(system: ConstrainedSystem, form: str) -> tuple[Callable[..., None], Callable[..., None]]:

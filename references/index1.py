@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
-from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances
+from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
 from twoloop.kernels.linalg import ldl_solve
@@ -121,10 +121,9 @@ def solve_index1(
     equations.warm(t0, y0, stabilisation == "projection")
     run = _Run(equations, times, stabilisation == "projection", time_limit)
     options = {"rtol": float(rtol), "atol": float(atol)}
-    began = time.process_time()
-    run.go(solver_type, t0, y0, t1, options)
-    cpu = time.process_time() - began
-    return _result(method, equations, run, t1, cpu)
+    with user_call as clock:
+        run.go(solver_type, t0, y0, t1, options)
+    return _result(method, equations, run, t1, clock.seconds or 0.0)
 
 
 def _pair(method: str) -> type[OdeSolver]:

@@ -26,7 +26,7 @@ Array = NDArray[np.floating]
 PAPER, FROZEN, PROJECTED, STABILISED, UNPROJECTED = VARIANTS
 RIVALS = (PROJECTED, STABILISED, UNPROJECTED)
 SUN, GAUSS, RADAU = sun_radau_iib(3), gauss(2), radau_iia(3)
-TIME = "cpu_s"  # the column of times
+TIME = "call_s"  # the column of times
 COSTS = {"evaluations": "n_evaluations", "factorisations": "n_factorizations", "time": TIME}  # as findings call them
 LINKAGE, FLEXIBLE = "four-bar", "very flexible beam"
 

@@ -12,7 +12,6 @@ import pandas as pd
 from studies.bench import NOTHING_RUN, Run
 from studies.store import KeptRows, Row
 
-ONCE = 0.5  # s of CPU; a run that takes longer is not repeated
 FAR = 20.0
 RUNNING = 2
 ENDING = (*NOTHING_RUN, "RAISED", "TIME_LIMIT")
@@ -29,7 +28,7 @@ class _Progress:
     def judge(self, row: Row, fastest: float | None, all_asked: bool, tolerances: bool) -> None:
         """Take a first repetition into account; `fastest`: the least time so far for no larger an error."""
         self.failed = self.failed + 1 if row["error_q"] is None else 0
-        far = fastest is not None and (row["cpu_s"] or 0.0) > FAR * fastest
+        far = fastest is not None and (row["call_s"] or 0.0) > FAR * fastest
         self.far = self.far + 1 if far and row["error_q"] is not None else 0
         hopeless = (tolerances and self.failed >= RUNNING) or (self.far >= RUNNING and not all_asked)
         self.ended = row["status"] in ENDING or hopeless
@@ -49,7 +48,7 @@ def collect(
         Those of one solver on one mechanism from its loosest setting on.
     kept : KeptRows
     make : callable
-        make(run, repeat, built) -> row, with case, status, error_q and cpu_s.
+        make(run, repeat, built) -> row, with case, status, error_q and call_s.
     all_asked : callable, optional
         all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
 
@@ -72,15 +71,14 @@ def collect(
                 row, runs = kept[run.key(0)], reached.setdefault(run.case.name, [])
                 good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
                 who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
-                if row["error_q"] is not None and row["cpu_s"]:
-                    runs.append((row["error_q"], row["cpu_s"]))
+                if row["error_q"] is not None and row["call_s"]:
+                    runs.append((row["error_q"], row["call_s"]))
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 
 
 def _again(run: Run, repeat: int, kept: KeptRows) -> bool:
-    """Whether a run is repeated: one that was made, ended and was short."""
+    """Whether a run is repeated: one that was made and ended."""
     if repeat >= run.repeats or run.key(0) not in kept:
         return False
-    first = kept[run.key(0)]
-    return first["error_q"] is not None and (first["cpu_s"] or 0.0) <= ONCE
+    return kept[run.key(0)]["error_q"] is not None

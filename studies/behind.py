@@ -66,16 +66,16 @@ def _profile(
 ) -> dict[str, Any]:
     line: dict[str, Any] = {key: at[key] for key in ("case", "error", "ratio")}
     for which in ("ours", "others"):
-        solver, seconds = at[which]["solver"], at[which]["cpu_s"]
+        solver, seconds = at[which]["solver"], at[which]["call_s"]
         steps = tables.time_for(rows[rows["solver"] == solver], at["error"], "n_steps")
         known = bool(np.isfinite(steps))
-        line[which] = {"solver": solver, "steps": steps if known else None, "cpu_s": seconds}
+        line[which] = {"solver": solver, "steps": steps if known else None, "call_s": seconds}
         line[which]["step_ns"] = 1e9 * seconds / steps if known else None
     evaluations, count = at["ours"]["n_evaluations"], operations.get(at["case"], np.nan)
     # a step of Taylor, which the default takes, too, computes series, not accelerations at points
     counted = bool(evaluations and np.isfinite(evaluations)) and not at["ours"]["solver"].startswith((DEFAULT, TAYLOR))
     line["evaluations"] = evaluations if counted else None
-    line["evaluation_ns"] = 1e9 * at["ours"]["cpu_s"] / evaluations if counted else None
+    line["evaluation_ns"] = 1e9 * at["ours"]["call_s"] / evaluations if counted else None
     line["straight_ns"] = count * operation_ns if np.isfinite(count) else None
     told = line["evaluation_ns"] is not None and line["straight_ns"] is not None
     line["without"] = line["ratio"] * line["evaluation_ns"] / line["straight_ns"] if told else None

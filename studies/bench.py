@@ -4,14 +4,11 @@ A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechan
 `solvers.py`, what a row says of the quality of a run in `metrics.py`.
 """
 
-import multiprocessing
-import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,6 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from references.driver import user_call
 from studies import metrics
 from studies.reference_motion import ReferenceMotion, make_reference
 from studies.store import KeptRows, Row
@@ -34,8 +32,9 @@ INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
 COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
 MOST_CALLS = 20
-ONCE = 1.0  # s of CPU; the time of a run that takes longer hardly varies, and it is not repeated
+REPEATS = 5
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
+ONCE = (*NOTHING_RUN, "TIME_LIMIT")  # which is not asked again
 
 
 class NotApplicable(Exception):
@@ -185,7 +184,7 @@ class Run:
     solver: Solver
     value: float
     group: str = ""
-    repeats: int = 3
+    repeats: int = REPEATS
 
     @property
     def settings(self) -> dict[str, float | str]:
@@ -198,15 +197,16 @@ class Run:
         return f"{self.group} | {self.case.name} to {self.case.t_end!r} | {self.solver.name} | {settings} | {repeat}"
 
 
+Timed = tuple[Result | None, str, str, dict[str, Any]]  # result, status, message, columns of times
 Measure = Callable[[Run, Result], dict[str, Any]]
 
 
-def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None, processes: int = 1) -> pd.DataFrame:
+def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None) -> pd.DataFrame:
     """Make the rows of all runs that are not kept yet: one row a repetition.
 
     The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
-    alike; one that takes more than ONCE seconds, or hits its limit, is made once. A run that fails, exceeds its time
-    limit, or cannot be made is a row whose status and message say so.
+    alike; what hits its limit or cannot be run is asked once. A run that fails, exceeds its time limit, or cannot be
+    made is a row whose status and message say so.
 
     Parameters
     ----------
@@ -216,8 +216,6 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
         Of the study's `Output`; rows are on disk as soon as they are made.
     measure : callable, optional
         measure(run, result) -> further columns, of values that JSON holds. Not called where there is no result.
-    processes : int
-        More than 1: runs side by side, for long studies whose times are not compared.
 
     Returns
     -------
@@ -239,7 +237,7 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
         _ = case.scale  # makes the reference, which is not to be timed with anything
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, disable=not sys.stdout.isatty())
-    with closing(_rows_of(left, kept, measure, processes)) as made, bar as progress:
+    with closing(_rows_of(left, kept, measure)) as made, bar as progress:
         task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
         for run, k, row in made:
             kept.add(run.key(k), row)
@@ -248,44 +246,12 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None,
 
 
 def _rows_of(
-    left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None, processes: int
+    left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None
 ) -> Generator[tuple[Run, int, Row], None, None]:
-    if processes == 1:
-        warm: set[tuple[int, str, float]] = set()
-        for run, k in left:
-            first = kept[run.key(0)] if k > 0 else {}
-            if first.get("status") != "TIME_LIMIT" and (first.get("cpu_s") or 0.0) <= ONCE:
-                yield run, k, row_of(run, k, measure, warm)
-        return
-    _shared[:] = [(run, k, measure) for run, k in left]  # cases and solvers hold functions that cannot be sent
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("fork"), _end_with_parent)
-    try:
-        futures = {pool.submit(_shared_row, i): left[i] for i in range(len(left))}
-        for future in as_completed(futures):
-            yield *futures[future], future.result()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-_shared: list[tuple[Run, int, Measure | None]] = []  # as the workers inherit it
-
-
-def _shared_row(i: int) -> Row:
-    run, k, measure = _shared[i]
-    return row_of(run, k, measure, set())
-
-
-def _end_with_parent() -> None:
-    """End this worker when the study is killed, which a worker of a pool does not notice by itself."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
-
-    def wait() -> None:
-        parent = multiprocessing.parent_process()
-        assert parent is not None
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+    warm: set[tuple[int, str, float]] = set()
+    for run, k in left:
+        if k == 0 or kept[run.key(0)]["status"] not in ONCE:
+            yield run, k, row_of(run, k, measure, warm)
 
 
 def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
@@ -294,17 +260,10 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
     row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
     row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
     row |= {**run.settings, "t_end": case.t_end, "repeat": k}
-    row["build_s"] = build(run, k, warm)
-    result, status, message = attempt(run, k)
+    warm_up(run, k, warm)
+    result, status, message, times = timed(run, k)
     stats = Statistics() if result is None else result.stats
-    spent = [] if result is None else [stats.cpu_time]
-    while spent and sum(spent) < case.timed and len(spent) < MOST_CALLS:  # too short for the clock
-        again = attempt(run, k)[0]
-        if again is None:
-            break
-        spent.append(again.stats.cpu_time)
-    row |= {"cpu_s": (sum(spent) / len(spent) or None) if spent else None, "calls": len(spent)}
-    row |= {"status": status, "message": message}
+    row |= {**times, "status": status, "message": message}
     rejected = [n for n in (stats.n_rejected_error, stats.n_rejected_convergence) if n is not None]
     row |= {"n_steps": stats.n_accepted, "n_rejected": sum(rejected) if rejected else None}
     for name in ("n_evaluations", "n_outer", "n_inner", "n_partitions", "n_factorizations", "n_jacobians"):
@@ -322,19 +281,33 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
         return row | metrics.COLUMNS | {"status": "NOT_MEASURED", "message": why}
 
 
-def build(run: Run, repeat: int, built: set[tuple[int, str, float]], limit: float = COMPILING) -> float | None:
-    """Let a run compile what it calls, unless `built` has it: its CPU time, s, with that of compilers."""
+def timed(run: Run, repeat: int) -> Timed:
+    """A run, its status and message, and what it takes, each call the same: all studies time in this place.
+
+    call_s is the CPU time of the call that a user writes, the mean over `calls` of them until their sum can be read
+    off the clock: of solve_dae all of it, of another project's solver what its adapter marks (`references.driver`).
+    inside_s is what the solver says of the time in its own loop.
+    """
+    result, status, message, spent = attempt(run, repeat)
+    if result is None:
+        return None, status, message, {"call_s": None, "inside_s": None, "calls": 0}
+    calls, inside = [spent], [result.stats.cpu_time]
+    while result.success and sum(calls) < run.case.timed and len(calls) < MOST_CALLS:
+        again, _, _, spent = attempt(run, repeat)
+        if again is None:
+            break
+        calls.append(spent)
+        inside.append(again.stats.cpu_time)
+    n = len(calls)
+    return result, status, message, {"call_s": sum(calls) / n or None, "inside_s": sum(inside) / n or None, "calls": n}
+
+
+def warm_up(run: Run, repeat: int, warm: set[tuple[int, str, float]], limit: float = COMPILING) -> None:
+    """Let a run compile what it calls, by the beginning of it, unless `warm` has it; a failure comes in the run."""
     what = (id(run.case), run.solver.name, run.value if run.solver.builds_each else 0.0)
-    if what in built:
-        return None
-    built.add(what)
-    began = os.times()
-    warm_up(run, repeat, limit)
-    return sum(os.times()[:4]) - sum(began[:4])
-
-
-def warm_up(run: Run, repeat: int, limit: float = COMPILING) -> None:
-    """Compile what a run calls, by the beginning of it; a failure comes back in the run itself."""
+    if what in warm:
+        return
+    warm.add(what)
     span = 10.0 * run.value if run.solver.setting == "h" else WARM_UP * run.case.t_end
     attempt(replace(run, case=replace(run.case, t_end=min(span, run.case.t_end), time_limit=limit)), repeat)
 
@@ -345,28 +318,34 @@ def called_from(run: Run) -> str:
     return "Python" if in_python else run.solver.called_from
 
 
-def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str]:
-    """Make a run: its result, where there is one, a status and a message."""
+def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str, float]:
+    """Make a run: its result, where there is one, a status, a message, and the CPU time of the user's call in s."""
+    result, status, message, spent, user_call.seconds = None, "", "", 0.0, None
     try:
         with _limited(run.case.time_limit):
+            began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
+            spent = time.process_time() - began
     except NotApplicable as why:
-        return None, "NOT_APPLICABLE", str(why)
+        status, message = "NOT_APPLICABLE", str(why)
     except TimeLimit:
-        return None, "TIME_LIMIT", f"Stopped after {run.case.time_limit:g} s of CPU time, the limit of a run."
+        status, message = "TIME_LIMIT", f"Stopped after {run.case.time_limit:g} s of CPU time, the limit of a run."
     except ImportError as error:
-        return None, "NOT_AVAILABLE", str(error)
+        status, message = "NOT_AVAILABLE", str(error)
     except RuntimeError as error:
         # references/ say so what is to be installed for a package that is not there
         status = "NOT_AVAILABLE" if isinstance(error.__context__, ImportError) else "RAISED"
-        return None, status, str(error)
+        message = str(error)
     except Exception as error:  # a solver that raises must not end a night of runs: the row says what it raised
-        return None, "RAISED", f"{type(error).__name__}: {error}"
+        status, message = "RAISED", f"{type(error).__name__}: {error}"
+    if result is None:
+        return None, status, message, 0.0
+    spent = spent if user_call.seconds is None else user_call.seconds
     if result.status.name == "INTERRUPTED":  # Ctrl-C, which solve_dae turns into a partial result
         raise KeyboardInterrupt
     if not result.success and "time_limit =" in result.message:  # as the adapters in references/ say it
-        return result, "TIME_LIMIT", result.message
-    return result, result.status.name, result.message
+        return result, "TIME_LIMIT", result.message, spent
+    return result, result.status.name, result.message, spent
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -84,7 +85,7 @@ def stamp(command: str) -> str:
             versions.append(f"{package} {version(package)}")
         except PackageNotFoundError:
             versions.append(f"{package} (not installed)")
-    machine = f"{_cpu()}, {os.cpu_count()} cores"
+    machine = f"{processor()}, {os.cpu_count()} cores"
     system = f"{platform.system()}, Python {platform.python_version()}"
     return "; ".join([f"`{command}`", date.today().isoformat(), f"commit {_commit()}", machine, system, *versions])
 
@@ -100,7 +101,9 @@ def _commit() -> str:
         return "unknown (not a git checkout)"
 
 
-def _cpu() -> str:
+@cache
+def processor() -> str:
+    """The model of this machine's processor, as the system names it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from studies import cli, figures, tables
-from studies.bench import Case, Run, collect
+from studies.bench import REPEATS, Case, Run, collect
 from studies.cli import StudyError
 from studies.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.render import number, power, render, table
@@ -61,7 +61,7 @@ def runs_of(case: Case, solvers: Sequence[str], quick: bool) -> list[Run]:
         if quick:
             own = (case.tolerances or ())[:6:2]  # a case that has its own has loose ones
             values = own or QUICK if solver.setting == "tol" else values[:2]
-        runs += [Run(case, solver, value, "compare", 1 if quick else 3) for value in values]
+        runs += [Run(case, solver, value, "compare", 1 if quick else REPEATS) for value in values]
     return runs
 
 
@@ -74,7 +74,7 @@ def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict
     found["cheapest"] = []
     for error in errors:
         ours, others = tables.of_both(tables.ranking(rows, error)).values()
-        first = None if ours is None or others is None else bool(ours["cpu_s"] < others["cpu_s"])
+        first = None if ours is None or others is None else bool(ours["call_s"] < others["call_s"])
         found["cheapest"].append({"error": error, "ours": ours, "others": others, "ours_first": first})
     return found | {"failed": bool((rows["status"] != "REACHED_END").any())}
 
@@ -95,7 +95,7 @@ def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Se
         figures.save(plot, output, "compare")
     middle = errors[len(errors) // 2]
     header = ["solver", "called from", *(power(error) for error in errors)]
-    kept = {"solver": "solver", "cpu_s": "CPU (s)", "n_evaluations": "evaluations", "violation_q": "max abs C"}
+    kept = {"solver": "solver", "call_s": "CPU (s)", "n_evaluations": "evaluations", "violation_q": "max abs C"}
     kept |= {"violation_v": "max abs C_q v + C_t", "energy": "energy error (J)"}
     quality = [[run[key] for key in kept] for _, run in tables.ranking(rows, middle).iterrows()]
     ready = {"work": table(header, tables.work_precision(rows, errors)), "kept": table([*kept.values()], quality)}

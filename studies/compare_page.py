@@ -17,10 +17,7 @@ from studies.render import TEMPLATES
 from studies.store import Output, plain
 
 FILE = "compare.html"
-SOURCES = {  # study: its columns under the names of the page
-    "work_precision": {},
-    "validation": {"cpu_time": "cpu_s"},
-}
+SOURCES = ("work_precision", "validation")
 MEASURES = {
     "error_q": "largest position error (m, rad)",
     "error_v": "largest velocity error",
@@ -30,7 +27,7 @@ MEASURES = {
     "violation_v": "largest violation of velocities",
 }
 SETTINGS = ("h", "err_out", "tol")
-COSTS = {"cpu_s": "CPU time (s)", "n_evaluations": "evaluations"}
+COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 OPENS = "four-bar, 10 s (work_precision)"
 ALWAYS = ("auto", "auto, compiled")  # shown at first beside the best
@@ -52,13 +49,13 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         If there are no rows at all, or a file is damaged.
     """
     parts, stamps = [], {}
-    for name, columns in SOURCES.items():
+    for name in SOURCES:
         path = folder / f"{name}.csv"
         if not path.is_file():
             continue
         try:
             first, rest = path.read_text().split("\n", 1)
-            rows = pd.read_csv(StringIO(rest), low_memory=False).rename(columns=columns)
+            rows = pd.read_csv(StringIO(rest), low_memory=False)
             rows = tables.medians(rows) if "repeat" in rows else rows
             # a study may run one mechanism for several lengths of time, whose costs cannot be compared
             parts.append(

@@ -52,7 +52,7 @@ def row_of(run: Run) -> Row:
         "worst_step": None,
         "first_step": None,
     }
-    result, row["status"], row["message"] = attempt(run, 0)
+    result, row["status"], row["message"], _ = attempt(run, 0)
     if result is None or result.t.size < 3:
         return row
     try:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies import metrics
-from studies.bench import NOTHING_RUN, Case, Run, attempt, called_from
+from studies.bench import NOTHING_RUN, Case, Run, called_from, timed
 from studies.reference_motion import ReferenceMotion
 from studies.store import Row
 from twoloop import ConstrainedSystem, Result
@@ -32,7 +32,9 @@ def case_of(problem: Problem, judged: bool = False) -> Case:
     known, rule = problem.reference, problem.condition
     assert known is not None
     t_end, n_instants = (rule.t_end, rule.n_outputs) if judged and rule is not None else (known.t, INSTANTS)
-    return Case(problem.name, problem, t_end, unknown, n_instants, conserved=problem.conserved, time_limit=TIME_LIMIT)
+    return Case(
+        problem.name, problem, t_end, unknown, n_instants, conserved=problem.conserved, time_limit=TIME_LIMIT, timed=0.0
+    )
 
 
 def truth(problem: Problem, t_end: float) -> Reference:
@@ -111,10 +113,10 @@ def row_of(run: Run) -> Row:
     row |= {"called_from": called_from(run), **run.settings, "t_end": case.t_end}
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        result, status, message = attempt(run, 0)
-    row |= {"status": status, "message": message, "warnings": len(said)}
+        result, status, message, times = timed(run, 0)
+    row |= {**times, "status": status, "message": message, "warnings": len(said)}
     stats = None if result is None else result.stats
-    for name in ("n_accepted", "n_evaluations", "cpu_time"):
+    for name in ("n_accepted", "n_evaluations"):
         row[name] = None if stats is None else getattr(stats, name)
     known = truth(problem, case.t_end)
     row |= {f"error_{level}": None for level in LEVELS} | {f"digits_{level}": None for level in LEVELS}

@@ -62,7 +62,7 @@ def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC,
 
 def told(row: pd.Series) -> dict[str, Any]:
     """A run as a finding."""
-    found = {name: row[name] for name in ("solver", "name", "called_from", "cpu_s", "n_evaluations", "violation_q")}
+    found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
     found |= {name: row[name] for name in ("verdict", "kinetic", "status")}
     found["label"] = f"{row['name']}, {setting(row)}"
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
@@ -72,7 +72,7 @@ def told(row: pd.Series) -> dict[str, Any]:
 
 def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
     """The cheapest of some runs."""
-    return None if rows.empty else told(rows.loc[rows["cpu_s"].idxmin()])
+    return None if rows.empty else told(rows.loc[rows["call_s"].idxmin()])
 
 
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         for name, which in (("no_drift", good & calm), ("drift", good & ~calm)):
             level[name] = {"ours": cheapest(reached[which & own]), "others": cheapest(reached[which & ~own])}
         free, other = cheapest(reached[good & calm]), cheapest(reached[good & ~calm])
-        over = np.inf if other is None else 0.0 if free is None else other["cpu_s"] / free["cpu_s"]
+        over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
         at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
     listed = rows[rows["group"].isin(("other", "controlled"))]
@@ -161,7 +161,7 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
     figure = figures.work_precision(long, drawn, title, "largest energy error over the run (J)")
     calm = long[long["verdict"].isin(CALM)]
-    for axes, what in zip(figure.axes, ("cpu_s", "n_evaluations"), strict=True):
+    for axes, what in zip(figure.axes, ("call_s", "n_evaluations"), strict=True):
         ring: dict[str, Any] = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 0.8}
         axes.plot(calm["error_q"], calm[what], "o", color="black", **ring)
     return figure
@@ -187,7 +187,7 @@ def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
     return figure
 
 
-STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of, processes=2)
+STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of)
 main = STUDY.main
 
 if __name__ == "__main__":

@@ -172,8 +172,8 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
             continue
         called = "P" if runs["called_from"].iloc[0] == "Python" else "c"
         one = look(runs.iloc[0]) | {"label": f"{solver} [{called}]"}
-        times = runs["cpu_s"].astype(float)
-        spread = [times - runs["cpu_q1"].astype(float), runs["cpu_q3"].astype(float) - times]
+        times = runs["call_s"].astype(float)
+        spread = [times - runs["call_q1"].astype(float), runs["call_q3"].astype(float) - times]
         left.errorbar(runs["error_q"].astype(float), times, yerr=spread, elinewidth=0.8, **one)
         counted = runs[runs["n_evaluations"].notna()]
         right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **one)

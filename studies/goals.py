@@ -40,8 +40,8 @@ def of_default(rows: pd.DataFrame, compiled: bool) -> dict[str, Any]:
         for error in rivals.DECADES:
             ranked = tables.ranking(runs, error)
             if not ranked.empty:
-                mine = ranked[ranked["solver"] == default]["cpu_s"]
-                over = float(mine.iloc[0] / ranked["cpu_s"].iloc[0]) if len(mine) else None
+                mine = ranked[ranked["solver"] == default]["call_s"]
+                over = float(mine.iloc[0] / ranked["call_s"].iloc[0]) if len(mine) else None
                 pairs.append({"case": str(case), "error": error, "over": over, "best": ranked["solver"].iloc[0]})
     reached = [pair for pair in pairs if pair["over"] is not None]
     found: dict[str, Any] = {"solver": default, "compiled": compiled, "limit": DEFAULT_OVER, "n": len(pairs)}
@@ -55,7 +55,7 @@ def _long(known: Sequence[Case], rows: pd.DataFrame) -> dict[str, Any] | None:
     for case in known:
         best = tables.of_both(tables.ranking(rows[rows["case"] == case.name], LONG_ERROR))["ours"]
         found = {"case": case.name, "t_end": case.t_end, "error": LONG_ERROR, "limit": LONG_TIME}
-        return found | {"solver": best and best["solver"], "cpu_s": best and best["cpu_s"]}
+        return found | {"solver": best and best["solver"], "call_s": best and best["call_s"]}
     return None
 
 
@@ -67,7 +67,7 @@ def _stiff(case: Case, rows: pd.DataFrame) -> dict[str, Any]:
         own = ranked if ranked.empty else ranked[ranked["family"] == "two-loop"]
         ida = ranked if ranked.empty else ranked[ranked["solver"].str.startswith(FROM_C)]
         told = len(own) > 0 and len(ida) > 0
-        found["ratios"].append(float(ida["cpu_s"].iloc[0] / own["cpu_s"].iloc[0]) if told else None)
+        found["ratios"].append(float(ida["call_s"].iloc[0] / own["call_s"].iloc[0]) if told else None)
     compared = [ratio for ratio in found["ratios"] if ratio is not None]
     return found | {"compared": compared, "ahead": bool(compared) and min(compared) > 1.0}
 

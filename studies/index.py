@@ -24,7 +24,7 @@ CLASSES = {  # tags of a case and the class of problem that they stand for, in t
 }
 LONG = "long and conservative"
 WHOSE = ("ours", "others")
-COSTS = ("cpu_s", "n_evaluations", "violation_q", "called_from", "keeps")
+COSTS = ("call_s", "n_evaluations", "violation_q", "called_from", "keeps")
 
 
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
@@ -69,7 +69,7 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[str, Any]:
     reached = [line for line in at if line["ours"] and "ida" in line]
-    over = [line["ida"]["cpu_s"] / line["ours"]["cpu_s"] for line in reached if line["ida"]]
+    over = [line["ida"]["call_s"] / line["ours"]["call_s"] for line in reached if line["ida"]]
     missed = [line["accuracy"] for line in reached if not line["ida"]]
     made = {"class": label, "name": case["name"], "t_end": case["t_end"], "at": at, "picks": picks(at)}
     return made | {"ida_over": over, "ida_misses": missed, "without_drift": []}
@@ -89,7 +89,7 @@ def _at_energy(at: dict[str, Any], *kinds: str) -> dict[str, Any]:
     for which in WHOSE:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:
-            best = min(runs, key=lambda run: float(run["cpu_s"]))
+            best = min(runs, key=lambda run: float(run["call_s"]))
             line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": best["drifts"]}
     return line
 
@@ -98,15 +98,15 @@ def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The cheapest solvers of all, each with the accuracies at which it is that, its times, and those of others."""
     made: dict[str, dict[str, Any]] = {}
     for line in at:
-        runs = [(line[which]["cpu_s"], which) for which in WHOSE if line[which]]
+        runs = [(line[which]["call_s"], which) for which in WHOSE if line[which]]
         if runs:
             which = min(runs)[1]
             best, other = line[which], line["others" if which == "ours" else "ours"]
             new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours"}
-            pick = made.setdefault(best["solver"], new | {"accuracies": [], "cpu_s": [], "over": []})
+            pick = made.setdefault(best["solver"], new | {"accuracies": [], "call_s": [], "over": []})
             pick["accuracies"].append(line["accuracy"])
-            pick["cpu_s"].append(best["cpu_s"])
-            pick["over"] += [other["cpu_s"] / best["cpu_s"]] if other else []
+            pick["call_s"].append(best["call_s"])
+            pick["over"] += [other["call_s"] / best["call_s"]] if other else []
     return list(made.values())
 
 
@@ -133,7 +133,7 @@ def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
     first = [at for entry in entries if entry["class"] == entries[0]["class"] for at in entry["at"]]
     for best in (at[which] for at in first for which in WHOSE):
         if best and best["n_evaluations"]:
-            times[best["called_from"]].append(1e6 * best["cpu_s"] / best["n_evaluations"])
+            times[best["called_from"]].append(1e6 * best["call_s"] / best["n_evaluations"])
     return times
 
 

@@ -137,7 +137,7 @@ def check_sound(faults: Sequence[Fault]) -> int:
         If one of them fails: it would catch anything.
     """
     foreign = Run(case_of(mechanisms.double_pendulum()), CATALOGUE[SCIPY], TOLERANCE, repeats=1)
-    warm_up(foreign, 0)  # here, so that the processes of the checks need not compile
+    warm_up(foreign, 0, set())  # here, so that the processes of the checks need not compile
     seen = set()
     for fault in faults:
         # what is sound of a faulty problem is the problem of that name

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
 from studies import adaptive, figures, tables
-from studies.bench import MOST_CALLS, Run, attempt, build
+from studies.bench import REPEATS, Run, warm_up
 from studies.cases.four_bar import SECOND
 from studies.cli import StudyError
 from studies.end_states import case_of, row_of
@@ -46,8 +46,7 @@ TOLERANCES = (1e-1, 1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
 BUILT = (1e-1, 1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
 STEPS = (100, 300, 1000)  # of those of fixed steps
 QUICK_TOLERANCES = (1e-3, 1e-5)
-REPEATS = 3
-TIMED = 0.002  # s; a shorter run is called until it has used so much
+TIMED = 0.01  # s; a shorter run is called until it has used so much
 TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 30.0  # s of what is built before
 TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
@@ -90,13 +89,12 @@ def runs(quick: bool) -> list[Run]:
     """Every mechanism, solver and setting."""
     found = []
     for name, problem in problems(quick).items():
-        case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT)
+        case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=TIMED)
         case = replace(case, step_sizes=tuple(case.t_end / n for n in STEPS))
         for solver in (CATALOGUE[each] for each in (QUICK_SOLVERS if quick else (*OWN, *RIVALS))):
             grid = BUILT if solver.builds_each else TOLERANCES if solver.setting == "tol" else case.steps()
             values = QUICK_TOLERANCES if quick else grid
-            repeats = 1 if quick or solver.called_from == "Python" else REPEATS
-            found += [Run(case, solver, value, GROUP, repeats) for value in values]
+            found += [Run(case, solver, value, GROUP, 1 if quick else REPEATS) for value in values]
     return found
 
 
@@ -106,13 +104,9 @@ def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
 
 
 def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
-    seconds = build(run, repeat, built, COMPILING)
-    row = row_of(run) | {"repeat": repeat, "build_s": seconds, "keeps_constraints": run.solver.keeps_constraints}
-    spent = [float(row.pop("cpu_time") or 0.0)]
-    while row["error_q"] is not None and sum(spent) < TIMED and len(spent) < MOST_CALLS:
-        again = attempt(run, repeat)[0]
-        spent += [] if again is None else [again.stats.cpu_time]
-    return row | {"cpu_s": sum(spent) / len(spent) or None, "calls": len(spent), "n_steps": row.pop("n_accepted")}
+    warm_up(run, repeat, built, COMPILING)
+    row = row_of(run) | {"repeat": repeat, "keeps_constraints": run.solver.keeps_constraints}
+    return row | {"n_steps": row.pop("n_accepted")}
 
 
 def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
@@ -121,25 +115,21 @@ def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     found: dict[str, Any] = {"error": error, "ratio": None}
     for which, best in both.items():
         found[which] = (
-            None if best is None else {key: best[key] for key in ("solver", "cpu_s", "n_evaluations", "keeps")}
+            None if best is None else {key: best[key] for key in ("solver", "call_s", "n_evaluations", "keeps")}
         )
     if found["ours"] and found["others"]:
-        found["ratio"] = found["others"]["cpu_s"] / found["ours"]["cpu_s"]
+        found["ratio"] = found["others"]["call_s"] / found["ours"]["call_s"]
     return found
 
 
 def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
-    """What a solver's line says: how many mechanisms, how long it builds, how far it leaves the constraints."""
+    """What a solver's line says: how many mechanisms, how far it leaves the constraints."""
     ran = rows[rows["error_q"].notna()]
     found = {
         "solver": name,
         "family": rows["family"].iloc[0],
         "mechanisms": int(ran["case"].nunique()),
-        "build_s": None,
     }
-    seconds = rows[rows["case"].isin(ran["case"])]["build_s"].dropna().astype(float)
-    if len(seconds):
-        found["build_s"] = [float(seconds.median()), float(seconds.max())]
     drifts = ran["violation_q"].dropna().astype(float)
     return found | {"violation": float(drifts.max()) if len(drifts) else None}
 
@@ -183,7 +173,7 @@ def _four_bar(name: str, rows: pd.DataFrame) -> dict[str, Any]:
         for kind, chosen in kinds.items():
             some = others[chosen(others)] if len(others) else others
             if len(some):
-                line = {"error": error, "ratio": float(some["cpu_s"].iloc[0] / own["cpu_s"].iloc[0])}
+                line = {"error": error, "ratio": float(some["call_s"].iloc[0] / own["call_s"].iloc[0])}
                 found[kind].append(line | {"solver": some["solver"].iloc[0], "ours": own["solver"].iloc[0]})
     return found
 
@@ -233,7 +223,7 @@ def headline(rows: pd.DataFrame, most: int = 9) -> Figure:
         line = line[line["error_q"] > line["floor"]]
         if len(line):
             look = figures.look(line.iloc[0]) | ({"linewidth": 2.2} if line["family"].iloc[0] == "two-loop" else {})
-            axes.plot(line["error_q"].astype(float), 1e3 * line["cpu_s"].astype(float), **look)
+            axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
     axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time (ms)")
     axes.invert_xaxis()
     figures.legend(figure, [axes], "thick: twoloop; filled:\nkeeps the constraints")

@@ -21,12 +21,25 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from studies.cli import ROOT, Call, StudyError
+from studies.cli import ROOT, Call, StudyError, processor
 
 Row = dict[str, Any]
 
 FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes kept rows worthless
 NUMERICS = ("numpy", "scipy", "numba")
+# studies whose times are compared, so that no two run at once
+TIMED = (
+    "work_precision",
+    "compare",
+    "table3",
+    "beam",
+    "energy",
+    "violation",
+    "symbolic_size",
+    "sweep_linkages",
+    "ablation",
+)
+LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
 
@@ -41,13 +54,15 @@ class Output:
     Raises
     ------
     StudyError
-        If the folder cannot be written to, or another run is using it.
+        If the folder cannot be written to, or another run is using it; if another full run of a study that compares
+        times goes on anywhere on the machine.
     """
 
     def __init__(self, call: Call):
         self.call = call
         self.path = call.out.resolve()
         self._lock: int | None = None
+        self._machine: int | None = None
 
     def __enter__(self) -> Self:
         lock = self.path / ".lock"
@@ -65,12 +80,21 @@ class Output:
             raise StudyError(
                 f"another run is writing to {self.path}; wait for it, or choose another folder by --out"
             ) from None
+        if self.call.study in TIMED and not (self.call.quick or self.call.redraw):
+            try:
+                self._machine = alone()
+            except StudyError:
+                self._unlock()
+                raise
         return self
 
     def __exit__(self, *_: object) -> None:
         self._unlock()
 
     def _unlock(self) -> None:
+        if self._machine is not None:
+            os.close(self._machine)
+            self._machine = None
         if self._lock is not None:
             os.close(self._lock)  # which releases the lock, as the end of the process does
             self._lock = None
@@ -162,6 +186,30 @@ class Output:
         return f"{'quick' if self.call.quick else 'full'} {self.call.study}"
 
 
+def alone() -> int:
+    """Hold the machine for a study that compares times, by the descriptor that is returned; its end releases it.
+
+    Raises
+    ------
+    StudyError
+        If another such study runs.
+    """
+    path = Path(tempfile.gettempdir(), LOCK)
+    try:
+        # to read is enough for a lock, and of a file that another user has made all that may be
+        descriptor = os.open(path, os.O_RDONLY | NO_LINK)
+    except FileNotFoundError:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | NO_LINK, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise StudyError(
+            "another study is being timed on this machine, and two would slow one another down; wait for it"
+        ) from None
+    return descriptor
+
+
 class KeptRows:
     """The rows of an unfinished study, in a file that vanishes when the study is complete.
 
@@ -183,7 +231,8 @@ class KeptRows:
 
     def __init__(self, path: Path, settings: Mapping[str, Any]):
         self.path = path
-        self._header = json.dumps({"sources": sources(), "settings": dict(settings)}, sort_keys=True)
+        about = {"sources": sources(), "processor": processor(), "settings": dict(settings)}
+        self._header = json.dumps(about, sort_keys=True)
         self._rows: dict[str, Row] = {}
         self.n_resumed = 0
 
@@ -212,7 +261,7 @@ class KeptRows:
 
     def _read(self, lines: list[str]) -> dict[str, Row]:
         if lines[:1] != [self._header] and self.path.stat().st_size > 0:
-            raise ValueError("its rows were made by other sources or with other settings")
+            raise ValueError("its rows were made by other sources, with other settings or on another processor")
         rows = {}
         for number, line in enumerate(lines[1:], 2):
             try:
@@ -238,8 +287,8 @@ class KeptRows:
         return self._rows[key]
 
     def add(self, key: str, row: Row) -> None:
-        """Keep a row: it is on disk when this returns."""
-        line = json.dumps({"key": key, "row": plain(row)})
+        """Keep a row, with the processor that made it: it is on disk when this returns."""
+        line = json.dumps({"key": key, "row": plain(row) | {"processor": processor()}})
         descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | NO_LINK)
         with os.fdopen(descriptor, "a") as file:
             file.write(line + "\n")

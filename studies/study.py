@@ -76,8 +76,6 @@ class Study:
         findings(rows) -> what the report and the first screen say. `rows`, here and below: medians.
     figures : callable
         figures(rows, series) -> figures by the name of their file.
-    processes : int
-        Runs side by side.
     """
 
     name: str
@@ -86,7 +84,6 @@ class Study:
     measure: Callable[[Run, Result], dict[str, Any]]
     findings: Callable[[pd.DataFrame], dict[str, Any]]
     figures: Callable[[pd.DataFrame, Series], dict[str, Figure]]
-    processes: int = 1
 
     def main(self, words: Sequence[str] | None = None) -> None:
         """Make the rows, or with --redraw read those that were saved, and write the report."""
@@ -97,7 +94,7 @@ class Study:
             (rows, line), series = output.load_rows(), output.load_series()
         else:
             with output.kept() as kept:
-                rows = collect(self.runs(output.call.quick), kept, self.measure, self.processes)
+                rows = collect(self.runs(output.call.quick), kept, self.measure)
             line, series = cli.stamp(output.call.command), {}
             for _, row in rows.iterrows():
                 curves = row.get("series")  # none of a run without a result

@@ -97,12 +97,12 @@ def grid(rows: pd.DataFrame, group: str) -> str:
 
 def _time(cell: pd.Series, paper: float | None) -> str:
     mark = "★" if cell["lost"] else "†" if cell["astray"] else ""
-    spread = tables.with_quartiles(cell["cpu_s"], cell["cpu_q1"], cell["cpu_q3"]) + mark
+    spread = tables.with_quartiles(cell["call_s"], cell["call_q1"], cell["call_q3"]) + mark
     if cell["t_end"] != PAPER_END:  # a quick run: nothing printed is for so short a motion
         return spread
     if paper is None:
         return f"{spread} / ★"
-    return f"{spread} / {paper:.2f} ×{number(paper / cell['cpu_s'])}"
+    return f"{spread} / {paper:.2f} ×{number(paper / cell['call_s'])}"
 
 
 def counts(rows: pd.DataFrame) -> str:
@@ -128,12 +128,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
     found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
     for name, cell in (("irk", irk), ("newmark", newmark)):
-        found |= {f"{name}_s": cell["cpu_s"], f"{name}_error": cell["error_q"]}
+        found |= {f"{name}_s": cell["call_s"], f"{name}_error": cell["error_q"]}
         cells = first[first["group"] == cell["group"]]
         for what in ("lost", "astray"):
             bad = cells[cells[what].astype(bool)]["err_out"].unique()
             found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
-    found["ratio_s"] = newmark["cpu_s"] / irk["cpu_s"]
+    found["ratio_s"] = newmark["call_s"] / irk["call_s"]
     found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
     ratios = _newmark_over_irk(first)
     found["newmark_over_irk"] = [min(ratios), max(ratios)] if ratios else []
@@ -149,7 +149,7 @@ def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
     ranked = tables.ranking(first, error)
     if ranked.empty:
         return None
-    times = dict(zip(ranked["solver"], ranked["cpu_s"] / ranked["cpu_s"].iloc[0], strict=True))
+    times = dict(zip(ranked["solver"], ranked["call_s"] / ranked["call_s"].iloc[0], strict=True))
     found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
     return found | (tables.best(ranked) or {})
 

@@ -52,9 +52,9 @@ def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:
                 if paper is None or ours is None:
                     continue
                 attempts = float(ours["n_steps"]) + float(ours["n_rejected"])
-                counts = (float(ours[key]) for key in ("cpu_s", "n_evaluations", "n_inner"))
+                counts = (float(ours[key]) for key in ("call_s", "n_evaluations", "n_inner"))
                 lines.append((group, paper, *counts, attempts))
-    return pd.DataFrame(lines, columns=["group", "paper", "cpu_s", "evaluations", "inner", "attempts"])
+    return pd.DataFrame(lines, columns=["group", "paper", "call_s", "evaluations", "inner", "attempts"])
 
 
 def span(ratio: pd.Series) -> float:
@@ -94,9 +94,9 @@ def partition_cost(rows: pd.DataFrame) -> tuple[float, float]:
         rows[(rows["group"] == "partition") & (rows["solver"] == f"fixed step, {name}")].iloc[0]
         for name in ("lasting", "symmetric")
     )
-    evaluation = kept["cpu_s"] / kept["n_evaluations"]
+    evaluation = kept["call_s"] / kept["n_evaluations"]
     # the two runs do not iterate equally often
-    extra = every["cpu_s"] - evaluation * every["n_evaluations"]
+    extra = every["call_s"] - evaluation * every["n_evaluations"]
     return float(extra / every["n_steps"]), float(evaluation)
 
 
@@ -142,9 +142,9 @@ def causes(rows: pd.DataFrame) -> dict[str, Any]:
     """Findings: paper over ours by procedure, and what each cause and reading leaves of the pattern."""
     table, read = cells(rows), readings(rows)
     partition, evaluation = partition_cost(rows)
-    by_time = table["paper"] / table["cpu_s"]
+    by_time = table["paper"] / table["call_s"]
     by_count = table["paper"] / table["evaluations"]
-    by_partition = table["paper"] / (table["cpu_s"] + partition * table["attempts"])
+    by_partition = table["paper"] / (table["call_s"] + partition * table["attempts"])
     found: dict[str, Any] = {"flat": FLAT, "one_constant": span(by_time) <= FLAT, "span_time": span(by_time)}
     for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         over = by_time[table["group"] == group]

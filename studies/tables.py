@@ -19,20 +19,18 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
     repetition failed is represented by a failed one if half of them or more failed.
     """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
-    errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["cpu_s"].to_numpy(float)
+    errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
     chosen, quartiles = [], []
     for run in np.split(np.arange(len(rows)), firsts[1:]):
         chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
         known = times[run][~np.isnan(times[run])]
         quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
-    found[["cpu_q1", "cpu_s", "cpu_q3"]] = np.array(quartiles)
-    if "build_s" in rows:  # which is measured once
-        found["build_s"] = np.fmax.reduceat(rows["build_s"].to_numpy(float), firsts)
+    found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
     return found.assign(repeats=np.diff(firsts, append=len(rows)))
 
 
-def time_for(rows: pd.DataFrame, target: float, what: str = "cpu_s") -> float:
+def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     """CPU time (or another cost) of one solver for an error of at most `target`; NaN where no run is so good.
 
     Between the two runs on either side of the target, on the log-log line through them: solvers whose settings lie
@@ -62,7 +60,7 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        solver, family, called_from, keeps_constraints, cpu_s, cpu_q1, cpu_q3, n_evaluations for this error (on the
+        solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on the
         log-log line between two runs), and violation_q, violation_v, energy of the cheapest run that is as good.
     """
     lines = []
@@ -71,18 +69,21 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         if np.isnan(cpu):
             continue
         good = runs[runs["error_q"] <= target]
-        run = good.loc[good["cpu_s"].astype(float).idxmin()]
+        run = good.loc[good["call_s"].astype(float).idxmin()]
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
-        line |= {"cpu_s": cpu, **{what: time_for(runs, target, what) for what in ("cpu_q1", "cpu_q3", "n_evaluations")}}
+        line |= {
+            "call_s": cpu,
+            **{what: time_for(runs, target, what) for what in ("call_q1", "call_q3", "n_evaluations")},
+        }
         lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
-    return pd.DataFrame(lines).sort_values("cpu_s", ignore_index=True) if lines else pd.DataFrame()
+    return pd.DataFrame(lines).sort_values("call_s", ignore_index=True) if lines else pd.DataFrame()
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
     """The first line of a ranking as a finding; None where there is none."""
     if ranked.empty:
         return None
-    keys = ("solver", "cpu_s", "n_evaluations", "called_from", "violation_q", "energy")
+    keys = ("solver", "call_s", "n_evaluations", "called_from", "violation_q", "energy")
     found = {key: ranked.iloc[0][key] for key in keys}
     kept, family = ranked.iloc[0][["keeps_constraints", "family"]]
     return found | {"keeps": bool(kept), "ours": bool(family == "two-loop")}
@@ -119,7 +120,7 @@ def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequen
             continue
         line = [solver, str(runs["called_from"].iloc[0])]
         for target in targets:
-            middle, low, high = (time_for(runs, target, what) for what in ("cpu_s", "cpu_q1", "cpu_q3"))
+            middle, low, high = (time_for(runs, target, what) for what in ("call_s", "call_q1", "call_q3"))
             line.append(why_not(runs) if np.isnan(middle) else with_quartiles(middle, low, high))
         lines.append(line)
     return lines

@@ -119,7 +119,7 @@ def make(output: Output) -> pd.DataFrame:
                     warm.add(what)
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore")
-                        warm_up(run, 0, COMPILING)
+                        warm_up(run, 0, set(), COMPILING)
                 kept.add(run.key(0), deceived.row_of(run) if run.group == deceived.DECEIVED else row_of(run))
         return pd.DataFrame([kept[run.key(0)] for run in todo])
 

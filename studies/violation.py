@@ -103,13 +103,13 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
     # where all runs of a solver are better than a target, its cost at the target is not known
     targets = [target for target in TARGETS if target <= min(one["error_q"].max(), two["error_q"].max())]
     found: dict[str, Any] = {"first": first, "second": second}
-    for what in ("n_evaluations", "cpu_s"):
+    for what in ("n_evaluations", "call_s"):
         ratios = [tables.time_for(one, target, what) / tables.time_for(two, target, what) for target in targets]
         ratios = [ratio for ratio in ratios if not np.isnan(ratio)]
         if not ratios:
             return None
         found[what] = [min(ratios), max(ratios)]
-    return found | {"dearer": found["cpu_s"][0] > 1.0, "cheaper": found["cpu_s"][1] < 1.0}
+    return found | {"dearer": found["call_s"][0] > 1.0, "cheaper": found["call_s"][1] < 1.0}
 
 
 def _told(row: pd.Series) -> dict[str, Any]:

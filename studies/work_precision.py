@@ -31,12 +31,11 @@ QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 SETTINGS = ("tol", "h", "err_out")
 PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP, behind.GROUP)  # groups of rows that are not of the four cases
-SLOW = 3.0  # s to build: quicker ones are not listed
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
-    """The runs of a case; of those called from Python on stiff ones, which take seconds, fewer and once."""
+    """The runs of a case; of those called from Python on stiff ones, which take seconds, fewer."""
     stiff = "stiff" in case.tags
     if quick:
         return runs_of(case, QUICK, quick)
@@ -44,8 +43,7 @@ def runs(case: Case, quick: bool) -> list[Run]:
     if not stiff:
         return made
     coarse = (case.tolerances or TOLERANCES)[::2]
-    once = [replace(run, repeats=1) if run.solver.called_from == "Python" else run for run in made]
-    return [run for run in once if run.repeats > 1 or run.value in coarse]
+    return [run for run in made if run.solver.called_from != "Python" or run.value in coarse]
 
 
 def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
@@ -56,10 +54,10 @@ def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     if ranked.empty:
         return found
     found["ida"] = tables.best(ranked[ranked["family"] == "SUNDIALS"])
-    default = ranked[ranked["solver"] == DEFAULT]["cpu_s"]
+    default = ranked[ranked["solver"] == DEFAULT]["call_s"]
     if not default.empty:
-        own, cheaper = ranked["family"] == "two-loop", ranked["cpu_s"] < default.iloc[0]
-        found["default_over"] = float(default.iloc[0] / ranked[own]["cpu_s"].iloc[0])
+        own, cheaper = ranked["family"] == "two-loop", ranked["call_s"] < default.iloc[0]
+        found["default_over"] = float(default.iloc[0] / ranked[own]["call_s"].iloc[0])
         kinds = {"ours": own, "others": ~own}
         found["before_default"] = {kind: ranked[cheaper & which]["solver"].tolist() for kind, which in kinds.items()}
     return found
@@ -78,7 +76,7 @@ def out_of_phase(runs: pd.DataFrame) -> list[dict[str, Any]]:
         setting = next(name for name in SETTINGS if name in own and own[name].notna().any())
         run = own.loc[own[setting].astype(float).idxmin()]
         line = {"solver": str(solver), "setting": setting, "value": float(run[setting])}
-        found.append(line | {key: float(run[key]) for key in ("error_q", "cpu_s")})
+        found.append(line | {key: float(run[key]) for key in ("error_q", "call_s")})
     return found
 
 
@@ -91,7 +89,7 @@ def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any
     found = []
     for solver, own in costs.items():
         over = {
-            other: {place: line["cpu_s"] / theirs[place]["cpu_s"] for place, line in own.items()}
+            other: {place: line["call_s"] / theirs[place]["call_s"] for place, line in own.items()}
             for other, theirs in costs.items()
             if other != solver and own.keys() <= theirs.keys()
         }
@@ -107,7 +105,7 @@ def dominated(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, Any
             "n": len(own),
             "called_from": mine["called_from"],
         }
-        line |= {"case": where[0], "error": where[1], "cpu_s": mine["cpu_s"], "by_s": theirs["cpu_s"]}
+        line |= {"case": where[0], "error": where[1], "call_s": mine["call_s"], "by_s": theirs["call_s"]}
         found.append(line | {"evaluations": mine["n_evaluations"] / theirs["n_evaluations"]})
     return found
 
@@ -175,7 +173,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings["behind"] = behind.findings_of(found, everywhere, operations.to_dict(), operation_ns)
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    findings |= {"fitted": scaling.FITTED, "slow": SLOW}
+    findings |= {"fitted": scaling.FITTED}
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)
     text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)

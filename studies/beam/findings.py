@@ -27,7 +27,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     cases = [_case(rows, runs[runs["case"] == case], case, w_max[case]) for case in (SOFT, STIFF)]
     found: dict[str, Any] = {"targets": list(TARGETS), "t_end": float(runs["t_end"].iloc[0]), "cases": cases}
     soft, stiff = (case["paper"] for case in cases)
-    found |= {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "cpu_s", "printed_s")}
+    found |= {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "call_s", "printed_s")}
     found["growth_w_max"] = w_max[STIFF] / w_max[SOFT]
     found["growth_as_frequency"] = bool(0.5 < found["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
     own = runs[(runs["solver"] == EXUDYN) & runs["error_tip"].notna()]
@@ -46,7 +46,7 @@ def _of(rows: pd.DataFrame, group: str, **equal: Any) -> pd.DataFrame:
 
 def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> dict[str, Any]:
     paper = _of(runs, "run", solver=PAPER, tol=PAPER_TOL).iloc[0]
-    ours: dict[str, Any] = {key: float(paper[key]) for key in ("n_steps", "n_evaluations", "cpu_s", "h_median")}
+    ours: dict[str, Any] = {key: float(paper[key]) for key in ("n_steps", "n_evaluations", "call_s", "h_median")}
     ours |= {"error": paper["error_tip"], "floor": float(paper["floor"]), "printed_s": PAPER_SECONDS[name]}
     ours["given_up"] = float(paper["n_rejected_convergence"] / (paper["n_steps"] + paper["n_rejected"]))
     ours["printed_h"] = PAPER_STEPS[name]
@@ -72,7 +72,7 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
 def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     """Who is cheapest at one error on one beam: of all, of ours, of others; and the paper's."""
     ranked = tables.ranking(runs, error)
-    seconds = dict(zip(ranked["solver"], ranked["cpu_s"], strict=True)) if len(ranked) else {}
+    seconds = dict(zip(ranked["solver"], ranked["call_s"], strict=True)) if len(ranked) else {}
     found: dict[str, Any] = {"error": error, "best": tables.best(ranked)}
     found |= {**tables.of_both(ranked), "differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
     found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
@@ -81,7 +81,7 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
         for names in ((IDA_C, IDA_C_ORDER_2), (NEWMARK, QUARTER))
     )
     if ida is not None and found["ours"] is not None:
-        found["ida_over_ours"] = ida / found["ours"]["cpu_s"]
+        found["ida_over_ours"] = ida / found["ours"]["call_s"]
     if PAPER in seconds:
         found["paper_over_best"] = seconds[PAPER] / min(seconds.values())
         found["newmark_over_paper"] = None if newmark is None else newmark / seconds[PAPER]

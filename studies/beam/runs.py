@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies.bench import Array, Case, Run, Solver
+from studies.bench import REPEATS, Array, Case, Run, Solver
 from studies.cases import beam
 from studies.cases.beam import SOFT, STIFF
 from studies.metrics import ASTRAY, deviation
@@ -99,7 +99,7 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
             values = OWN_VALUES.get(name, values)
             if quick:
                 values = (PAPER_TOL,) if name == PAPER else QUICK_TOLERANCES
-            repeats = 1 if quick or solver.called_from == "Python" else 3
+            repeats = 1 if quick else REPEATS
             yield from (Run(case, solver, value, "run", repeats) for value in values)
 
 

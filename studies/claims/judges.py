@@ -71,7 +71,7 @@ def projection_inefficient(rows: Rows) -> Judgement:
     ratios: list[float] = []
     for names in (("IDA, stabilised", "IDA, index1"), ("DOP853, projected", "DOP853, index 1")):
         with_it, without = (rows.long("table3", solver=name, problem=DEFAULT) for name in names)
-        for what in ("n_evaluations", "cpu_s"):
+        for what in ("n_evaluations", "call_s"):
             ratios += common_costs(with_it, without, TARGETS, what)
     return decide((ratio > DEARER for ratio in ratios), ratio=span(ratios))
 
@@ -176,7 +176,7 @@ def gstiff(rows: Rows, part: str) -> Judgement:
 def stand_in_as_foil(rows: Rows) -> Judgement:
     ours = rows.long("table3", solver=IRK_LINE, problem=DEFAULT)
     theirs = rows.long("motion", group=GSTIFF_GROUP, solver=gear(5))
-    ratios = common_costs(theirs, ours, TIPS, "cpu_s")
+    ratios = common_costs(theirs, ours, TIPS, "call_s")
     return decide((ratio > 1.0 for ratio in ratios), ratio=span(ratios))
 
 
@@ -199,8 +199,8 @@ def tolerances_and_steps(rows: Rows) -> Judgement:
 def _influence(rows: Rows, group: str, coarsest: float) -> tuple[float, ...]:
     """Mean factors in time from `coarsest` to 1e-9: of err_in at every err_out from there on, and the reverse."""
     out = [e for e in TOLERANCES if e <= coarsest]
-    by_in = [rows.cell(group, FINEST, e)["cpu_s"] / rows.cell(group, coarsest, e)["cpu_s"] for e in out]
-    by_out = [rows.cell(group, e, FINEST)["cpu_s"] / rows.cell(group, e, coarsest)["cpu_s"] for e in out]
+    by_in = [rows.cell(group, FINEST, e)["call_s"] / rows.cell(group, coarsest, e)["call_s"] for e in out]
+    by_out = [rows.cell(group, e, FINEST)["call_s"] / rows.cell(group, e, coarsest)["call_s"] for e in out]
     return tuple(float(np.exp(np.log(np.asarray(each, dtype=float)).mean())) for each in (by_in, by_out))
 
 
@@ -230,7 +230,7 @@ def irk_star(rows: Rows) -> Judgement:
 
 
 def fourteen_times(rows: Rows) -> Judgement:
-    ratios: dict[str, list[float]] = {"cpu_s": [], "n_evaluations": []}
+    ratios: dict[str, list[float]] = {"call_s": [], "n_evaluations": []}
     for problem in dict.fromkeys(rows.long("table3", group=IRK_GROUP)["problem"]):
         slow, fast = (rows.cell(group, FINEST, FINEST, problem) for group in (NEWMARK_GROUP, IRK_GROUP))
         for what, each in ratios.items():
@@ -241,7 +241,7 @@ def fourteen_times(rows: Rows) -> Judgement:
 
 def table_3_seconds(rows: Rows) -> Judgement:
     parts = (cells(rows.long("table3", problem=DEFAULT, group=group)) for group in (IRK_GROUP, NEWMARK_GROUP))
-    irk, newmark = (span(part["paper"] / part["cpu_s"]) for part in parts)
+    irk, newmark = (span(part["paper"] / part["call_s"]) for part in parts)
     return decide([max(irk + newmark) <= FLAT * min(irk + newmark)], irk=irk, newmark=newmark)
 
 
@@ -263,9 +263,11 @@ def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
     for name in (NEWMARK, QUARTER):
         for problem in dict.fromkeys(rows.long("table3")["problem"]):
             one, other = (_along(rows, solver, problem) for solver in (name, IRK_LINE))
-            ratios["linkage"] += common_costs(one, other, tuple(e for e in ERRORS if e < one["error_q"].max()), "cpu_s")
+            ratios["linkage"] += common_costs(
+                one, other, tuple(e for e in ERRORS if e < one["error_q"].max()), "call_s"
+            )
         for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
-            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), TIPS, "cpu_s")
+            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), TIPS, "call_s")
     return ratios
 
 
@@ -314,12 +316,12 @@ def beams_work(rows: Rows) -> Judgement:
 
 def grows_a_lot(rows: Rows) -> Judgement:
     soft, stiff = (_paper_on(rows, case) for case in BEAMS)
-    time, evaluations = (float(stiff[what] / soft[what]) for what in ("cpu_s", "n_evaluations"))
+    time, evaluations = (float(stiff[what] / soft[what]) for what in ("call_s", "n_evaluations"))
     return decide([min(time, evaluations) >= A_LOT], time=time)
 
 
 def beam_seconds(rows: Rows) -> Judgement:
-    over = [seconds / float(_paper_on(rows, case)["cpu_s"]) for seconds, case in zip(SECONDS, BEAMS, strict=True)]
+    over = [seconds / float(_paper_on(rows, case)["call_s"]) for seconds, case in zip(SECONDS, BEAMS, strict=True)]
     return decide([max(over) <= FLAT * min(over)], soft=over[0], stiff=over[1])
 
 

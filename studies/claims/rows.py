@@ -47,7 +47,7 @@ def read(folder: Path) -> dict[str, pd.DataFrame]:
 def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
     if name == "beam" and "error_tip" in table:  # the error by which the beams are judged
         table["error_q"] = table["error_tip"]
-    if {"repeat", "error_q", "cpu_s"} <= set(table):
+    if {"repeat", "error_q", "call_s"} <= set(table):
         repeated = table[table["repeat"].notna()]
         table = pd.concat([tables.medians(repeated), table[table["repeat"].isna()]], ignore_index=True)
     for column in {"lost", "astray"} & set(table):  # no value: the run gave no result

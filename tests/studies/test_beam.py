@@ -39,7 +39,7 @@ def rows(t_end=2.0):
         for solver, seconds in times.items():
             for k, error in enumerate((1e-1, 5e-3, 5e-4, 5e-5)):
                 line = {"case": case, "solver": solver, "family": families.get(solver, "two-loop"), "error_q": error}
-                line |= {"error_tip": error, "cpu_s": factor * seconds * (k + 1), "n_evaluations": factor * 1e5}
+                line |= {"error_tip": error, "call_s": factor * seconds * (k + 1), "n_evaluations": factor * 1e5}
                 line |= {"n_steps": factor * 1e3, "h_median": 1.0 / W_MAX[case]}
                 made.append({**common, **line, "tol": PAPER_TOL if solver == PAPER and k == 3 else 10.0**-k})
     for solver, theory in ((GAUSS_SEIDEL, 3.221), (JACOBI, 4.64)):
@@ -67,23 +67,23 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     found = found_of(tmp_path, rows())["cases"][1]
     assert [at["error"] for at in found["at"]] == [1e-2, 1e-3, 1e-4] == list(TARGETS)
     assert found["one_best"] and found["at"][0]["best"]["solver"] == NEWTON
-    assert found["at"][0]["ours"]["cpu_s"] == pytest.approx(0.85, abs=0.01)
-    assert found["at"][0]["others"]["cpu_s"] == pytest.approx(1.7, abs=0.02)
+    assert found["at"][0]["ours"]["call_s"] == pytest.approx(0.85, abs=0.01)
+    assert found["at"][0]["others"]["call_s"] == pytest.approx(1.7, abs=0.02)
     assert found["newmark_cheaper"] == list(TARGETS) and found["newmark_dearer"] == []
     made = rows()
-    made.loc[made["solver"] == IDA_C_ORDER_2, "cpu_s"] /= 100.0
-    made.loc[made["solver"] == PAPER, "cpu_s"] /= 100.0
+    made.loc[made["solver"] == IDA_C_ORDER_2, "call_s"] /= 100.0
+    made.loc[made["solver"] == PAPER, "call_s"] /= 100.0
     found = found_of(tmp_path, made)["cases"][1]
     assert found["one_best"] and found["at"][0]["best"]["solver"] == IDA_C_ORDER_2
     assert not found["at"][0]["best"]["ours"]
     assert found["newmark_cheaper"] == [] and found["newmark_dearer"] == list(TARGETS)
     made = rows()
-    made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "cpu_s"] = 1e-3
+    made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "call_s"] = 1e-3
     found = found_of(tmp_path, made)["cases"][1]
     assert [at["best"]["solver"] for at in found["at"]] == [IDA_C_ORDER_2, IDA_C_ORDER_2, NEWTON]
     made = rows()
     loosest = made["error_tip"] > 1e-3
-    made.loc[(made["solver"] == PAPER) & loosest & (made["case"] == STIFF), "cpu_s"] = 0.1
+    made.loc[(made["solver"] == PAPER) & loosest & (made["case"] == STIFF), "call_s"] = 0.1
     found = found_of(tmp_path, made)["cases"][1]
     assert (found["newmark_cheaper"], found["newmark_dearer"]) == ([1e-4], [1e-2, 1e-3])
 
@@ -132,7 +132,7 @@ def test_failures_and_what_is_not_there_are_told(tmp_path):
     made = rows()
     peer = made[made["solver"] == IDA_C].iloc[:1].assign(status="NOT_AVAILABLE", message="it is not installed")
     without = made[made["solver"] != IDA_C]
-    numbers = ["error_q", "error_tip", "cpu_s", "n_evaluations", "n_steps", "h_median"]
+    numbers = ["error_q", "error_tip", "call_s", "n_evaluations", "n_steps", "h_median"]
     peer = peer.assign(**dict.fromkeys(numbers, np.nan))
     assert found_of(tmp_path, pd.concat([peer, without], ignore_index=True))["cases"][0]["failed"] == [f"{IDA_C} (all)"]
     assert found_of(tmp_path, made)["cases"][0]["failed"] == []
@@ -143,7 +143,7 @@ def test_failures_and_what_is_not_there_are_told(tmp_path):
 @pytest.mark.usefixtures("unsaved")
 def test_exudyn_is_judged_by_its_own_motion_and_not_ranked(tmp_path):
     made = rows()
-    made.loc[made["solver"] == EXUDYN, "cpu_s"] = 1e-6
+    made.loc[made["solver"] == EXUDYN, "call_s"] = 1e-6
     found = found_of(tmp_path, made)
     assert found["cases"][0]["at"][0]["best"]["solver"] != EXUDYN and found["exudyn"] == ["1e-6", "1e-6"]
     assert found_of(tmp_path, made[made["solver"] != EXUDYN])["exudyn"] == []

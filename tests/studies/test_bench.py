@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from references.driver import user_call
 from studies import bench
 from studies.bench import Case, NotApplicable, Run, Solver, collect
 from studies.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
@@ -198,13 +199,31 @@ def test_an_interrupted_result_stops_the_collector(kept):
         row(kept, run)
 
 
-def test_processes_make_the_same_rows(kept, tmp_path):
-    runs = [Run(case(), solver(ours), tolerance, repeats=1) for tolerance in (1e-5, 1e-7)]
+def test_the_time_is_that_of_the_whole_call_or_of_what_an_adapter_marks(kept):
+    def beside():  # what a call does beside the integration
+        end = time.process_time() + 0.02
+        while time.process_time() < end:
+            pass
+
+    def whole(case, value, repeat):
+        beside()
+        return ours(case, value, repeat)
+
+    marks = []
+
+    def marked(case, value, repeat):
+        beside()
+        with user_call:
+            result = ours(case, value, repeat)
+        marks.append(user_call.seconds)
+        beside()
+        return result
+
     with kept:
-        one = collect(runs, kept)
-    with KeptRows(tmp_path / "y.jsonl", {}) as other:
-        two = collect(runs, other, processes=2)
-    assert one["error_q"].tolist() == two["error_q"].tolist()
+        both = collect([Run(case(), solver(run, run.__name__), 1e-6, repeats=1) for run in (marked, whole)], kept)
+    call, inside = (both.set_index("solver")[name] for name in ("call_s", "inside_s"))
+    assert call["marked"] == marks[-1] >= inside["marked"]
+    assert call["whole"] >= 0.02 + inside["whole"] > 0.02
 
 
 def test_two_equal_runs_are_refused(kept):

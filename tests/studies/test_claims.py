@@ -35,7 +35,7 @@ def table3():
             seconds = (PAPER_IRK if solver == IRK else PAPER_NEWMARK)[i][j]
             cpu = 2.5 * (1.0 + 0.1 * i) * (1.0 + 0.2 * j) if solver == IRK else 0.5 * 4.0**j * (1.0 + 0.01 * i)
             row = {"group": group, "solver": solver, "problem": problem, "err_in": e_in, "err_out": e_out}
-            row |= {"cpu_s": cpu, "n_evaluations": 1e6 * cpu, "n_steps": 1600.0 if solver == IRK else 4e3 * 4.0**j}
+            row |= {"call_s": cpu, "n_evaluations": 1e6 * cpu, "n_steps": 1600.0 if solver == IRK else 4e3 * 4.0**j}
             row |= {"lost": seconds is None, "astray": j == 0, "error_q": 2.0 / 16.0**j, "y3_max": 0.01 * (j == 0)}
             rows.append(row | {"violation_q": 1e-9 * e_in, "n_inner": 1e5, "n_rejected": 10.0})
         if i == j:
@@ -46,21 +46,21 @@ def table3():
                 (QUARTER, 1e-9, 2 * cost),
             ):
                 row = {"group": "comparison", "solver": solver, "problem": problem, "err_in": err_in, "error_q": error}
-                rows.append(row | {"cpu_s": cpu, "n_evaluations": 1e5 * cpu, "violation_q": 1e-15})
+                rows.append(row | {"call_s": cpu, "n_evaluations": 1e5 * cpu, "violation_q": 1e-15})
             for solver, cpu, drift in (("index 1", 1.0, 100.0), ("projected", 0.9, 1.0)):
                 row = {"group": "comparison", "solver": f"DOP853, {solver}", "problem": problem, "error_q": error}
                 row |= {"violation_early": 1e-15, "violation_late": 1e-15 * drift, "violation_q": 1e-15 * drift}
-                rows.append(row | {"cpu_s": cpu * (j + 1), "n_evaluations": 1e4 * cpu * (j + 1)})
+                rows.append(row | {"call_s": cpu * (j + 1), "n_evaluations": 1e4 * cpu * (j + 1)})
             for solver, cpu in (("index1", 1.0), ("stabilised", 1.1)):
                 row = {"group": "comparison", "solver": f"IDA, {solver}", "problem": problem, "error_q": error}
                 row |= {"violation_early": 1e-6, "violation_late": 1e-3, "violation_q": 1e-6}
-                rows.append(row | {"cpu_s": cpu * (j + 1), "n_evaluations": 1e4 * cpu * (j + 1)})
+                rows.append(row | {"call_s": cpu * (j + 1), "n_evaluations": 1e4 * cpu * (j + 1)})
     return pd.DataFrame([GOOD | row for row in rows])
 
 
 def motion():
     """The line-up and the stand-in for Gstiff, which fits from order 2 on."""
-    near = {"error_y3": 5e-3, "error_y3_short": 1e-6, "top": 0.0, "top_late": -1e-4, "energy": -2e-3, "cpu_s": 0.3}
+    near = {"error_y3": 5e-3, "error_y3_short": 1e-6, "top": 0.0, "top_late": -1e-4, "energy": -2e-3, "call_s": 0.3}
     rows = [{"group": "line-up", "solver": solver, "error_q": 0.02, **near} for solver in (IRK, NEWMARK, *IMPLICIT)]
     for order, (h, short, long, cpu) in itertools.product(
         GEAR_ORDERS, ((0.02, 0.02, 0.7, 0.03), (0.01, 5e-3, 0.5, 0.06), (0.001, 1e-9, 1e-5, 0.5))
@@ -71,7 +71,7 @@ def motion():
             "h": h,
             "error_y3_short": short * (3.0 if order == 1 else 1.0),
         }
-        rows.append(row | {"error_y3": long, "error_q": long, "cpu_s": cpu, "astray": h > 0.001})
+        rows.append(row | {"error_y3": long, "error_q": long, "call_s": cpu, "astray": h > 0.001})
     return pd.DataFrame([GOOD | row for row in rows]).assign(kinetic=22.0, range_y3=0.7)
 
 
@@ -91,9 +91,9 @@ def beam():
                 for name in ("DOP853, projected", "DOP853 (two-loop)", "RadauIIA5, by differences")
             ),
         ):
-            row = {"group": "run", "case": case, "solver": solver, "tol": tol, "error_tip": error, "cpu_s": cpu * slow}
+            row = {"group": "run", "case": case, "solver": solver, "tol": tol, "error_tip": error, "call_s": cpu * slow}
             if solver in (NEWMARK, QUARTER) and slow > 1.0:
-                row["error_tip"], row["cpu_s"] = 1e-3 * error, 0.3 * cpu * slow
+                row["error_tip"], row["call_s"] = 1e-3 * error, 0.3 * cpu * slow
             row |= {
                 "n_evaluations": 1e6 * cpu * slow,
                 "n_steps": 6e3,
@@ -225,8 +225,14 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("index_1_drifts", "table3", "solver == solver", {"violation_late": 1e-15}, FAILS),
     ("baumgarte_inexact", "violation", "group == 'tolerances'", {"violation_q": 1e-5}, HOLDS),
     ("projection_exact", "table3", "solver == 'IDA, stabilised'", {"violation_q": 0.0}, HOLDS),
-    ("projection_inefficient", "table3", "solver.str.contains('stab|proj')", {"cpu_s": 9, "n_evaluations": 1e9}, HOLDS),
-    ("jacobian_difficult", "beam", "solver.str.contains('differences')", {"cpu_s": 99.0}, HOLDS),
+    (
+        "projection_inefficient",
+        "table3",
+        "solver.str.contains('stab|proj')",
+        {"call_s": 9, "n_evaluations": 1e9},
+        HOLDS,
+    ),
+    ("jacobian_difficult", "beam", "solver.str.contains('differences')", {"call_s": 99.0}, HOLDS),
     ("constraints_kept", "violation", "solver == 'PaperIRK'", {"growth_q": 1.0, "late_q": 1e-13}, FAILS),
     ("constraints_kept", "violation", "solver == 'PaperIRK'", {"violation_a": 1e-9}, FAILS),
     ("stiff_applicable", "beam", "case == 'moderately stiff'", {"h_median": 1e-2}, HOLDS),
@@ -236,25 +242,25 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("agree_and_reach", "motion", "solver == 'PaperIRK'", {"error_y3_short": 0.1}, FAILS),
     ("gstiff_short", "motion", "h == 0.02", {"error_y3_short": 1e-3}, FAILS),
     ("gstiff_long", "motion", "h == 0.01", {"error_y3": 1e-3}, FAILS),
-    ("stand_in_as_foil", "motion", "h > 0", {"cpu_s": 99.0}, CONSISTENT),
+    ("stand_in_as_foil", "motion", "h > 0", {"call_s": 99.0}, CONSISTENT),
     ("large_steps", "step_size", "solver == 'PaperIRK'", {"share_time": 0.4}, PART),
     ("tolerances_and_steps", "table3", "err_in == 1e-3", {"n_steps": 1.0}, PART),
     ("tolerances_and_steps", "table3", "solver == solver", {"n_steps": 9.0}, FAILS),
-    ("newmark_tolerances", "table3", "solver == 'PaperNewmark (beta = 1/2)'", {"cpu_s": 1.0}, FAILS),
-    ("irk_tolerances", "table3", "solver == 'PaperIRK' and err_in == 1e-9", {"cpu_s": 99.0}, HOLDS),
+    ("newmark_tolerances", "table3", "solver == 'PaperNewmark (beta = 1/2)'", {"call_s": 1.0}, FAILS),
+    ("irk_tolerances", "table3", "solver == 'PaperIRK' and err_in == 1e-9", {"call_s": 99.0}, HOLDS),
     ("newmark_star", "table3", "solver == 'PaperNewmark (beta = 1/2)'", {"lost": True}, FAILS),
     ("irk_star", "table3", "solver == 'PaperIRK'", {"astray": False, "y3_max": 0.0}, CIRCULAR),
-    ("fourteen_times", "table3", "solver == 'PaperIRK'", {"cpu_s": 0.01, "n_evaluations": 1e3}, HOLDS),
+    ("fourteen_times", "table3", "solver == 'PaperIRK'", {"call_s": 0.01, "n_evaluations": 1e3}, HOLDS),
     ("works_long", "motion", "solver == 'PaperIRK'", {"astray": True}, FAILS),
-    ("more_efficient", "beam", "solver.str.startswith('PaperNewmark')", {"cpu_s": 99.0}, HOLDS),
-    ("more_efficient", "table3", "solver.str.startswith('PaperNewmark')", {"cpu_s": 1e-6}, FAILS),
-    ("because_of_order", "beam", "solver.str.startswith('PaperNewmark')", {"cpu_s": 99.0}, HOLDS),
+    ("more_efficient", "beam", "solver.str.startswith('PaperNewmark')", {"call_s": 99.0}, HOLDS),
+    ("more_efficient", "table3", "solver.str.startswith('PaperNewmark')", {"call_s": 1e-6}, FAILS),
+    ("because_of_order", "beam", "solver.str.startswith('PaperNewmark')", {"call_s": 99.0}, HOLDS),
     ("implicit_needed", "beam", "solver.str.startswith('DOP')", {"n_evaluations": 1e9}, HOLDS),
     ("soft_step", "beam", "solver == 'PaperIRK'", {"h_median": 1e-3}, HOLDS),
     ("stiff_step", "beam", "solver == 'PaperIRK'", {"h_median": 1e-3}, FAILS),
     ("beams_work", "beam", "case == 'very flexible'", {"error_q": 0.1}, PART),
-    ("grows_a_lot", "beam", "solver == 'PaperIRK'", {"cpu_s": 1.0}, FAILS),
-    ("beam_seconds", "beam", "case == 'moderately stiff'", {"cpu_s": 111.6}, HOLDS),
+    ("grows_a_lot", "beam", "solver == 'PaperIRK'", {"call_s": 1.0}, FAILS),
+    ("beam_seconds", "beam", "case == 'moderately stiff'", {"call_s": 111.6}, HOLDS),
     ("any_method", "motion", "solver == 'BDF'", {"status": "NOT_CONVERGED"}, PART),
     ("beams_work", "beam", "case == 'very flexible'", {"error_q": np.nan}, NOT_RUN),
     ("every_stage", "ablation", "solver == 'projected once a step'", {"n_evaluations": 1e6, "cpu_s": 9.0}, HOLDS),
@@ -303,7 +309,7 @@ def test_one_factor_of_the_machine_would_be_seen(tables):
     for group, paper in (("Table 3: IRK", PAPER_IRK), ("Table 3: Newmark", PAPER_NEWMARK)):
         for (i, e_in), (j, e_out) in itertools.product(enumerate(TOLERANCES), repeat=2):
             place = (table["group"] == group) & (table["err_in"] == e_in) & (table["err_out"] == e_out)
-            table.loc[place, "cpu_s"] = (paper[i][j] or 1.0) / 10.0
+            table.loc[place, "call_s"] = (paper[i][j] or 1.0) / 10.0
     assert verdict("table_3_seconds", tables) is HOLDS
 
 

@@ -74,7 +74,7 @@ def findings(**rows):
     common = {"keeps_constraints": True, "called_from": "compiled", "floor": 1e-10, "status": "REACHED_END"}
     common |= {"violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "n_evaluations": 1.0}
     lines = [
-        {"solver": name, "family": family, "error_q": error, "cpu_s": cpu, "cpu_q1": cpu, "cpu_q3": cpu, **common}
+        {"solver": name, "family": family, "error_q": error, "call_s": cpu, "call_q1": cpu, "call_q3": cpu, **common}
         for name, (family, error, cpu) in rows.items()
     ]
     return compare.findings_of(pd.DataFrame(lines), case, (1e-4,)) | {"source": "", "published": None}

@@ -32,7 +32,7 @@ RUNS = [  # case, end, solver, family, called from, tolerance, repetition, CPU, 
     ("crane", 0.5, "Adams", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
     ("swing", 1.0, "Adams", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
 ]
-COLUMNS = ["case", "t_end", "solver", "family", "called_from", "tol", "repeat", "cpu_s", "status", "message"]
+COLUMNS = ["case", "t_end", "solver", "family", "called_from", "tol", "repeat", "call_s", "status", "message"]
 COLUMNS += ["n_evaluations", "error_q", "energy"]
 CRANE, SHORT, SWING = (f"{name} s (work_precision)" for name in ("crane, 9", "crane, 0.5", "swing, 1"))
 
@@ -157,7 +157,7 @@ def test_the_data_are_the_rows(folder):
     place = {name: k for k, name in enumerate(data["columns"])}
     assert len(data["runs"]) == 9  # of the three repetitions the median
     first = data["runs"][0]
-    assert [first[place[name]] for name in ("setting", "cpu_s", "error_q", "energy")] == ["tol 1e-4", 0.02, 1e-4, 1e-5]
+    assert [first[place[name]] for name in ("setting", "call_s", "error_q", "energy")] == ["tol 1e-4", 0.02, 1e-4, 1e-5]
     assert data["runs"][3][place["said"]] == "TIME_LIMIT: Stopped"
     assert data["runs"][3][place["error_q"]] is None
     assert [run[place["said"]] for run in data["runs"] if run[place["error_q"]] == 2.5] == [

@@ -93,7 +93,7 @@ def test_redraw_writes_the_same_report(quick):
 def test_findings_answer_the_first_screen(quick):
     found = json.loads((quick / "energy.json").read_text())["long"]
     ours = found["no_drift"]["ours"]
-    assert ours["calm"] and ours["keeps"] and ours["cpu_s"] > 0.0
+    assert ours["calm"] and ours["keeps"] and ours["call_s"] > 0.0
     assert [at["share"] for at in found["at"]] == [1e-3, 1e-5, 1e-7]
     assert {IDA_C, "LSODA, index 1", "Exudyn, GeneralizedAlpha"} <= {run["solver"] for run in found["alternatives"]}
 
@@ -174,13 +174,13 @@ def test_all_controlled_runs_drift_or_not(rows, found_of):
 
 def test_freedom_from_drift_pays_where_it_is_cheaper(rows, found_of):
     where = f"case == '{SWITCHING}'"
-    rows = changed(rows, where, slope=1.0, slope_error=0.0, cpu_s=1.0, energy=1e-9)
+    rows = changed(rows, where, slope=1.0, slope_error=0.0, call_s=1.0, energy=1e-9)
     even = f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}' and partition == 'symmetric'"
-    pays = changed(rows.copy(), even, slope=0.0, cpu_s=0.1)
+    pays = changed(rows.copy(), even, slope=0.0, call_s=0.1)
     found = found_of(pays)["long"]
     assert found["n_pays"] == len(found["at"]) == 3 and found["no_drift"]["others"] is None
     for cpu, equal in ((0.95, 3), (1.05, 3), (10.0, 0)):
-        found = found_of(changed(pays, even, cpu_s=cpu))["long"]
+        found = found_of(changed(pays, even, call_s=cpu))["long"]
         assert (found["n_pays"], found["n_equal"]) == (0, equal)
     assert found_of(changed(pays, where, slope=1.0))["long"]["no_drift"]["ours"] is None
 

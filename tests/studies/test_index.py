@@ -60,14 +60,20 @@ def test_one_study_runs_by_its_name(monkeypatch):
     assert ran == [["--quick"]]
 
 
-BEST = {"solver": "ours", "cpu_s": 0.1, "cpu_q1": 0.1, "cpu_q3": 0.1, "n_evaluations": 1e5, "keeps": True}
+BEST = {"solver": "ours", "call_s": 0.1, "call_q1": 0.1, "call_q3": 0.1, "n_evaluations": 1e5, "keeps": True}
 BEST |= {"called_from": "compiled", "violation_q": 1e-15, "energy": -1e-3}
-THEIRS = BEST | {"solver": "theirs", "cpu_s": 0.2, "keeps": False, "called_from": "Python", "n_evaluations": 1e4}
+THEIRS = BEST | {"solver": "theirs", "call_s": 0.2, "keeps": False, "called_from": "Python", "n_evaluations": 1e4}
 NOTHING = {"ours": None, "others": None, "ida": None, "default_over": None}
 
 
 def at_error(error=1e-4, **changed):
-    return {"error": error, "ours": BEST, "others": THEIRS, "ida": BEST | {"cpu_s": 0.3}, "default_over": 2.0} | changed
+    return {
+        "error": error,
+        "ours": BEST,
+        "others": THEIRS,
+        "ida": BEST | {"call_s": 0.3},
+        "default_over": 2.0,
+    } | changed
 
 
 def case(**changed):
@@ -77,8 +83,8 @@ def case(**changed):
     return found | changed
 
 
-def long_run(name, cpu_s, calm=True):
-    run = BEST | {"name": name, "cpu_s": cpu_s, "calm": calm, "drifts": not calm, "energy": 2e-3, "drift": 0.1}
+def long_run(name, call_s, calm=True):
+    run = BEST | {"name": name, "call_s": call_s, "calm": calm, "drifts": not calm, "energy": 2e-3, "drift": 0.1}
     return run | {"verdict": "no drift" if calm else "drifts", "n_evaluations": None}
 
 
@@ -99,7 +105,7 @@ def energy(**changed):
 
 
 def beam(differences_s, paper_s=4.5):
-    at = {"error": 1e-4, "paper_s": paper_s, "differences_s": differences_s, "best": {"solver": "IDA", "cpu_s": 0.01}}
+    at = {"error": 1e-4, "paper_s": paper_s, "differences_s": differences_s, "best": {"solver": "IDA", "call_s": 0.01}}
     return {"cases": [{"name": "moderately stiff", "at": [at]}]}
 
 
@@ -124,7 +130,7 @@ def front(tmp_path, cases, **others):
 
 
 WORSE = {"solver": "slow", "by": "ours", "factor": 3.0, "n": 6, "called_from": "Python"}
-WORSE |= {"case": "crane", "error": 1e-4, "cpu_s": 0.6, "by_s": 0.2, "evaluations": 1.5}
+WORSE |= {"case": "crane", "error": 1e-4, "call_s": 0.6, "by_s": 0.2, "evaluations": 1.5}
 
 
 def entries(cases, **others):
@@ -139,7 +145,7 @@ def test_the_cheapest_are_found_among_ours_and_others():
     assert entry["ida_over"] == pytest.approx([3.0]) and entry["ida_misses"] == []
     assert index.per_evaluation([entry]) == {"compiled": pytest.approx([1.0]), "Python": pytest.approx([20.0])}
 
-    faster = at_error(others=THEIRS | {"cpu_s": 0.05}, ida=None)
+    faster = at_error(others=THEIRS | {"call_s": 0.05}, ida=None)
     made = entries([case(name="hoist", at=[at_error(), faster, at_error(error=1e-6)])])
     assert index.overall(made) == [{"solver": "ours", "n": 2}, {"solver": "theirs", "n": 1}]
     assert made[0]["ida_misses"] == ["1e-4"]
@@ -175,7 +181,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
 
 
 def test_mechanisms_of_a_class_with_the_same_picks_are_told_together():
-    cheaper = case(name="hoist", at=[at_error(ours=BEST | {"cpu_s": 0.05}, ida=None)])
+    cheaper = case(name="hoist", at=[at_error(ours=BEST | {"call_s": 0.05}, ida=None)])
     mine = case(name="robot", at=[at_error(ours=BEST | {"solver": "mine"})])
     groups = index.advice(entries([case(), cheaper, mine]))
     assert [[entry["name"] for entry in group] for group in groups] == [["crane", "hoist"], ["robot"]]
@@ -184,14 +190,14 @@ def test_mechanisms_of_a_class_with_the_same_picks_are_told_together():
 WHAT_MAY_BE_FOUND = {
     "nothing else": {},
     "no others": {"at": [at_error(others=None), at_error(error=1e-2)]},
-    "others are faster": {"at": [at_error(others=THEIRS | {"cpu_s": 0.05}, ida=None)]},
+    "others are faster": {"at": [at_error(others=THEIRS | {"call_s": 0.05}, ida=None)]},
     "none of ours": {"at": [at_error(ours=None)]},
     "none at all": {"at": [{"error": 1e-4, **NOTHING}], "default_dominated": False, "default_over": []},
     "the default is best": {"default_dominated": False, "default_over": [1.0, 2.0]},
     "out of phase": {
         "astray": [
-            {"solver": "loose", "setting": "tol", "value": 1e-3, "error_q": 0.5, "cpu_s": 0.1},
-            {"solver": "stepping", "setting": "h", "value": 1e-9, "error_q": 0.5, "cpu_s": 0.1},
+            {"solver": "loose", "setting": "tol", "value": 1e-3, "error_q": 0.5, "call_s": 0.1},
+            {"solver": "stepping", "setting": "h", "value": 1e-9, "error_q": 0.5, "call_s": 0.1},
         ]
     },
 }
@@ -216,7 +222,7 @@ def test_solvers_beaten_everywhere_are_listed_worst_first(tmp_path):
 
 def test_picks_are_joined_where_the_solver_is_the_same():
     prices = ((2, 0.1), (4, 0.4), (6, 0.1))
-    lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"cpu_s": cpu}, "others": THEIRS} for k, cpu in prices]
+    lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"call_s": cpu}, "others": THEIRS} for k, cpu in prices]
     found = index.picks(lines)
     assert [(pick["solver"], pick["accuracies"]) for pick in found] == [
         ("ours", ["1e-2", "1e-6"]),

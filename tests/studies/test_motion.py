@@ -19,7 +19,7 @@ def rows():
     good = {"status": "REACHED_END", "message": "", "problem": "four-bar", "t_end": 100.0, "floor": 1e-11, "repeat": 0}
     good |= {
         "error_q": 1e-6,
-        "cpu_s": 1.0,
+        "call_s": 1.0,
         "n_evaluations": 1e4,
         "kinetic": 22.5,
         "range_y3": 0.726,

@@ -24,7 +24,7 @@ def rows():
         "repeat": 0,
         "case": "four-bar",
     }
-    good |= {"error_q": 1e-3, "cpu_s": 1.0, "n_evaluations": 1e5, "n_steps": 1000, "h_median": 0.06, "h_low": 0.02}
+    good |= {"error_q": 1e-3, "call_s": 1.0, "n_evaluations": 1e5, "n_steps": 1000, "h_median": 0.06, "h_low": 0.02}
     good |= {"h_high": 0.1, "share_time": 0.999, "retried": 0.4}
     good |= {"retried_switch": 0.5, "n_rejected_error": 400.0, "n_rejected_convergence": 50.0, "n_partitions": 101.0}
     good |= {"err_out": np.nan, "tol": np.nan, "case": "four-bar"}

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from studies import store
-from studies.cli import ROOT, Call, StudyError
+from studies.cli import ROOT, Call, StudyError, processor
 from studies.store import KeptRows, Output, plain
 
 STAMP = "`python -m studies.x`; 2026-01-01"
@@ -104,7 +104,7 @@ def test_finished_rows_are_kept_and_the_file_goes_when_all_is_done(tmp_path):
     path = tmp_path / "x.partial.jsonl"
     interrupt(path, "a", "b")
     with KeptRows(path, {}) as kept:
-        assert kept.n_resumed == 2 and "a" in kept and kept["b"] == {"name": "b", "x": 0.1 + 0.2}
+        assert kept.n_resumed == 2 and "a" in kept and kept["b"]["x"] == 0.1 + 0.2
     assert not path.exists()
 
 
@@ -125,6 +125,9 @@ def test_a_torn_last_line_is_dropped(tmp_path):
         lambda text: text + "[1]\n",
         lambda text: "\x00\x00" + text,
         lambda text: text.replace('"settings": {}', '"settings": {"quick": true}'),
+        lambda text: text.replace(
+            f'"processor": {json.dumps(processor())}, "settings"', '"processor": "Z80", "settings"'
+        ),
     ],
 )
 def test_damaged_or_foreign_rows_are_set_aside_whole(tmp_path, capsys, damage):
@@ -165,9 +168,40 @@ def test_rows_survive_a_kill(tmp_path):
         process.kill()
         process.wait()
     with KeptRows(path, {}) as kept:
-        assert kept["a"] == {"x": 1}
+        assert kept["a"]["x"] == 1
 
 
 def test_what_json_does_not_hold_is_refused():
     with pytest.raises(TypeError, match="given complex"):
         plain({"x": 1j})
+
+
+def test_two_timed_studies_do_not_run_at_once_on_a_machine(tmp_path, monkeypatch):
+    monkeypatch.setattr(store.tempfile, "gettempdir", lambda: str(tmp_path))
+
+    def output(study, folder, quick=False, redraw=False):
+        return Output(Call(study, quick, tmp_path / folder, redraw, ""))
+
+    with output("table3", "a"):
+        with pytest.raises(StudyError, match="another study is being timed"), output("energy", "b"):
+            pass
+        for other in (output("honesty", "c"), output("energy", "d", quick=True), output("energy", "e", redraw=True)):
+            with other:  # compares no times, or makes none that count
+                pass
+    with output("energy", "b"):  # nothing is left locked, also of the one refused
+        pass
+
+
+def test_every_row_has_its_processor(tmp_path):
+    with KeptRows(tmp_path / "x.partial.jsonl", {}) as kept:
+        kept.add("a", {"x": 1})
+        assert kept["a"] == {"x": 1, "processor": processor()}
+
+
+def test_a_study_pins_its_threads_whoever_starts_it():
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "XLA_FLAGS")
+    environment = {name: value for name, value in os.environ.items() if name not in names} | {"OMP_NUM_THREADS": "4"}
+    code = f"import sys, os, studies; assert 'numpy' not in sys.modules; print([os.environ[n] for n in {names!r}])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("['1', '1', '1', '--xla_cpu_multi_thread_eigen=false intra_op")

@@ -42,14 +42,14 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
                 steps = 1600.0 if solver == IRK else 1e3 * 10.0**j
                 cpu = paper / machine - 1e-6 * step * steps
                 line = {"problem": problem, "group": group, "solver": solver, "err_in": e_in, "err_out": e_out}
-                line |= {"cpu_s": cpu, "n_evaluations": cpu / 1e-6, "n_steps": steps, "error_q": 1.0}
+                line |= {"call_s": cpu, "n_evaluations": cpu / 1e-6, "n_steps": steps, "error_q": 1.0}
                 lines.append({**common, **line, "lost": solver == NEWMARK and j == 0})
         for name, each in (("lasting", 0.0), ("symmetric", 2.0)):
             line = {"problem": problem, "group": "partition", "solver": f"fixed step, {name}", "n_steps": 1e4}
             evaluations = 1e5
             line |= {
                 "n_evaluations": evaluations,
-                "cpu_s": 1e-6 * (evaluations + each * 1e4),
+                "call_s": 1e-6 * (evaluations + each * 1e4),
                 "error_q": 1e-3,
                 "h": 0.01,
             }
@@ -57,7 +57,7 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
         for solver, cpu in ((NEWMARK, 4.0), (QUARTER, 3.0), (IRK_LINE, 1.0), (IDA_C, 0.5), ("Gauss12", 0.2)):
             for k, error in enumerate((0.5, 1e-3, 1e-6)):
                 line = {"problem": problem, "group": "comparison", "solver": solver, "tol": 10.0**-k, "error_q": error}
-                line |= {"cpu_s": cpu * (k + 1), "n_evaluations": 1e4, "n_steps": 1e3}
+                line |= {"call_s": cpu * (k + 1), "n_evaluations": 1e4, "n_steps": 1e3}
                 family = "SUNDIALS" if solver == IDA_C else "two-loop"
                 lines.append({**common, **line, "family": family})
     for reading, what in READINGS.items():  # "all of z" as the paper's err_in column, "y_i only" as its err_out column
@@ -67,7 +67,7 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
             paper = [row[3] for row in PAPER_IRK] if reading == "all" else PAPER_IRK[3]
             line = {"problem": PROBLEMS[0], "group": "reading", "solver": f"{IRK}, (32) on {what}", "err_in": e_in}
             line |= {"n_evaluations": 1e4 * paper[TOLERANCES.index(e_out)], "n_steps": 1600.0, "error_q": 0.01}
-            line |= {"err_out": e_out, "cpu_s": 0.1, "astray": reading == "independent" and e_out == 1e-3}
+            line |= {"err_out": e_out, "call_s": 0.1, "astray": reading == "independent" and e_out == 1e-3}
             lines.append({**common, **line})
     return pd.DataFrame(lines)
 
@@ -100,7 +100,7 @@ def test_one_machine_constant_is_told_from_more(tmp_path):
 @pytest.mark.usefixtures("unsaved")
 def test_a_partition_too_cheap_to_be_measured_explains_nothing(tmp_path):
     made = rows(step=2.0)
-    made.loc[made["solver"] == "fixed step, symmetric", "cpu_s"] = 0.09
+    made.loc[made["solver"] == "fixed step, symmetric", "call_s"] = 0.09
     found = found_of(tmp_path, made)
     assert found["partition_us"] <= 0.0 and not found["partition_explains"]
 
@@ -113,8 +113,8 @@ def test_findings_turn_with_the_rows(tmp_path):
     assert {at["solver"] for at in found["cheapest"]} == {"Gauss12"}
     made = rows()
     made["lost"] = made["solver"] == IRK
-    made.loc[made["solver"] == QUARTER, "cpu_s"] = 0.1
-    made.loc[made["solver"] == IDA_C, "cpu_s"] = 0.01
+    made.loc[made["solver"] == QUARTER, "call_s"] = 0.1
+    made.loc[made["solver"] == IDA_C, "call_s"] = 0.01
     failing = made.index[made["solver"] == IDA_C][-1]
     made.loc[failing, ["status", "error_q"]] = ["STEP_TOO_SMALL", np.nan]
     found = found_of(tmp_path, made)

@@ -14,7 +14,7 @@ def rows(*lines, floor=1e-12):
     common = {"family": "two-loop", "called_from": "compiled", "keeps_constraints": True, "status": "REACHED_END"}
     common |= {"floor": floor, "violation_q": 1e-16, "violation_v": 1e-16, "energy": 0.0, "repeat": 0, "message": ""}
     made = [
-        {"solver": solver, "error_q": error, "cpu_s": cpu, "cpu_q1": cpu, "cpu_q3": cpu, "n_evaluations": 1e3 * cpu}
+        {"solver": solver, "error_q": error, "call_s": cpu, "call_q1": cpu, "call_q3": cpu, "n_evaluations": 1e3 * cpu}
         for solver, error, cpu in lines
     ]
     return pd.DataFrame([{**common, **line} for line in made])
@@ -23,8 +23,8 @@ def rows(*lines, floor=1e-12):
 def test_medians_keep_the_repetition_of_median_error_and_the_quartiles_of_time():
     made = rows(("a", 3.0, 1.0), ("a", 1.0, 5.0), ("a", 2.0, 2.0), ("b", 1.0, 9.0)).assign(repeat=[0, 1, 2, 0])
     middle = tables.medians(made)
-    assert middle["error_q"].tolist() == [2.0, 1.0] and middle["cpu_s"].tolist() == [2.0, 9.0]
-    assert middle["cpu_q1"][0] == 1.5 and middle["cpu_q3"][0] == 3.5 and middle["repeats"].tolist() == [3, 1]
+    assert middle["error_q"].tolist() == [2.0, 1.0] and middle["call_s"].tolist() == [2.0, 9.0]
+    assert middle["call_q1"][0] == 1.5 and middle["call_q3"][0] == 3.5 and middle["repeats"].tolist() == [3, 1]
 
 
 @pytest.mark.parametrize(("n_failed", "status"), [(1, "REACHED_END"), (2, "STEP_TOO_SMALL")])
@@ -49,7 +49,7 @@ def test_nothing_is_claimed_below_what_the_reference_resolves():
 def test_a_ranking_turns_with_the_rows():
     made = rows(("a", 1e-4, 1.0), ("b", 1e-4, 2.0), ("c", 1e-2, 0.1))
     assert tables.ranking(made, 1e-3)["solver"].tolist() == ["a", "b"]
-    made.loc[0, ["cpu_s", "cpu_q1", "cpu_q3"]] = 3.0
+    made.loc[0, ["call_s", "call_q1", "call_q3"]] = 3.0
     assert tables.ranking(made, 1e-3)["solver"].tolist() == ["b", "a"]
     assert tables.ranking(made, 1e-9).empty
 

@@ -20,7 +20,7 @@ BAUMGARTE = baumgarte("DOP853", 10.0)
 def rows():
     """Medians of a full run, made up but like them."""
     good = {"status": "REACHED_END", "message": "", "problem": "four-bar", "t_end": 100.0, "floor": 1e-11, "repeat": 0}
-    good |= {"error_q": 1e-6, "cpu_s": 1.0, "n_evaluations": 1e4, "energy": 0.0, "err_in": np.nan, "err_out": np.nan}
+    good |= {"error_q": 1e-6, "call_s": 1.0, "n_evaluations": 1e4, "energy": 0.0, "err_in": np.nan, "err_out": np.nan}
     good |= {"violation_q": 9e-16, "violation_v": 2e-15, "violation_a": 3e-13, "violation_35": 4e-16, "h": np.nan}
     good |= {"violation_36": 9e-16, "tol": 1e-8, "case": "four-bar"}
     good |= {
@@ -45,7 +45,7 @@ def rows():
         drifts = {} if CATALOGUE[name].keeps_constraints else {"violation_q": 1e-6}
         for k, tol in enumerate((1e-3, 1e-5, 1e-7, 1e-9)):
             times = cost.get(name, 0.5) * (k + 1)
-            add("tolerances", name, tol=tol, error_q=100.0 * tol, cpu_s=times, n_evaluations=1e4 * times, **drifts)
+            add("tolerances", name, tol=tol, error_q=100.0 * tol, call_s=times, n_evaluations=1e4 * times, **drifts)
     return pd.DataFrame(lines)
 
 
@@ -73,9 +73,9 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[line_up & made["solver"].isin(("LSODA, index 1", "DOP853, index 1")), ["growth_q", "late_q"]] = [0.0, 1e-9]
     made.loc[along & (made["solver"] == BAUMGARTE), "violation_q"] = 1e-14
     made.loc[made["group"] == "loops", "violation_q"] = 1e-9
-    made.loc[along & made["solver"].isin(("IDA, stabilised", "DOP853, projected")), "cpu_s"] /= 10.0
-    made.loc[along & ~made["keeps_constraints"], "cpu_s"] /= 100.0
-    made.loc[along & made["solver"].isin(("IDA, index1", "DOP853, index 1")), "cpu_s"] *= 200.0
+    made.loc[along & made["solver"].isin(("IDA, stabilised", "DOP853, projected")), "call_s"] /= 10.0
+    made.loc[along & ~made["keeps_constraints"], "call_s"] /= 100.0
+    made.loc[along & made["solver"].isin(("IDA, index1", "DOP853, index 1")), "call_s"] *= 200.0
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
     found = found_of(tmp_path, made)
     assert found["irk_grows"] and not found["ours_keep"] and found["ours_growing"] == [IRK]

@@ -16,7 +16,7 @@ def test_dominated_is_who_costs_more_at_every_error_on_every_case():
     found = {line["solver"]: (line["by"], line["factor"]) for line in work_precision.dominated(table, (1e-2,))}
     assert found == {"b": ("a", pytest.approx(3.0)), "c": ("a", pytest.approx(9.0))}
     worst = work_precision.dominated(table, (1e-2,))[0]
-    assert (worst["case"], worst["error"], worst["cpu_s"], worst["by_s"]) == ("crane", 1e-2, 3.0, 1.0)
+    assert (worst["case"], worst["error"], worst["call_s"], worst["by_s"]) == ("crane", 1e-2, 3.0, 1.0)
     both = work_precision.dominated(table, (1e-2, 1e-4))
     assert [line["solver"] for line in both] == ["b"]  # c alone reaches 1e-4
     other = pd.concat([table, made(("a", 1e-3, 5.0), ("b", 1e-3, 4.0)).assign(case="robot")])
@@ -26,7 +26,7 @@ def test_dominated_is_who_costs_more_at_every_error_on_every_case():
 def test_the_default_is_judged_by_the_rows():
     table = made(("auto", 1e-5, 4.0), ("Gauss12", 1e-5, 1.0))
     assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(4.0)
-    table.loc[1, "cpu_s"] = 8.0
+    table.loc[1, "call_s"] = 8.0
     assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(1.0)
     nothing = work_precision.class_of(table, 1e-9)
     assert nothing["error"] == 1e-9 and all(nothing[key] is None for key in ("ours", "others", "ida", "default_over"))
@@ -44,7 +44,7 @@ def test_what_beats_the_default_beats_it_at_every_error_that_it_reaches():
 def test_of_each_solver_out_of_phase_the_finest_setting_is_found():
     table = made(("a", 0.5, 1.0), ("a", 0.3, 2.0), ("b", 1e-3, 1.0)).assign(tol=[1e-2, 1e-3, 1e-3], h=float("nan"))
     table["astray"] = [True, True, False]
-    found = {"solver": "a", "setting": "tol", "value": 1e-3, "error_q": 0.3, "cpu_s": 2.0}
+    found = {"solver": "a", "setting": "tol", "value": 1e-3, "error_q": 0.3, "call_s": 2.0}
     assert work_precision.out_of_phase(table) == [found]
 
 
@@ -55,13 +55,15 @@ def test_cases_are_found_by_listing_the_folder():
     assert all(a.t_end <= b.t_end for a, b in zip(quick, full, strict=True))
 
 
-def test_stiff_cases_have_their_own_solvers_and_slow_runs_are_made_once():
+def test_stiff_cases_have_their_own_solvers_and_fewer_settings_from_python():
     for case in cases.load(False):
         made = work_precision.runs(case, False)
         names = {run.solver.name for run in made}
         assert (names >= set(work_precision.STIFF)) == ("stiff" in case.tags)
-        once = {run.repeats == 1 for run in made if run.solver.called_from == "Python"}
-        assert once == {"stiff" in case.tags} and len({run.key(0) for run in made}) == len(made)
+        python = {run.value for run in made if run.solver.called_from == "Python" and run.solver.setting == "tol"}
+        compiled = {run.value for run in made if run.solver.name == "auto"}
+        assert (python < compiled) == ("stiff" in case.tags) and len({run.key(0) for run in made}) == len(made)
+        assert {run.repeats for run in made} == {5}
 
 
 @pytest.mark.slow
