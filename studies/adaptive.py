@@ -2,18 +2,25 @@
 
 A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit, has failed at
 two tolerances running, or has taken more than `FAR` times as long as the fastest so far for no smaller an error, at two
-settings running. A part of `studies.work_precision`.
+settings running. Where two of its errors lie more than a decade apart it is asked between them, so that nothing need be
+interpolated over more, and beyond its ends where these leave accuracies out. A part of `studies.work_precision`.
 """
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 
 from studies.bench import NOTHING_RUN, Run
 from studies.store import KeptRows, Row
+from studies.tables import DECADE, LOOSEST, NEAR, TIGHTEST
 
 FAR = 20.0
 RUNNING = 2
+ROUNDS = 4  # of asking between settings
+CLOSE = 5.0  # times the time of the fastest: what costs more is not asked between its settings
 ENDING = (*NOTHING_RUN, "RAISED", "TIME_LIMIT")
 
 Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
@@ -39,6 +46,7 @@ def collect(
     kept: KeptRows,
     make: Callable[[Run, int, Built], Row],
     all_asked: Callable[[Run], bool] = lambda run: False,
+    errors: Sequence[float] = (),
 ) -> pd.DataFrame:
     """Rows of all runs that are of use, the repetitions interleaved.
 
@@ -51,6 +59,8 @@ def collect(
         make(run, repeat, built) -> row, with case, status, error_q and call_s.
     all_asked : callable, optional
         all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
+    errors : sequence of float, optional
+        The accuracies that are compared, for which solvers that are not far behind are asked between their settings.
 
     Returns
     -------
@@ -60,21 +70,67 @@ def collect(
     built: Built = set()
     progress: dict[tuple[str, str], _Progress] = {}
     reached: dict[str, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
-    for repeat in range(max((run.repeats for run in todo), default=0)):
+    todo = list(todo)
+
+    def first(run: Run) -> None:
+        if run.key(0) not in kept:
+            kept.add(run.key(0), make(run, 0, built))
+        row, runs = kept[run.key(0)], reached.setdefault(run.case.name, [])
+        good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
+        who = progress.setdefault((run.case.name, run.solver.name), _Progress())
+        who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
+        if row["error_q"] is not None and row["call_s"]:
+            runs.append((row["error_q"], row["call_s"]))
+
+    for run in todo:
+        who = progress.get((run.case.name, run.solver.name))
+        if who is None or not who.ended:
+            first(run)
+    for _ in range(ROUNDS if errors else 0):
+        more = [run for own in _by_solver(todo) for run in between(own, kept, reached, errors)]
+        for run in more:
+            first(run)
+        todo += more
+    for repeat in range(1, max((run.repeats for run in todo), default=0)):
         for run in todo:
-            who = progress.setdefault((run.case.name, run.solver.name), _Progress())
-            if not _again(run, repeat, kept) if repeat > 0 else who.ended:
-                continue
-            if run.key(repeat) not in kept:
+            if _again(run, repeat, kept) and run.key(repeat) not in kept:
                 kept.add(run.key(repeat), make(run, repeat, built))
-            if repeat == 0:
-                row, runs = kept[run.key(0)], reached.setdefault(run.case.name, [])
-                good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
-                who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
-                if row["error_q"] is not None and row["call_s"]:
-                    runs.append((row["error_q"], row["call_s"]))
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
+
+
+def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in todo:
+        groups.setdefault((run.case.name, run.solver.name), []).append(run)
+    return list(groups.values())
+
+
+def between(
+    own: Sequence[Run], kept: KeptRows, reached: Mapping[str, Sequence[tuple[float, float]]], errors: Sequence[float]
+) -> list[Run]:
+    """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
+    rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
+    made = sorted((value for value, row in rows.items() if row["error_q"]), reverse=True)
+    if not made:
+        return []
+    error = {value: max(float(rows[value]["error_q"]), float(rows[value].get("floor") or 0.0)) for value in made}
+    fastest = [
+        min((cpu for each, cpu in reached[own[0].case.name] if each <= error[value]), default=np.inf) for value in made
+    ]
+    close = {value: rows[value]["call_s"] <= CLOSE * least for value, least in zip(made, fastest, strict=True)}
+    asked = []
+    for loose, tight in itertools.pairwise(made):
+        apart, inside = error[loose] / error[tight], any(error[tight] < each < error[loose] for each in errors)
+        if inside and apart > DECADE and loose / tight > NEAR and (close[loose] or close[tight]):
+            asked.append(float(f"{np.sqrt(loose * tight):.2g}"))
+    if own[0].solver.setting == "tol":
+        first, last = made[0], made[-1]
+        if first == max(rows) and error[first] < max(errors) / DECADE and first < LOOSEST and close[first]:
+            asked.append(min(LOOSEST, DECADE * first))
+        if last == min(rows) and error[last] > min(errors) and last > TIGHTEST and close[last]:
+            asked.append(max(TIGHTEST, last / DECADE))
+    return [replace(own[0], value=value) for value in asked if value not in rows]
 
 
 def _again(run: Run, repeat: int, kept: KeptRows) -> bool:

@@ -57,7 +57,7 @@ def findings_of(
     for each in found["mechanisms"]:
         compared = [at | {"case": each["case"]} for at in each["at"] if at["ratio"] is not None]
         worst += sorted(compared, key=lambda at: float(at["ratio"]))[:1]
-    chosen = sorted((at for at in worst if at["ratio"] < 1.0 / found["tied"]), key=lambda at: float(at["ratio"]))[:MOST]
+    chosen = sorted((at for at in worst if at["verdict"] == "behind"), key=lambda at: float(at["ratio"]))[:MOST]
     return [_profile(at, rows[rows["case"] == at["case"]], operations, operation_ns) for at in chosen]
 
 
@@ -84,7 +84,7 @@ def _profile(
 
 def _in_the_way(line: dict[str, Any]) -> str:
     """All but the arithmetic of the accelerations, where the lead would end without it; else steps or time per step."""
-    if line["without"] is not None and line["without"] >= 1.0 / rivals.TIED:
+    if line["without"] is not None and line["without"] >= 1.0:
         return "overhead"
     steps, others = line["ours"]["steps"], line["others"]["steps"]
     if steps is None or others is None:

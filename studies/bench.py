@@ -147,6 +147,8 @@ class Solver:
         Whether it runs the mechanism's functions once, or has a model of its own, and calls none during a run.
     own_accelerations : bool
         Whether the accelerations in its results are not those of eq. (6) at its q and v.
+    used : callable or None
+        used(value, result) -> what a solver that chooses among methods took, between which nothing is interpolated.
     builds_each : bool
         Whether it compiles or builds anew for each value of the setting, not once a case.
     """
@@ -161,7 +163,12 @@ class Solver:
     fixed: Mapping[str, float | str] = field(default_factory=dict)
     own_accelerations: bool = False
     traces: bool = False
+    used: Callable[[float, Result], str] | None = None
     builds_each: bool = False
+
+    def took(self, value: float, result: Result | None) -> str:
+        """The method that a run took, where the solver chooses; else nothing."""
+        return "" if self.used is None or result is None else self.used(value, result)
 
     def grid(self, case: Case) -> tuple[float, ...]:
         """The values of the setting to run on a case."""
@@ -263,7 +270,7 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
     warm_up(run, k, warm)
     result, status, message, times = timed(run, k)
     stats = Statistics() if result is None else result.stats
-    row |= {**times, "status": status, "message": message}
+    row |= {**times, "status": status, "message": message, "used": solver.took(run.value, result)}
     rejected = [n for n in (stats.n_rejected_error, stats.n_rejected_convergence) if n is not None]
     row |= {"n_steps": stats.n_accepted, "n_rejected": sum(rejected) if rejected else None}
     for name in ("n_evaluations", "n_outer", "n_inner", "n_partitions", "n_factorizations", "n_jacobians"):

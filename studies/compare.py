@@ -1,7 +1,7 @@
 """Work-precision report of a mechanism of your own: our methods beside IDA and SciPy's solvers."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
     return made
 
 
-def runs_of(case: Case, solvers: Sequence[str], quick: bool) -> list[Run]:
+def runs_of(case: Case, solvers: Iterable[str], quick: bool) -> list[Run]:
     """All runs of the comparison of a case."""
     runs = []
     for name in solvers:

@@ -115,6 +115,7 @@ def row_of(run: Run) -> Row:
         warnings.simplefilter("always")
         result, status, message, times = timed(run, 0)
     row |= {**times, "status": status, "message": message, "warnings": len(said)}
+    row["used"] = run.solver.took(run.value, result)
     stats = None if result is None else result.stats
     for name in ("n_accepted", "n_evaluations"):
         row[name] = None if stats is None else getattr(stats, name)

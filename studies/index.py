@@ -9,7 +9,7 @@ from typing import Any
 
 from studies.cli import StudyError
 from studies.render import number, power, render
-from studies.store import Output
+from studies.store import TIMED, WHOLE_CALL, Output
 
 # claims and compare_page read the others' rows
 STUDIES = (
@@ -28,7 +28,7 @@ COSTS = ("call_s", "n_evaluations", "violation_q", "called_from", "keeps")
 
 
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
-    """What NAME.json of each study holds, for those that have been run into the folder.
+    """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
     Raises
     ------
@@ -40,9 +40,11 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
         path = folder / f"{name}.json"
         if path.is_file():
             try:
-                found[name] = json.loads(path.read_text())
+                told = json.loads(path.read_text())
             except ValueError as error:
                 raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{name} again") from None
+            if name not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
+                found[name] = told
     return found
 
 
@@ -70,14 +72,15 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
 def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[str, Any]:
     reached = [line for line in at if line["ours"] and "ida" in line]
     over = [line["ida"]["call_s"] / line["ours"]["call_s"] for line in reached if line["ida"]]
-    missed = [line["accuracy"] for line in reached if not line["ida"]]
+    missed = [line["accuracy"] for line in reached if line["ida_missed"]]
     made = {"class": label, "name": case["name"], "t_end": case["t_end"], "at": at, "picks": picks(at)}
     return made | {"ida_over": over, "ida_misses": missed, "without_drift": []}
 
 
 def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     """The line of a largest position error."""
-    line: dict[str, Any] = {"accuracy": power(at["error"]), "ida": at["ida"], **dict.fromkeys(WHOSE)}
+    told = {key: at[key] for key in ("ida", "ida_missed", "standing")}
+    line: dict[str, Any] = {"accuracy": power(at["error"]), **told, **dict.fromkeys(WHOSE)}
     for which in (which for which in WHOSE if at[which]):
         line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
     return line
@@ -85,7 +88,7 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
 
 def _at_energy(at: dict[str, Any], *kinds: str) -> dict[str, Any]:
     """The line of a largest energy error, from runs with a drift, without, or both."""
-    line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", **dict.fromkeys(WHOSE)}
+    line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
     for which in WHOSE:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:
@@ -159,6 +162,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
     more["drifting"] = any(best["drifts"] for best in told)
     more["n_errors"] = sum(len(entry["at"]) for entry in entries)
+    more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
     more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]
     return _render("index", found, quick=quick, **more)
 

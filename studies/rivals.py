@@ -16,7 +16,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
-from studies import adaptive, figures, tables
+from studies import adaptive, figures, headline, tables
 from studies.bench import REPEATS, Run, warm_up
 from studies.cases.four_bar import SECOND
 from studies.cli import StudyError
@@ -33,7 +33,6 @@ DECADES = tuple(10.0**-k for k in range(3, 14))
 SHOWN = DECADES[::2]  # at which the four-bars are judged
 IN_TABLE = DECADES[::3]
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
-TIED = 1.2  # times that differ by less are equal
 AHEAD = {"heyoka": 2.0, "python": 8.0, "compiled": 4.0}  # aimed at on the four-bars, by kind of rival
 HEADLINE = "four-bar"
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
@@ -100,7 +99,8 @@ def runs(quick: bool) -> list[Run]:
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
     """Rows of all runs that are of use; on the four-bars every solver is asked for all accuracies."""
-    return adaptive.collect(todo, kept, _row, lambda run: run.case.name in GEOMETRIES)
+    quick = all(run.repeats == 1 for run in todo)
+    return adaptive.collect(todo, kept, _row, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
 
 
 def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
@@ -110,16 +110,14 @@ def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
 
 
 def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
-    """The cheapest of ours and of others at one error on one mechanism, and their ratio."""
+    """The cheapest of ours and of others at one error on one mechanism, and how default and best of ours stand."""
     both = tables.of_both(tables.ranking(rows, error))
-    found: dict[str, Any] = {"error": error, "ratio": None}
+    found: dict[str, Any] = {"error": error, "standing": headline.of_error(rows, error)}
     for which, best in both.items():
         found[which] = (
             None if best is None else {key: best[key] for key in ("solver", "call_s", "n_evaluations", "keeps")}
         )
-    if found["ours"] and found["others"]:
-        found["ratio"] = found["others"]["call_s"] / found["ours"]["call_s"]
-    return found
+    return found | {key: found["standing"][headline.BEST][key] for key in ("ratio", "verdict")}
 
 
 def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
@@ -141,16 +139,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         {"case": name, "at": [at_decade(own, error) for error in DECADES]} for name, own in by_case.items()
     ]
     every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
-    behind = [at for at in every if at["ratio"] < 1.0 / TIED]
-    found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind), "tied": TIED}
-    found["n_ahead"] = sum(at["ratio"] > TIED for at in every)
+    behind = [at for at in every if at["verdict"] == "behind"]
+    found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
+    found["standings"] = headline.counted(at["standing"] for each in made for at in each["at"])
     found["behind"] = dict(pd.Series([at["others"]["solver"] for at in behind], dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
     found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None
     found |= {"down_to": DOWN_TO, "n_behind_down_to": sum(at["error"] >= 0.5 * DOWN_TO for at in behind)}
     found["n_clear"] = sum(
-        all(at["ratio"] is None or at["ratio"] >= 1 / TIED for at in each["at"] if at["error"] >= 0.5 * DOWN_TO)
-        for each in made
+        all(at["verdict"] != "behind" for at in each["at"] if at["error"] >= 0.5 * DOWN_TO) for each in made
     )
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
@@ -197,7 +194,7 @@ def _goal(compared: list[dict[str, Any]], wanted: float) -> str:
 
 
 def lines(found: dict[str, Any]) -> Iterator[list[Any]]:
-    """Of the table of ratios: mechanism, ratio at each error shown; those that ours alone reach are left out."""
+    """Of the table of ratios: mechanism, ratios at each error shown; those that ours alone reach are left out."""
     for each in found["mechanisms"]:
         if each["case"] not in found["alone"]:
             ratios = {at["error"]: at for at in each["at"]}
@@ -205,13 +202,19 @@ def lines(found: dict[str, Any]) -> Iterator[list[Any]]:
 
 
 def _cell(at: dict[str, Any]) -> str:
-    if at["ratio"] is None:
-        return "ours" if at["ours"] else "others" if at["others"] else "–"
-    text = number(at["ratio"])
-    return f"**{text}**" if at["ratio"] < 1.0 / TIED else text
+    """Ratios of default, compiled default and best of ours; bold: behind, in brackets: undecided."""
+    cells = [_standing(at["standing"][name]) for name in at["standing"]]
+    return cells[0] if len(set(cells)) == 1 else " · ".join(cells)
 
 
-def headline(rows: pd.DataFrame, most: int = 9) -> Figure:
+def _standing(found: dict[str, Any]) -> str:
+    if found["ratio"] is None:
+        return {"alone": "ours", "missed": "others", "none": "–"}[found["verdict"]]
+    text = number(found["ratio"])
+    return {"behind": f"**{text}**", "undecided": f"({text})"}.get(found["verdict"], text)
+
+
+def picture(rows: pd.DataFrame, most: int = 9) -> Figure:
     """The README's picture: CPU time over error on the four-bar, the cheapest three of ours and six of others."""
     rows = rows[(rows["case"] == HEADLINE) & rows["error_q"].notna()]
     own = rows["family"] == "two-loop"
@@ -232,19 +235,25 @@ def headline(rows: pd.DataFrame, most: int = 9) -> Figure:
 
 
 def heat_map(found: dict[str, Any]) -> Figure:
-    """Mechanism x decade: the time of the fastest rival over that of the fastest of ours."""
+    """Mechanism x decade: the time of the fastest rival over that of default, compiled default and best of ours."""
     names = [each["case"] for each in found["mechanisms"]]
-    shown = np.array([[at["ratio"] or np.nan for at in each["at"]] for each in found["mechanisms"]], dtype=float)
-    figure, axes = plt.subplots(figsize=(8.4, 0.28 * len(names) + 1.4), layout="constrained")
+    whose = (headline.DEFAULT, headline.OWN_CODE, headline.BEST)
+    size = (4.6 * len(whose) + 2.0, 0.28 * len(names) + 1.6)
+    figure, panels = plt.subplots(1, len(whose), figsize=size, sharey=True, layout="constrained")
     colours = plt.get_cmap("RdBu").with_extremes(bad="#e6e6e6")
-    image = axes.imshow(shown, norm=LogNorm(0.1, 10.0), cmap=colours, aspect="auto")
-    for (i, j), value in np.ndenumerate(shown):
-        if np.isfinite(value):
-            strong = abs(np.log10(value)) > 0.6
-            axes.text(j, i, number(value), ha="center", va="center", fontsize=7, color="white" if strong else "black")
-    axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES])
-    axes.set_yticks(range(len(names)), names)
-    axes.grid(False)
-    axes.set_title("Time of the fastest rival over that of the fastest of ours (blue: ours ahead)")
-    figure.colorbar(image, ax=axes)
+    for axes, name in zip(panels, whose, strict=True):
+        standings = [[at["standing"][name] for at in each["at"]] for each in found["mechanisms"]]
+        shown = np.array([[each["ratio"] or np.nan for each in line] for line in standings], dtype=float)
+        image = axes.imshow(shown, norm=LogNorm(0.1, 10.0), cmap=colours, aspect="auto")
+        for (i, j), value in np.ndenumerate(shown):
+            if np.isfinite(value):
+                dark = "white" if abs(np.log10(value)) > 0.6 else "black"
+                text = number(value) if standings[i][j]["verdict"] != "undecided" else f"({number(value)})"
+                axes.text(j, i, text, ha="center", va="center", fontsize=6, color=dark)
+        axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
+        axes.set_yticks(range(len(names)), names)
+        axes.grid(False)
+        axes.set_title(name)
+    figure.suptitle("Time of the fastest rival over ours (blue: ours ahead; in brackets: undecided)", fontsize=10)
+    figure.colorbar(image, ax=panels)
     return figure

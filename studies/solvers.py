@@ -15,13 +15,15 @@ import numpy as np
 from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop.auto import LOOSE, TIGHTEST
 from twoloop.plan import Method
 from twoloop.tableaux import gauss, sun_radau_iib
 
-TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of all solvers that have one
+TOLERANCES = tuple(float(f"1e-{k}") for k in range(3, 14))  # of all solvers that have one: no gap of over a decade
 ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
 ERR_IN = 1e-9  # err_in and ...
 PAPER_TOL = 1e-5  # ... Atol = Rtol of the paper
+NEWTON_SHARE = 0.1  # of the steps with a new Jacobian, from which on a run of the default counts as implicit
 STORED = 5000  # about as many steps of a fixed-step solver are stored
 NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is shown
 
@@ -54,16 +56,17 @@ ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 GEAR_STARTS = ("accurate", "ramp")
 
-# other projects' solvers, beside ours on every mechanism: called from compiled code, then from Python
+# other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
     *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi", "collocation, CasADi"),
-    *("CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "Pr9, index 1", "Radau, index 1", "BDF, index 1"),
-    *("IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
+    *("CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Pr9, index 1", "Radau, index 1"),
+    *("BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
 )
 
-# what `compare` runs, and the lines from which its figure takes the cheapest seven
+# of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
+COMPARED_OWN = ("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF")
 COMPARED = (
-    *("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF"),
+    *(*COMPARED_OWN, HEYOKA, CVODE_C, "CVODE from C, BDF"),
     *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
 )
 
@@ -75,6 +78,14 @@ def _start(case: Case) -> tuple[Any, Any, Any, Any]:
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: bool = False) -> Result:
     limit = case.time_limit
     return solve_dae(*_start(case), method, tolerance, tolerance, time_limit=limit, compiled=compiled)
+
+
+def _chosen(tolerance: float, result: Result) -> str:
+    """What the default took: Newton's method, of which there are three by tolerance, or an explicit one."""
+    stats = result.stats
+    if (stats.n_jacobians or 0) < NEWTON_SHARE * (stats.n_accepted or 1):
+        return "explicit"
+    return "Newton, " + ("loose" if tolerance >= LOOSE else "tight" if tolerance >= TIGHTEST else "tightest")
 
 
 def _traced(method: str, compiled: bool, case: Case, tolerance: float, repeat: int) -> Result:
@@ -249,9 +260,9 @@ def _all() -> Iterator[Solver]:
         if preset == TAYLOR or preset in COMPILED:
             run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
         # the default compiles another method at other tolerances
-        yield _solver(
-            preset, "two-loop", "compiled", "tol", run, builds_each=preset in COMPILED, traces=preset in COMPILED
-        )
+        more: dict[str, Any] = {"builds_each": True, "traces": True} if preset in COMPILED else {}
+        used = _chosen if COMPILED.get(preset, preset) == DEFAULT else None
+        yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, **more)
     yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
     own: dict[str, Any] = {"own_accelerations": True}
     model = own | {"traces": True}

@@ -39,6 +39,7 @@ TIMED = (
     "sweep_linkages",
     "ablation",
 )
+WHOLE_CALL = "whole call"  # what their times are of, in their findings
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
@@ -150,7 +151,8 @@ class Output:
 
     def save_findings(self, findings: Mapping[str, Any]) -> None:
         """Write NAME.json; what is not finite becomes null."""
-        text = json.dumps(plain(findings), indent=1, allow_nan=False, ensure_ascii=False)
+        told = {"timed": WHOLE_CALL, "processor": processor()} if self.call.study in TIMED else {}
+        text = json.dumps(plain({**findings, **told}), indent=1, allow_nan=False, ensure_ascii=False)
         self.write(f"{self.call.study}.json", text + "\n")
 
     def load_findings(self) -> dict[str, Any]:

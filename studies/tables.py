@@ -1,57 +1,162 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from studies.bench import NOTHING_RUN
 from studies.render import number, power
 
+Array = NDArray[np.float64]
+
+SETTINGS = ("tol", "h", "err_out")
+DECADE = 10.0  # between two runs that lie farther apart nothing is interpolated
+NEAR = 2.0  # settings that differ by less are nearly the same
+LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
+RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # of the bootstrap
+FEWEST = 3  # repetitions that an interval asks for
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a run: the repetition of median error, with median and quartiles of the CPU time of all repetitions.
+    """One row a run: the repetition of median error, with median and quartiles of the time of all calls.
 
     The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
-    repetition failed is represented by a failed one if half of them or more failed.
+    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all.
     """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
     errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
-    chosen, quartiles = [], []
+    chosen, quartiles, kept = [], [], []
     for run in np.split(np.arange(len(rows)), firsts[1:]):
         chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
         known = times[run][~np.isnan(times[run])]
+        kept.append(tuple(known))
         quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
     found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
-    return found.assign(repeats=np.diff(firsts, append=len(rows)))
+    return found.assign(repeats=np.diff(firsts, append=len(rows)), times=pd.Series(kept, dtype=object))
+
+
+@cache
+def _rounds(n: int) -> NDArray[np.int64]:
+    """Rounds of n repetitions, drawn again (RESAMPLES, n): the same for all runs, as rounds are interleaved."""
+    return np.random.default_rng(SEED).integers(0, n, (RESAMPLES, n))
+
+
+def resampled(rows: pd.DataFrame) -> Array:
+    """Medians of the times of each row over rounds drawn again (n_rows, RESAMPLES); NaN of fewer than three."""
+    drawn = np.full((len(rows), RESAMPLES), np.nan)
+    for k, times in enumerate(rows.get("times", ())):
+        if len(times) >= FEWEST:
+            drawn[k] = np.median(np.array(times)[_rounds(len(times))], axis=1)
+    return drawn
+
+
+def setting_of(rows: pd.DataFrame) -> Array:
+    """Value of the setting that varies, of each row; NaN where there is none."""
+    found = np.full(len(rows), np.nan)
+    for name in SETTINGS:
+        if name in rows:
+            found = np.where(np.isnan(found), rows[name].to_numpy(float), found)
+    return found
+
+
+def _place(runs: pd.DataFrame, target: float) -> tuple[int, float | None] | None:
+    """How many of the runs of one solver, by error, are good enough, and where between them and the next the target is.
+
+    None: no run is so good, or none was asked for about this: within a decade below the target, or at the loosest
+    setting, or next to a run that is not good enough at nearly the same setting (the solver leaps over the target).
+    The place between two runs, on the log-log line through them, is None where they are more than a decade apart or
+    of different methods.
+    """
+    errors = _errors(runs)
+    n_good = int((errors <= target).sum())
+    if n_good == 0 or target < runs["floor"].max():
+        return None
+    below, settings, end = errors[n_good - 1], setting_of(runs), n_good == len(errors)
+    joined = not end and 0.0 < errors[n_good] <= DECADE * below
+    near = not end and 1.0 / NEAR <= settings[n_good] / settings[n_good - 1] <= NEAR
+    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= LOOSEST).any()):
+        return None
+    if not joined or ("used" in runs and runs["used"].iloc[n_good - 1] != runs["used"].iloc[n_good]):
+        return n_good, None
+    x = np.log(errors[n_good - 1 : n_good + 1])
+    return n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
+
+
+def _errors(runs: pd.DataFrame) -> Array:
+    return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
+
+
+def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
+    """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
+    n_good, share = place
+    best = costs[:n_good].min(axis=0)
+    if share is None:
+        return np.asarray(best)
+    with np.errstate(invalid="ignore"):
+        between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
+    return np.minimum(best, between)
+
+
+def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
+    """The runs that have an error and this cost, by error."""
+    return rows[rows["error_q"].notna() & rows[what].notna()].sort_values("error_q", kind="stable")
 
 
 def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
-    """CPU time (or another cost) of one solver for an error of at most `target`; NaN where no run is so good.
+    """Time of a call (or another cost) of one solver for an error of at most `target`.
 
-    Between the two runs on either side of the target, on the log-log line through them: solvers whose settings lie
-    far apart are not made to look expensive by it. NaN too where the target is below what the reference resolves.
+    Between two runs less than a decade apart, on the log-log line through them: solvers whose settings lie apart are
+    not made to look expensive by it. NaN where no run is so good, where the solver was not asked for about so much, and
+    where the target is below what the reference resolves.
     """
-    errors, costs, floors = (rows[name].to_numpy(float) for name in ("error_q", what, "floor"))
-    known = np.flatnonzero(~np.isnan(errors) & ~np.isnan(costs))
-    if not known.size or (target < floors[known]).any():
-        return float("nan")
-    order = known[np.argsort(errors[known], kind="stable")]
-    errors, costs = np.maximum(errors, floors)[order], costs[order]
-    n_good = int((errors <= target).sum())
-    if n_good == 0:
-        return float("nan")
-    best = float(costs[:n_good].min())
-    if n_good < len(errors) and errors[n_good - 1] > 0.0:
-        x = np.log(errors[n_good - 1 : n_good + 1])
-        share = (np.log(target) - x[0]) / (x[1] - x[0])
-        between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
-        best = min(best, float(between))
-    return best
+    runs = _told(rows, what)
+    place = None if runs.empty else _place(runs, target)
+    return float("nan") if place is None else float(_cost(runs[what].to_numpy(float), place))
+
+
+Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
+
+
+def costs_at(rows: pd.DataFrame, target: float) -> Costs:
+    """Of the solvers of one case that get to an error and were asked for about so much, what they take."""
+    found = {}
+    for solver, own in rows.groupby("solver", sort=False):
+        runs = _told(own, "call_s")
+        place = None if runs.empty else _place(runs, target)
+        if place is not None:
+            found[str(solver)] = float(_cost(runs["call_s"].to_numpy(float), place)), _cost(resampled(runs), place)
+    return found
+
+
+def compared(own: Costs, others: Costs) -> dict[str, Any]:
+    """Time of the best of others over that of the best of `own` at one error on one case, and what it comes to.
+
+    Returns
+    -------
+    dict
+        ratio; interval, that of 95 % by the bootstrap over the repetitions, or None; verdict: "ahead" or "behind"
+        where the interval leaves out 1, else "undecided"; "alone" where no other gets there, "missed" where own does
+        not and another does, "none" where neither does.
+    """
+    if not own or not others:
+        verdict = "alone" if own else "missed" if others else "none"
+        return {"ratio": None, "interval": None, "verdict": verdict}
+    least, drawn = zip(
+        *(
+            (min(time for time, _ in side.values()), np.min([each for _, each in side.values()], axis=0))
+            for side in (own, others)
+        ),
+        strict=True,
+    )
+    low, high = (float(x) for x in np.percentile(drawn[1] / drawn[0], INTERVAL))
+    verdict = "ahead" if low > 1.0 else "behind" if high < 1.0 else "undecided"
+    return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
 
 
 def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
@@ -97,12 +202,23 @@ def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
     return {"ours": best(ranked[own]), "others": best(ranked[~own])}
 
 
-def why_not(rows: pd.DataFrame) -> str:
-    """What a table shows for a solver that did not reach an error: its smallest error, or why there is none."""
+def missed(rows: pd.DataFrame, target: float) -> bool:
+    """Whether one solver was asked for all that it can on a case and has not reached an error."""
+    if (rows["error_q"].astype(float) <= target).any():
+        return False
+    settings = setting_of(rows)
+    finest = rows.iloc[int(np.nanargmin(settings))] if np.isfinite(settings).any() else rows.iloc[-1]
+    return bool(pd.isna(finest["error_q"]) or setting_of(rows).min() <= TIGHTEST * (1.0 + 1e-9))
+
+
+def why_not(rows: pd.DataFrame, target: float) -> str:
+    """What a table shows for a solver without a time at an error: why there is none."""
     reached = rows[rows["error_q"].notna()]
     if reached.empty:
         first = rows["status"].iloc[0]
         return first.lower().replace("_", " ")
+    if not missed(rows, target):
+        return "not asked"
     best = float(reached["error_q"].min())
     stopped = bool((rows["status"] == "TIME_LIMIT").any())
     return f"least error {number(best)}" + (", then time limit" if stopped else "")
@@ -121,7 +237,7 @@ def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequen
         line = [solver, str(runs["called_from"].iloc[0])]
         for target in targets:
             middle, low, high = (time_for(runs, target, what) for what in ("call_s", "call_q1", "call_q3"))
-            line.append(why_not(runs) if np.isnan(middle) else with_quartiles(middle, low, high))
+            line.append(why_not(runs, target) if np.isnan(middle) else with_quartiles(middle, low, high))
         lines.append(line)
     return lines
 

@@ -14,13 +14,24 @@ from typing import Any
 
 import pandas as pd
 
-from studies import adaptive, behind, cases, figures, goals, limit, rivals, scaling, study, tables
+from studies import adaptive, behind, cases, figures, goals, headline, limit, rivals, scaling, study, tables
 from studies.bench import Case, Run, row_of
 from studies.cli import StudyError
 from studies.compare import runs_of
 from studies.render import number, power, render, table
-from studies.solvers import COMPARED, DEFAULT, IDA_C_ORDER_2, IDA_FORMS, IRK_LINE, QUARTER, RADAU, TOLERANCES
-from studies.store import Output
+from studies.solvers import (
+    COMPARED,
+    COMPARED_OWN,
+    DEFAULT,
+    IDA_C_ORDER_2,
+    IDA_FORMS,
+    IRK_LINE,
+    QUARTER,
+    RADAU,
+    RIVALS,
+    TOLERANCES,
+)
+from studies.store import Output, Row
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
@@ -29,27 +40,27 @@ STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; 
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
-SETTINGS = ("tol", "h", "err_out")
 PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP, behind.GROUP)  # groups of rows that are not of the four cases
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
-    """The runs of a case; of those called from Python on stiff ones, which take seconds, fewer."""
+    """The runs of a case, at every other value of the grid: between them `adaptive` asks where that is of use."""
     stiff = "stiff" in case.tags
     if quick:
         return runs_of(case, QUICK, quick)
-    made = runs_of(case, (*COMPARED, *(STIFF if stiff else FURTHER)), quick)
-    if not stiff:
-        return made
+    made = runs_of(case, dict.fromkeys((*COMPARED_OWN, *RIVALS, *(STIFF if stiff else FURTHER))), quick)
     coarse = (case.tolerances or TOLERANCES)[::2]
-    return [run for run in made if run.solver.called_from != "Python" or run.value in coarse]
+    return [run for run in made if run.solver.setting != "tol" or run.value in coarse]
 
 
 def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     """The cheapest of ours, of others and of IDA on one case at one error, how the default does, and what beats it."""
     ranked = tables.ranking(rows, error)
     found: dict[str, Any] = {"error": error, "ida": None, "default_over": None, "before_default": {}}
+    found["standing"] = headline.of_error(rows, error)
+    ida = [own for _, own in rows[rows["solver"].str.startswith("IDA")].groupby("solver")]
+    found["ida_missed"] = bool(ida) and all(tables.missed(own, error) for own in ida)
     found |= tables.of_both(ranked)
     if ranked.empty:
         return found
@@ -73,7 +84,7 @@ def out_of_phase(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Of each solver with runs out of phase, the one at its finest setting; `tol`, `h` or `err_out` names it."""
     found = []
     for solver, own in runs[runs["astray"].astype(bool)].groupby("solver", sort=False):
-        setting = next(name for name in SETTINGS if name in own and own[name].notna().any())
+        setting = next(name for name in tables.SETTINGS if name in own and own[name].notna().any())
         run = own.loc[own[setting].astype(float).idxmin()]
         line = {"solver": str(solver), "setting": setting, "value": float(run[setting])}
         found.append(line | {key: float(run[key]) for key in ("error_q", "call_s")})
@@ -141,10 +152,15 @@ def make(output: Output) -> pd.DataFrame:
     quick = output.call.quick
     at_length = [run for case in known_cases(quick) for run in runs(case, quick)]
     with output.kept() as kept:
-        made = [adaptive.collect(at_length, kept, lambda run, k, built: row_of(run, k, None, built), lambda run: True)]
+        errors = () if quick else ERRORS
+        made = [adaptive.collect(at_length, kept, _row, lambda run: True, errors)]
         made += [rivals.collect(rivals.runs(quick), kept), behind.collect(kept, quick)]
         made += [scaling.collect(quick, kept), limit.collect(kept, quick)]
     return pd.concat(made, ignore_index=True)
+
+
+def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+    return row_of(run, repeat, None, built)
 
 
 def part(rows: pd.DataFrame, group: str | None = None) -> pd.DataFrame:
@@ -201,7 +217,7 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
         lines = figures.cheapest_lines(own, ERRORS)
         plot = figures.work_precision(own, lines, f"{case['name']}, {number(case['t_end'])} s")
         figures.save(plot, output, case["figure"].removesuffix(".png"))
-    figures.save(rivals.headline(everywhere), output, "work_precision")
+    figures.save(rivals.picture(everywhere), output, "work_precision")
     figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")
 
 

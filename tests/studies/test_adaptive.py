@@ -75,3 +75,46 @@ def test_a_run_goes_on_from_what_is_kept():
     kept = Kept()
     before = made(("a", good(0.01)), ("b", good(0.3)), kept=kept)
     assert made(("a", None), ("b", None), kept=kept).equals(before)  # neither is called again
+
+
+def asked(make, errors=(1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9), start=VALUES[:3], **others):
+    """Tolerances of which a solver was asked, given make(value) -> status, error, seconds; others beside it."""
+    case = Case("crane", None, 1.0)
+    makers = {"a": make, **others}
+    solvers = [Solver(name, "any", "compiled", True, "tol", None, VALUES) for name in sorted(makers, reverse=True)]
+    todo = [Run(case, solver, value) for solver in solvers for value in start]
+
+    def row(run, repeat, built):
+        status, error, seconds = makers[run.solver.name](run.value)
+        return {"solver": run.solver.name, "tol": run.value, "repeat": repeat, "status": status, "error_q": error} | {
+            "case": run.case.name,
+            "call_s": seconds,
+        }
+
+    made = adaptive.collect(todo, Kept(), row, errors=errors)
+    first = made[(made["repeat"] == 0) & (made["solver"] == "a")].sort_values("tol", ascending=False)
+    assert made.groupby(["solver", "tol"]).size().isin([1, 5]).all()
+    return first
+
+
+def test_a_solver_is_asked_between_settings_until_no_error_is_a_decade_from_the_next():
+    made = asked(lambda value: ("REACHED_END", 0.1 * value**1.5, 1.0 / value))
+    wanted = made[made["error_q"].between(1e-9, 1e-2)]["error_q"]
+    assert (wanted / wanted.shift(-1)).dropna().max() <= adaptive.DECADE * 1.01
+
+
+def test_a_solver_that_leaps_is_asked_on_both_sides_and_no_more():
+    made = asked(lambda value: ("REACHED_END", 1e-2 if value > 2.5e-5 else 1.8e-7, 1.0))
+    above, below = made[made["tol"] > 2.5e-5]["tol"].min(), made[made["tol"] < 2.5e-5]["tol"].max()
+    assert above / below <= adaptive.NEAR and len(made) <= 3 + 8
+
+
+def test_a_solver_is_asked_beyond_its_ends_where_accuracies_are_left_out():
+    made = asked(lambda value: ("REACHED_END", 1e-3 * value, 1.0), start=(1e-3, 1e-4))
+    assert made["tol"].max() == adaptive.LOOSEST and made["error_q"].min() <= 1e-9
+
+
+def test_what_is_far_behind_is_not_asked_between_its_settings():
+    fast = lambda value: ("REACHED_END", 1e-3 * value, 1e-3)  # noqa: E731
+    slow = asked(lambda value: ("REACHED_END", value, 6e-3), fast=fast)
+    assert len(slow) == 3

@@ -63,17 +63,18 @@ def test_one_study_runs_by_its_name(monkeypatch):
 BEST = {"solver": "ours", "call_s": 0.1, "call_q1": 0.1, "call_q3": 0.1, "n_evaluations": 1e5, "keeps": True}
 BEST |= {"called_from": "compiled", "violation_q": 1e-15, "energy": -1e-3}
 THEIRS = BEST | {"solver": "theirs", "call_s": 0.2, "keeps": False, "called_from": "Python", "n_evaluations": 1e4}
-NOTHING = {"ours": None, "others": None, "ida": None, "default_over": None}
+NOTHING = {"ours": None, "others": None, "ida": None, "default_over": None, "ida_missed": False, "standing": None}
+
+
+def standing(call_s=0.1, verdict="ahead"):
+    found = {"solver": "ours", "call_s": call_s, "ratio": 2.0, "interval": [1.5, 2.5], "verdict": verdict}
+    return {name: dict(found) for name in ("auto", "auto, compiled", "best of ours")}
 
 
 def at_error(error=1e-4, **changed):
-    return {
-        "error": error,
-        "ours": BEST,
-        "others": THEIRS,
-        "ida": BEST | {"call_s": 0.3},
-        "default_over": 2.0,
-    } | changed
+    ida = BEST | {"call_s": 0.3}
+    found = {"error": error, "ours": BEST, "others": THEIRS, "ida": ida, "default_over": 2.0}
+    return found | {"ida_missed": False, "standing": standing()} | changed
 
 
 def case(**changed):
@@ -109,14 +110,15 @@ def beam(differences_s, paper_s=4.5):
     return {"cases": [{"name": "moderately stiff", "at": [at]}]}
 
 
-def screen(tmp_path, cases=(), dominated=(), **others):
+def screen(tmp_path, cases=(), dominated=(), standings=None, **others):
     found = {"cases": list(cases), "dominated": list(dominated), "limit": 2.0, "default": "SunRadau5"}
+    found |= {"rivals": {"standings": standings}} if standings else {}
     for path in tmp_path.glob("*.json"):
         path.unlink()
     if cases:
         others["work_precision"] = found
     for name, each in others.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(each))
+        (tmp_path / f"{name}.json").write_text(json.dumps(each | {"timed": index.WHOLE_CALL}))
     return index.first_screen(tmp_path, False)
 
 
@@ -145,10 +147,12 @@ def test_the_cheapest_are_found_among_ours_and_others():
     assert entry["ida_over"] == pytest.approx([3.0]) and entry["ida_misses"] == []
     assert index.per_evaluation([entry]) == {"compiled": pytest.approx([1.0]), "Python": pytest.approx([20.0])}
 
-    faster = at_error(others=THEIRS | {"call_s": 0.05}, ida=None)
+    faster = at_error(others=THEIRS | {"call_s": 0.05}, ida=None, ida_missed=True)
     made = entries([case(name="hoist", at=[at_error(), faster, at_error(error=1e-6)])])
     assert index.overall(made) == [{"solver": "ours", "n": 2}, {"solver": "theirs", "n": 1}]
     assert made[0]["ida_misses"] == ["1e-4"]
+    # IDA misses what it was asked for, not what it was not
+    assert entries([case(at=[faster | {"ida_missed": False}])])[0]["ida_misses"] == []
     (entry,) = entries([case(at=[faster | {"ours": None}])])
     assert [(pick["solver"], pick["over"]) for pick in entry["picks"]] == [("theirs", [])] and entry["ida_over"] == []
     (entry,) = entries([case(at=[{"error": 1e-4, **NOTHING}])])
@@ -317,3 +321,35 @@ def test_the_readme_changes_between_its_marks_only(tmp_path):
     assert "`ours`" in text and "1e-4" in text and "`SunRadau5`" in text
     with pytest.raises(StudyError, match="there is no work_precision"):
         index.put_in_readme(tmp_path / "nowhere", readme)
+
+
+def test_each_of_default_compiled_default_and_best_stands_in_the_table_by_its_verdict(tmp_path):
+    at = at_error()
+    at["standing"] = standing(0.25, "behind") | {"best of ours": standing(0.1, "undecided")["best of ours"]}
+    at["standing"]["auto, compiled"] |= {"verdict": "missed", "call_s": None, "ratio": None}
+    line = next(line for line in screen(tmp_path, [case(at=[at])]).splitlines() if "crane, 1.0 s" in line)
+    assert [cell.strip() for cell in line.split("|")[3:7]] == [
+        "0.25 −",
+        "–",
+        "`ours` 0.10 ≈",
+        "`theirs` (Python, drifts off) 0.20",
+    ]
+
+
+def test_the_counts_of_the_headline_stand_first_on_both_screens(tmp_path):
+    counts = {"ahead": 51, "behind": 123, "undecided": 20, "alone": 4, "missed": 2, "n": 200}
+    standings = [counts | {"name": name} for name in ("auto", "auto, compiled", "best of ours")]
+    standings[2] |= {"ahead": 158, "behind": 1, "missed": 0}
+    said = (
+        "**`auto`**, which a user gets, is ahead of the best rival in 51 of 200 pairs of mechanism and error, behind "
+    )
+    for text in (screen(tmp_path, [case()], (), standings), front(tmp_path, [case()], standings=standings)):
+        assert text.count(said + "in 123, undecided in 20; in 4 no rival gets there, in 2 it does not") == 1
+        assert text.index(said) < text.index("The best of our methods**, chosen when all had run, is ahead of the best")
+
+
+def test_findings_of_other_times_than_the_whole_call_are_not_mixed_in(tmp_path):
+    screen(tmp_path, [case()])
+    path = tmp_path / "work_precision.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"timed": "inside"}))
+    assert "not run yet (`python -m studies.work_precision`)" in index.first_screen(tmp_path, False)

@@ -1,11 +1,13 @@
 """Every mechanism against the rivals: ratios, goals and sentences follow from the rows; sizes and the limit."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from references.straight_line import program_of
-from studies import behind, goals, limit, rivals, scaling, work_precision
+from studies import behind, goals, limit, rivals, scaling, tables, work_precision
 from studies.render import number, render
 from studies.solvers import CATALOGUE, OWN, RIVALS
 from twoloop import solve_dae
@@ -13,18 +15,12 @@ from twoloop.mechanisms import four_bar
 
 
 def rows(*lines, case="four-bar"):
-    """Rows of (solver, family, called from, error, seconds)."""
+    """Medians of (solver, family, called from, error, seconds), of five equal repetitions, at the loosest setting."""
     made = []
     for solver, family, called_from, error, cpu in lines:
         row = {"group": rivals.GROUP, "case": case, "solver": solver, "family": family, "called_from": called_from}
-        row |= {
-            "error_q": error,
-            "call_s": cpu,
-            "call_q1": cpu,
-            "call_q3": cpu,
-            "n_evaluations": 1e6 * cpu,
-            "floor": 1e-14,
-        }
+        row |= {"error_q": error, "floor": 1e-14, "tol": tables.LOOSEST, "n_evaluations": 1e6 * cpu}
+        row |= {"call_s": cpu, "call_q1": cpu, "call_q3": cpu, "times": (cpu,) * 5}
         row |= {"violation_q": 1e-15, "violation_v": 1e-15, "energy": 0.0, "keeps_constraints": True}
         made.append(row | {"status": "REACHED_END", "repeat": 0})
     return pd.DataFrame(made)
@@ -35,14 +31,35 @@ def compared(own, heyoka, python=9.0, error=1e-14):
     return rows(("Adams", "two-loop", "compiled", error, own), *kinds)
 
 
-@pytest.mark.parametrize(("own", "behind"), [(1.0, 0), (3.0, len(rivals.DECADES)), (2.1, 0)])
+@pytest.mark.parametrize(("own", "behind"), [(1.0, 0), (3.0, len(rivals.DECADES)), (2.0, 0)])
 def test_ahead_and_behind_follow_the_rows(own, behind):
     found = rivals.findings_of(compared(own, 2.0))
     assert found["n_behind"] == behind and found["n"] == len(rivals.DECADES)
-    assert found["n_ahead"] == (len(rivals.DECADES) if own == 1.0 else 0)
     assert found["n_clear"] == (0 if behind else 1) and found["n_behind_down_to"] == max(0, behind - 1)
     assert found["behind"] == ({"heyoka": behind} if behind else {})
     assert found["worst"]["ratio"] == pytest.approx(2.0 / own)
+    default, own_code, best = found["standings"]
+    assert best["ahead"] == (len(rivals.DECADES) if own == 1.0 else 0) and best["behind"] == behind
+    assert default["missed"] == own_code["missed"] == best["n"] == len(rivals.DECADES)  # neither was run
+
+
+def test_the_headline_names_default_compiled_default_and_best_in_this_order():
+    """Every sentence is made again from the rows."""
+    lines = [("auto", 3.0), ("auto, compiled", 2.0), ("Adams", 0.5), ("heyoka", 1.0)]
+    table = rows(*((name, "heyoka" if name == "heyoka" else "two-loop", "compiled", 1e-14, s) for name, s in lines))
+    slow = table[table["solver"] == "heyoka"].assign(times=[(1.0, 9.0, 0.5, 8.0, 0.7)])  # scatters about 2
+    undecided = pd.concat([table[table["solver"] != "heyoka"], slow.assign(call_s=1.0)]).assign(case="four-bar, second")
+    alone = table[table["solver"] != "heyoka"].assign(case="knife edge")
+    text = render("standings", {}, {}, standings=rivals.findings_of(pd.concat([table, undecided, alone]))["standings"])
+    n = len(rivals.DECADES)
+    assert [line.split(" is ahead")[0] for line in text.splitlines() if line] == [
+        "- **`auto`**, which a user gets,",
+        "- **`auto, compiled`**",
+        "- **The best of our methods**, chosen when all had run,",
+    ]
+    counts = [[int(word) for word in re.findall(r"\b\d+\b", line)] for line in text.splitlines() if line]
+    assert counts[0] == [0, 3 * n, n, n, n]  # ahead of pairs, behind, undecided, alone
+    assert counts[1] == [0, 3 * n, n, n, n] and counts[2][0] >= n
 
 
 def test_the_goals_are_of_each_kind_of_rival():
@@ -57,7 +74,7 @@ def test_where_one_side_does_not_come_there_is_no_ratio():
     assert at[3]["ratio"] == 2.0 and at[4]["ratio"] == 2.0
     assert at[5]["ratio"] is None and at[5]["ours"] is None and at[5]["others"]["solver"] == "heyoka"
     (cells,) = rivals.lines(rivals.findings_of(table))
-    assert cells == ["four-bar", "2.0", *["others"] * 3]
+    assert cells == ["four-bar", "others · others · 2.0", *["others"] * 3]
 
 
 def test_what_ours_alone_reaches_is_named_apart():
@@ -74,14 +91,14 @@ def test_a_goal_missed_everywhere_says_so_without_a_list():
 
 
 def test_a_ratio_that_we_lose_is_bold():
-    assert next(rivals.lines(rivals.findings_of(compared(4.0, 2.0))))[1] == "**0.50**"
+    assert next(rivals.lines(rivals.findings_of(compared(4.0, 2.0))))[1] == "others · others · **0.50**"
 
 
 def test_figures_are_drawn_of_rows():
     table = pd.concat([compared(1.0, 2.0), compared(0.5, 1.0, error=1e-3)], ignore_index=True)
-    (axes,) = rivals.headline(table).axes
+    (axes,) = rivals.picture(table).axes
     assert len(axes.lines) == 3
-    assert len(rivals.heat_map(rivals.findings_of(table)).axes) == 2
+    assert len(rivals.heat_map(rivals.findings_of(table)).axes) == 4
 
 
 def test_every_solver_has_its_settings_and_every_mechanism_is_there():
@@ -185,12 +202,12 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
 @pytest.mark.parametrize(
     ("own", "said", "not_said"),
     [
-        (0.5, ["**Reached**: no rival ahead", "ahead in 11, behind in 0,", "| heyoka | 2 | 4.0 |"], ["in the way"]),
-        (1.5, ["**Reached**: no rival ahead", "| heyoka | 2 | 1.3, missed |"], ["in the way"]),
+        (0.5, ["**Reached**: our best nowhere", "in 11 of 11 pairs", "| heyoka | 2 | 4.0 |"], ["in the way"]),
+        (1.5, ["**Reached**: our best nowhere", "| heyoka | 2 | 1.3, missed |"], ["in the way"]),
         (
             4.0,
-            ["**Missed**: no rival ahead", "behind in 11 (in 11 behind `heyoka`)", "in the way"],
-            ["**Reached**: no"],
+            ["**Missed**: our best nowhere", "behind in 11 pairs (in 11 behind `heyoka`)", "in the way"],
+            ["**Reached**: our"],
         ),
     ],
 )

@@ -35,10 +35,26 @@ def test_a_run_that_mostly_fails_is_shown_as_failed(n_failed, status):
 
 
 def test_cost_at_an_error_lies_on_the_line_between_two_runs():
-    made = rows(("a", 1e-2, 1.0), ("a", 1e-4, 4.0))
-    assert tables.time_for(made, 1e-3) == pytest.approx(2.0)
-    assert tables.time_for(made, 1.0) == 1.0 and tables.time_for(made, 1e-4) == 4.0
-    assert np.isnan(tables.time_for(made, 1e-5))
+    made = rows(("a", 1e-2, 1.0), ("a", 1e-3, 4.0))
+    assert tables.time_for(made, 10.0**-2.5) == pytest.approx(2.0)
+    assert tables.time_for(made, 1e-2) == 1.0 and tables.time_for(made, 1e-3) == 4.0
+    assert np.isnan(tables.time_for(made, 1e-4))
+
+
+def test_nothing_is_interpolated_over_more_than_a_decade_or_between_methods():
+    made = rows(("a", 1.1e-2, 1.0), ("a", 1.8e-7, 4.0))
+    assert np.isnan(tables.time_for(made, 1e-4))  # no run within a decade: not asked
+    assert tables.time_for(made, 1e-6) == 4.0 and tables.why_not(made, 1e-4) == "not asked"
+    near = made.assign(tol=[1e-4, 6e-5])  # asked on both sides: the solver leaps, and its price is that of the leap
+    assert tables.time_for(near, 1e-4) == 4.0
+    changed = rows(("a", 1e-2, 1.0), ("a", 2e-3, 4.0)).assign(used=["Newton", "explicit"])
+    assert tables.time_for(changed, 5e-3) == 4.0 > tables.time_for(changed.assign(used=""), 5e-3)
+
+
+def test_what_no_looser_setting_makes_cheaper_counts_at_every_error():
+    made = rows(("a", 1e-6, 2.0), ("a", 1e-9, 3.0))
+    assert np.isnan(tables.time_for(made.assign(tol=[1e-3, 1e-5]), 1e-2))
+    assert tables.time_for(made.assign(tol=[1e-1, 1e-3]), 1e-2) == 2.0
 
 
 def test_nothing_is_claimed_below_what_the_reference_resolves():
@@ -55,13 +71,53 @@ def test_a_ranking_turns_with_the_rows():
 
 
 def test_a_cell_that_is_not_reached_says_why():
-    made = rows(("a", 1e-4, 1.0))
-    assert tables.work_precision(made, [1e-3, 1e-5]) == [["a", "compiled", "1.0", "least error 1e-4"]]
-    limited = pd.concat([made, rows(("a", np.nan, 60.0)).assign(status="TIME_LIMIT")])
+    made = rows(("a", 1e-4, 1.0)).assign(tol=1e-5)
+    assert tables.work_precision(made, [1e-3, 1e-5]) == [["a", "compiled", "1.0", "not asked"]]
+    tightest = made.assign(tol=tables.TIGHTEST)
+    assert tables.work_precision(tightest, [1e-5])[0][2] == "least error 1e-4" and tables.missed(tightest, 1e-5)
+    limited = pd.concat([made, rows(("a", np.nan, 60.0)).assign(status="TIME_LIMIT", tol=1e-7)])
     assert tables.work_precision(limited, [1e-5])[0][2] == "least error 1e-4, then time limit"
     nothing = rows(("x", np.nan, np.nan)).assign(status="NOT_APPLICABLE", message="needs a model of its own")
     assert tables.work_precision(nothing, [1e-5])[0][2] == "not applicable"
     assert tables.failures(nothing) == [["x", "all", "not applicable", "needs a model of its own"]]
+
+
+def repeated(ours, others):
+    """Medians of one solver of ours and one other, of these times."""
+    made = [
+        rows(*((name, 1e-4, time) for time in times)).assign(repeat=range(len(times)), family=family)
+        for name, family, times in (("auto", "two-loop", ours), ("heyoka", "heyoka", others))
+    ]
+    return tables.medians(pd.concat(made, ignore_index=True))
+
+
+@pytest.mark.parametrize(
+    ("ours", "others", "verdict"),
+    [
+        ([1.0, 1.1, 0.9, 1.0, 1.05], [2.0, 2.2, 1.9, 2.0, 2.1], "ahead"),
+        ([2.0, 2.2, 1.9, 2.0, 2.1], [1.0, 1.1, 0.9, 1.0, 1.05], "behind"),
+        ([1.0, 3.0, 0.9, 2.0, 1.2], [1.1, 0.8, 2.5, 1.0, 2.9], "undecided"),
+        ([1.0], [5.0], "undecided"),  # one repetition decides nothing
+        ([1.0, 1.1, 0.9, 1.0, 1.05], [1.0, 1.1, 0.9, 1.0, 1.05], "undecided"),
+    ],
+)
+def test_a_pair_is_decided_where_the_interval_of_the_ratio_leaves_out_one(ours, others, verdict):
+    costs = tables.costs_at(repeated(ours, others), 1e-3)
+    found = tables.compared({"auto": costs["auto"]}, {"heyoka": costs["heyoka"]})
+    assert found["verdict"] == verdict and found["ratio"] == pytest.approx(np.median(others) / np.median(ours))
+    if len(ours) > 1:
+        low, high = found["interval"]
+        assert low <= found["ratio"] <= high and (verdict == "undecided") == (low <= 1.0 <= high)
+    else:
+        assert found["interval"] is None
+    again = tables.compared({"auto": costs["auto"]}, {"heyoka": costs["heyoka"]})
+    assert again == found  # the draws are the same
+
+
+def test_who_alone_gets_there_and_who_misses_is_told():
+    costs = tables.costs_at(repeated([1.0] * 3, [2.0] * 3), 1e-3)
+    verdicts = [tables.compared(*pair)["verdict"] for pair in ((costs, {}), ({}, costs), ({}, {}))]
+    assert verdicts == ["alone", "missed", "none"]
 
 
 def test_styles_tell_the_solvers_of_a_figure_apart():
