@@ -67,7 +67,7 @@ def runs(first: Case, second: Case, quick: bool) -> list[Run]:
     for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
         for name in names_:
             solver = CATALOGUE[name]
-            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-6, 1e-8, 1e-10)
+            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
             made += [Run(case, solver, x, "comparison", 1 if quick else 3) for x in (values[1:3] if quick else values)]
     return made
 
