@@ -117,6 +117,14 @@ def test_a_pair_is_decided_where_the_interval_of_the_ratio_leaves_out_one(ours, 
     assert again == found  # the draws are the same
 
 
+def test_nobody_is_ahead_of_a_solver_for_want_of_a_run():
+    made = rows(("heyoka", 1e-1, 1.0), ("heyoka", 1e-9, 50.0)).assign(tol=[1e-1, 1e-9])
+    assert tables.costs_at(made, 1e-5) == {}  # nothing is told of its cost there ...
+    (time, _) = tables.costs_at(made, 1e-5, doubt=True)["heyoka"]
+    assert time == 1.0  # ... and nobody is ahead of it who takes more than its looser run
+    assert tables.costs_at(made, 1e-10, doubt=True) == {}
+
+
 def test_who_alone_gets_there_and_who_misses_is_told():
     costs = tables.costs_at(repeated([1.0] * 3, [2.0] * 3), 1e-3)
     verdicts = [tables.compared(*pair)["verdict"] for pair in ((costs, {}), ({}, costs), ({}, {}))]
