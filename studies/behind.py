@@ -71,11 +71,16 @@ def _profile(
         known = bool(np.isfinite(steps))
         line[which] = {"solver": solver, "steps": steps if known else None, "call_s": seconds}
         line[which]["step_ns"] = 1e9 * seconds / steps if known else None
+    own = rows[rows["solver"] == at["ours"]["solver"]]
+    inside = tables.time_for(own, at["error"], "inside_s") if "inside_s" in rows else float("nan")
+    known = bool(np.isfinite(inside))
+    seconds = inside if known else at["ours"]["call_s"]
+    line["integrators"] = line["ratio"] * at["ours"]["call_s"] / inside if known else None
     evaluations, count = at["ours"]["n_evaluations"], operations.get(at["case"], np.nan)
     # a step of Taylor, which the default takes, too, computes series, not accelerations at points
     counted = bool(evaluations and np.isfinite(evaluations)) and not at["ours"]["solver"].startswith((DEFAULT, TAYLOR))
     line["evaluations"] = evaluations if counted else None
-    line["evaluation_ns"] = 1e9 * at["ours"]["call_s"] / evaluations if counted else None
+    line["evaluation_ns"] = 1e9 * seconds / evaluations if counted else None
     line["straight_ns"] = count * operation_ns if np.isfinite(count) else None
     told = line["evaluation_ns"] is not None and line["straight_ns"] is not None
     line["without"] = line["ratio"] * line["evaluation_ns"] / line["straight_ns"] if told else None
@@ -83,7 +88,10 @@ def _profile(
 
 
 def _in_the_way(line: dict[str, Any]) -> str:
-    """All but the arithmetic of the accelerations, where the lead would end without it; else steps or time per step."""
+    """What each call pays outside the integrator, where the lead would end without it; so all but the arithmetic of the
+    accelerations; else steps or time per step."""
+    if line["integrators"] is not None and line["integrators"] >= 1.0:
+        return "the call"
     if line["without"] is not None and line["without"] >= 1.0:
         return "overhead"
     steps, others = line["ours"]["steps"], line["others"]["steps"]

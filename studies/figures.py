@@ -177,7 +177,7 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
         left.errorbar(runs["error_q"].astype(float), times, yerr=spread, elinewidth=0.8, **one)
         counted = runs[runs["n_evaluations"].notna()]
         right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **one)
-    for axes, what in ((left, "CPU time (s)"), (right, "evaluations")):
+    for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
     legend(figure, [left], "filled: keeps constraints\n[c] compiled, [P] Python")
     figure.suptitle(title, fontsize=10)

@@ -20,23 +20,22 @@ STANDINGS = ("ahead", "behind", "undecided", "alone", "missed")
 
 def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
     """How each of the three stands on one case at one error, by the best of each; `rows`: medians, of all solvers."""
-    costs = tables.costs_at(rows, error)
-    ours = set(rows["solver"][rows["family"] == "two-loop"])
-    own = {name: cost for name, cost in costs.items() if name in ours}
-    others = {name: cost for name, cost in costs.items() if name not in ours}
+    ours = rows["family"] == "two-loop"
+    own, others = tables.costs_at(rows[ours], error), tables.costs_at(rows[~ours], error, doubt=True)
     sides = {DEFAULT: _only(own, DEFAULT), OWN_CODE: _only(own, OWN_CODE), BEST: own}
     return {
-        name: {"solver": _best(side), "call_s": side[_best(side)][0] if side else None, **tables.compared(side, others)}
-        for name, side in sides.items()
+        name: _told(side) | {"rival": _told(others)} | tables.compared(side, others) for name, side in sides.items()
     }
+
+
+def _told(costs: tables.Costs) -> dict[str, Any]:
+    """The cheapest."""
+    best = min(costs, key=lambda name: costs[name][0], default=None)
+    return {"solver": best, "call_s": None if best is None else costs[best][0]}
 
 
 def _only(costs: tables.Costs, name: str) -> tables.Costs:
     return {name: costs[name]} if name in costs else {}
-
-
-def _best(costs: tables.Costs) -> str:
-    return min(costs, key=lambda name: costs[name][0], default="")
 
 
 def counted(found: Iterable[Mapping[str, Mapping[str, Any]]]) -> list[dict[str, Any]]:

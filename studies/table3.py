@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from studies import figures, study, tables
-from studies.bench import Case, Run, Solver, collect
+from studies.bench import REPEATS, Case, Run, Solver, collect
 from studies.cases import four_bar
 from studies.cli import StudyError
 from studies.metrics import ASTRAY, LOST
@@ -60,7 +60,7 @@ def runs(first: Case, second: Case, quick: bool) -> list[Run]:
     for case, once in ((first, quick), (second, True)):
         for group, at in zip(FAMILIES, (paper_irk_at, paper_newmark_at), strict=True):
             cells = [(e_in, e_out) for e_in in TOLERANCES for e_out in TOLERANCES if case is first or e_in == e_out]
-            made += [Run(case, at(e_in), e_out, group, 1 if once else 3) for e_in, e_out in cells]
+            made += [Run(case, at(e_in), e_out, group, 1 if once else REPEATS) for e_in, e_out in cells]
     for partition in ("lasting", "symmetric"):
         solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
         made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
@@ -69,8 +69,10 @@ def runs(first: Case, second: Case, quick: bool) -> list[Run]:
     for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
         for name in names_:
             solver = CATALOGUE[name]
-            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-6, 1e-8, 1e-10)
-            made += [Run(case, solver, x, "comparison", 1 if quick else 3) for x in (values[1:3] if quick else values)]
+            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+            made += [
+                Run(case, solver, x, "comparison", 1 if quick else REPEATS) for x in (values[1:3] if quick else values)
+            ]
     return made
 
 

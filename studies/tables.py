@@ -14,7 +14,7 @@ from studies.render import number, power
 Array = NDArray[np.float64]
 
 SETTINGS = ("tol", "h", "err_out")
-DECADE = 10.0  # between two runs that lie farther apart nothing is interpolated
+DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
 NEAR = 2.0  # settings that differ by less are nearly the same
 LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
 RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # of the bootstrap
@@ -65,13 +65,13 @@ def setting_of(rows: pd.DataFrame) -> Array:
     return found
 
 
-def _place(runs: pd.DataFrame, target: float) -> tuple[int, float | None] | None:
+def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, float | None] | None:
     """How many of the runs of one solver, by error, are good enough, and where between them and the next the target is.
 
-    None: no run is so good, or none was asked for about this: within a decade below the target, or at the loosest
-    setting, or next to a run that is not good enough at nearly the same setting (the solver leaps over the target).
-    The place between two runs, on the log-log line through them, is None where they are more than a decade apart or
-    of different methods.
+    `rows` are all of the solver, `runs` those that have an error and the cost. None: no run is so good, or none was
+    asked for about this: within a decade below the target, at the loosest setting that the solver can run, or next to a
+    run that is not good enough at nearly the same setting (the solver leaps over the target). The place between two
+    runs, on the log-log line through them, is None where they are more than a decade apart or of different methods.
     """
     errors = _errors(runs)
     n_good = int((errors <= target).sum())
@@ -80,12 +80,24 @@ def _place(runs: pd.DataFrame, target: float) -> tuple[int, float | None] | None
     below, settings, end = errors[n_good - 1], setting_of(runs), n_good == len(errors)
     joined = not end and 0.0 < errors[n_good] <= DECADE * below
     near = not end and 1.0 / NEAR <= settings[n_good] / settings[n_good - 1] <= NEAR
-    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= LOOSEST).any()):
+    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
         return None
-    if not joined or ("used" in runs and runs["used"].iloc[n_good - 1] != runs["used"].iloc[n_good]):
+    if not joined or _used(runs.iloc[n_good - 1]) != _used(runs.iloc[n_good]):
         return n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])
     return n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
+
+
+def _loosest(rows: pd.DataFrame) -> float:
+    """The setting than which none is looser that the solver can run: tried, or of no use."""
+    settings, good = setting_of(rows), rows["error_q"].notna().to_numpy()
+    best = float(settings[good].max(initial=0.0))
+    return best if (settings[~good] > best).any() else LOOSEST
+
+
+def _used(run: pd.Series) -> str:
+    """The method that a solver took which chooses; a file has nothing where there is none."""
+    return run["used"] if isinstance(run.get("used"), str) else ""
 
 
 def _errors(runs: pd.DataFrame) -> Array:
@@ -116,19 +128,26 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     where the target is below what the reference resolves.
     """
     runs = _told(rows, what)
-    place = None if runs.empty else _place(runs, target)
+    place = None if runs.empty else _place(rows, runs, target)
     return float("nan") if place is None else float(_cost(runs[what].to_numpy(float), place))
 
 
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
 
 
-def costs_at(rows: pd.DataFrame, target: float) -> Costs:
-    """Of the solvers of one case that get to an error and were asked for about so much, what they take."""
+def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
+    """Of the solvers of one case that get to an error and were asked for about so much, what they take.
+
+    `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
+    either side, so that nobody is ahead of a solver for want of a run.
+    """
     found = {}
     for solver, own in rows.groupby("solver", sort=False):
         runs = _told(own, "call_s")
-        place = None if runs.empty else _place(runs, target)
+        place = None if runs.empty else _place(own, runs, target)
+        if place is None and doubt and not runs.empty and target >= runs["floor"].max():
+            n_good = int((_errors(runs) <= target).sum())
+            place = None if n_good == 0 else (min(n_good + 1, len(runs)), None)
         if place is not None:
             found[str(solver)] = float(_cost(runs["call_s"].to_numpy(float), place)), _cost(resampled(runs), place)
     return found

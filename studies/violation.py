@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from studies import figures, tables
-from studies.bench import Run
+from studies.bench import REPEATS, Run
 from studies.cases import four_bar
 from studies.cli import StudyError
 from studies.metrics import CHECKED, violations
@@ -51,7 +51,7 @@ def runs(quick: bool) -> list[Run]:
     made += [Run(case, paper_irk_at(LOOSE), err_out, "loops", 1) for err_out in (LOOSE, TIGHT)]
     for name in QUICK_ALONG if quick else (*ALONG, *STABILISED):
         values = (1e-5, 1e-7) if quick else CATALOGUE[name].grid(case)
-        made += [Run(case, CATALOGUE[name], value, "tolerances", 1 if quick else 3) for value in values]
+        made += [Run(case, CATALOGUE[name], value, "tolerances", 1 if quick else REPEATS) for value in values]
     return made
 
 

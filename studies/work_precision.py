@@ -14,7 +14,20 @@ from typing import Any
 
 import pandas as pd
 
-from studies import adaptive, behind, cases, figures, goals, headline, limit, rivals, scaling, study, tables
+from studies import (
+    adaptive,
+    behind,
+    cases,
+    figures,
+    first_calls,
+    goals,
+    headline,
+    limit,
+    rivals,
+    scaling,
+    study,
+    tables,
+)
 from studies.bench import Case, Run, row_of
 from studies.cli import StudyError
 from studies.compare import runs_of
@@ -40,7 +53,13 @@ STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; 
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
-PARTS = (rivals.GROUP, scaling.GROUP, limit.GROUP, behind.GROUP)  # groups of rows that are not of the four cases
+PARTS = (
+    rivals.GROUP,
+    scaling.GROUP,
+    limit.GROUP,
+    behind.GROUP,
+    first_calls.GROUP,
+)  # groups of rows that are not of the four cases
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
@@ -155,7 +174,7 @@ def make(output: Output) -> pd.DataFrame:
         errors = () if quick else ERRORS
         made = [adaptive.collect(at_length, kept, _row, lambda run: True, errors)]
         made += [rivals.collect(rivals.runs(quick), kept), behind.collect(kept, quick)]
-        made += [scaling.collect(quick, kept), limit.collect(kept, quick)]
+        made += [scaling.collect(quick, kept), limit.collect(kept, quick), first_calls.collect(kept, quick)]
     return pd.concat(made, ignore_index=True)
 
 
@@ -189,7 +208,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings["behind"] = behind.findings_of(found, everywhere, operations.to_dict(), operation_ns)
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    findings |= {"fitted": scaling.FITTED}
+    findings |= {"fitted": scaling.FITTED, "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)
     text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
@@ -224,12 +243,14 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 def ready(findings: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
     geometries = [geometry["case"] for geometry in findings["rivals"]["four_bar"]]
+    first = ["solver", "first call (s)", "least", "most", "later call (ms)", "pays from run"]
     profile = ["worst", "ours", "steps × ns", "rival", "steps × ns", "evaluation (ns)", "without", "in the way"]
     return {
         "goals": table(["rival", "wanted", *geometries], rivals.goal_lines(findings["rivals"])),
         "ratios": table(["mechanism", *(power(e) for e in rivals.IN_TABLE)], rivals.lines(findings["rivals"])),
         "behind": table(profile, behind.lines(findings["behind"])),
         "scaling": scaling.pivot(findings["scaling"]),
+        "first": table(first, first_calls.lines(findings["first_calls"])),
     }
 
 

@@ -217,7 +217,7 @@ def test_exudyn_is_measured_against_itself():
     pytest.importorskip("exudyn")
     case = cases(True)[STIFF]
     run = Run(case, beam_runs.solvers()[EXUDYN], case.t_end / 50_000, "run")
-    result, status, _ = attempt(run, 0)
+    result, status, _, _ = attempt(run, 0)
     row = measure(run, result)
     assert status == "REACHED_END" and row["floor"] <= row["error_tip"] < 1e-3
 

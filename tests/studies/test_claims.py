@@ -87,7 +87,7 @@ def beam():
                 for tol, error, cpu in ((1e-5, 1e-2, 0.2), (1e-9, 1e-5, 1.6))
             ),
             *(
-                (name, 1e-3, 1e-6, 0.05)
+                (name, 1e-1, 1e-6, 0.05)
                 for name in ("DOP853, projected", "DOP853 (two-loop)", "RadauIIA5, by differences")
             ),
         ):

@@ -203,7 +203,7 @@ def test_the_run_of_least_error_stands_for_a_solver(rows):
 def test_a_run_that_does_not_converge_is_a_row():
     run = next(run for run in runs(True) if run.solver.name == GAUSS and run.case.name == SWITCHING and run.value == H)
     run = type(run)(run.case, run.solver, 0.05)
-    result, status, _ = attempt(run, 0)
+    result, status, _, _ = attempt(run, 0)
     found = measure(run, result)
     assert status == "NOT_CONVERGED" and found["slope"] is None and 0.0 < found["t_reached"] < 75.0
 

@@ -74,6 +74,17 @@ def test_what_stands_in_the_way_follows_steps_and_times():
     assert profile(float("nan"), 100.0, {})["in_the_way"] == "not told"
 
 
+def test_what_each_call_pays_outside_the_integrator_is_told_apart():
+    def way(inside):
+        table = compared(4.0, 2.0).assign(n_evaluations=100.0, n_steps=10.0, inside_s=[inside, 2.0, 9.0])
+        (line,) = behind.findings_of(rivals.findings_of(table), table, {}, 1e6)
+        return line
+
+    assert way(1.0)["in_the_way"] == "the call" and way(1.0)["integrators"] == pytest.approx(2.0)
+    assert way(3.9)["in_the_way"] == "time per step"
+    assert way(1.0)["evaluation_ns"] == pytest.approx(1e7)  # of the time inside
+
+
 def test_a_step_of_taylor_is_not_measured_in_evaluations():
     table = compared(4.0, 2.0).assign(n_evaluations=100.0, n_steps=10.0)
     table["solver"] = table["solver"].replace("Adams", "Taylor")

@@ -188,6 +188,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
     found = {
         "cases": [],
         "scaling": [],
+        "first_calls": [],
         "fitted": 10,
         "default": "auto",
         "rivals": rivals.findings_of(table),

@@ -170,7 +170,7 @@ def test_the_study_lists_all_cells_once():
 
     runs = table3.runs(*four_bar.cases(False), False)
     cells_ = [run for run in runs if run.group in FAMILIES and run.case.name == "four-bar"]
-    assert len(cells_) == 32 and all(run.repeats == 3 for run in cells_)
+    assert len(cells_) == 52 and all(run.repeats == 3 for run in cells_)
     assert len({run.key(0) for run in runs}) == len(runs)
     assert sum(run.repeats for run in table3.runs(*four_bar.cases(True), True)) < 100
 

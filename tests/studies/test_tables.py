@@ -49,12 +49,15 @@ def test_nothing_is_interpolated_over_more_than_a_decade_or_between_methods():
     assert tables.time_for(near, 1e-4) == 4.0
     changed = rows(("a", 1e-2, 1.0), ("a", 2e-3, 4.0)).assign(used=["Newton", "explicit"])
     assert tables.time_for(changed, 5e-3) == 4.0 > tables.time_for(changed.assign(used=""), 5e-3)
+    assert tables.time_for(changed.assign(used=np.nan), 5e-3) < 4.0  # as a file has it where nothing is chosen
 
 
 def test_what_no_looser_setting_makes_cheaper_counts_at_every_error():
     made = rows(("a", 1e-6, 2.0), ("a", 1e-9, 3.0))
     assert np.isnan(tables.time_for(made.assign(tol=[1e-3, 1e-5]), 1e-2))
     assert tables.time_for(made.assign(tol=[1e-1, 1e-3]), 1e-2) == 2.0
+    failed = pd.concat([made.assign(tol=[1e-3, 1e-5]), rows(("a", np.nan, 1.0)).assign(tol=1e-2)])
+    assert tables.time_for(failed, 1e-2) == 2.0
 
 
 def test_nothing_is_claimed_below_what_the_reference_resolves():
@@ -112,6 +115,14 @@ def test_a_pair_is_decided_where_the_interval_of_the_ratio_leaves_out_one(ours, 
         assert found["interval"] is None
     again = tables.compared({"auto": costs["auto"]}, {"heyoka": costs["heyoka"]})
     assert again == found  # the draws are the same
+
+
+def test_nobody_is_ahead_of_a_solver_for_want_of_a_run():
+    made = rows(("heyoka", 1e-1, 1.0), ("heyoka", 1e-9, 50.0)).assign(tol=[1e-1, 1e-9])
+    assert tables.costs_at(made, 1e-5) == {}  # nothing is told of its cost there ...
+    (time, _) = tables.costs_at(made, 1e-5, doubt=True)["heyoka"]
+    assert time == 1.0  # ... and nobody is ahead of it who takes more than its looser run
+    assert tables.costs_at(made, 1e-10, doubt=True) == {}
 
 
 def test_who_alone_gets_there_and_who_misses_is_told():

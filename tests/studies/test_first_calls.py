@@ -1,0 +1,50 @@
+"""The first call, and from which run building pays, from rows made by hand."""
+
+import pandas as pd
+import pytest
+
+from studies import first_calls
+
+
+def rows(*lines):
+    """Rows of (solver, first call, later call) on one mechanism."""
+    made = [{"solver": solver, "first_call_s": first, "call_s": later} for solver, first, later in lines]
+    return pd.DataFrame(made).assign(case="crane", status="REACHED_END")
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "pays"),
+    [
+        (1.05, 0.1, 11.0),
+        (0.05, 0.1, 1.0),
+        (1.0, 0.2, None),
+        (1.0, 0.3, None),
+    ],
+)
+def test_building_pays_from_the_run_in_which_all_runs_together_take_less(first, later, pays):
+    line = {"first_call_s": first, "call_s": later}
+    default = {"first_call_s": 0.1, "call_s": 0.2}
+    found = first_calls.pays_from(line, default)
+    assert found == pays
+
+    def total(side, n):
+        return side["first_call_s"] + (n - 1) * side["call_s"]
+
+    ahead = [n for n in range(1, 100) if total(line, n) < total(default, n)]
+    assert (ahead[0] if ahead else None) == pays
+
+
+def test_a_line_a_solver_and_never_where_its_calls_are_no_cheaper():
+    made = rows(("auto", 0.1, 0.2), ("auto, compiled", 1.0, 0.1), ("heyoka", 3.0, 0.4))
+    failed = rows(("auto, compiled", None, None)).assign(case="hoist", status="RAISED")
+    found = {line["solver"]: line for line in first_calls.findings_of(pd.concat([made, failed]))}
+    assert found["auto, compiled"]["pays"] == [11.0] and found["auto, compiled"]["n"] == 1
+    assert found["heyoka"]["never"] == 1 and found["auto"]["pays"] == [] and found["auto"]["never"] == 0
+    lines = list(first_calls.lines(list(found.values())))
+    assert lines[1] == ["`auto, compiled`", 1.0, 1.0, 1.0, 100.0, "11"] and lines[2][-1] == "never on 1"
+
+
+@pytest.mark.slow
+def test_the_first_call_builds_where_the_next_finds_all_built():
+    row = first_calls.in_process("four-bar", "auto, compiled")
+    assert row["status"] == "REACHED_END" and row["first_call_s"] > 3.0 * row["call_s"]
