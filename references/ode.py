@@ -2,12 +2,15 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import qr
 
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+DEPENDENT = 1e-10  # of the largest pivot: rows of C_q with a smaller one depend on the others
+SAMPLES = 5  # states at which the rank is looked for
 OUTPUTS = 1001  # instants of the default t_eval of solvers that do not store their steps
 
 ADVICE = (
@@ -35,25 +38,11 @@ def ode_result(
     `a` and `lam` (with the sign of M a + C_q^T lam = Q) are those of eq. (6) at the states, of least norm where they
     are not unique.
     """
-    n, m = system.n_q, system.n_c
-    a, lam = np.empty((n, t.size)), np.empty((m, t.size))
-    matrix, right = np.zeros((n + m, n + m)), np.empty(n + m)
-    for k in range(t.size):
-        q, v = states[:n, k].copy(), states[n:, k].copy()
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            a[:, k] = lam[:, k] = np.nan
-            continue
-        matrix[:n, :n], right[:n] = system.mass(t[k], q), system.force(t[k], q, v)
-        if m:
-            matrix[n:, :n] = system.jacobian(t[k], q)
-            matrix[:n, n:] = matrix[n:, :n].T
-            right[n:] = system.gamma(t[k], q, v)
-        solution = np.linalg.lstsq(matrix, right, rcond=None)[0]
-        a[:, k], lam[:, k] = solution[:n], solution[n:]
+    a, lam = _accelerations(system, t, states)
     return Result(
         t=t,
-        q=states[:n],
-        v=states[n:],
+        q=states[: system.n_q],
+        v=states[system.n_q :],
         a=a,
         lam=lam,
         h=np.empty(0) if h is None else h,
@@ -61,3 +50,51 @@ def ode_result(
         message=failure or end,
         stats=statistics,
     )
+
+
+def _accelerations(system: ConstrainedSystem, t: Array, states: Array) -> tuple[Array, Array]:
+    """Accelerations and multipliers of eq. (6) at states (2 n_q, n_t); NaN where a state is not finite."""
+    n, m, f = system.n_q, system.n_c, system.functions
+    rows, finite = np.ascontiguousarray(states.T), np.isfinite(states).all(axis=0)
+    matrices, right = np.zeros((t.size, n + m, n + m)), np.zeros((t.size, n + m))
+    M, Cq = np.zeros((n, n)), np.zeros((m, n))
+    for k in np.flatnonzero(finite):
+        time, q, v = float(t[k]), rows[k, :n], rows[k, n:]
+        M[:], Cq[:] = 0.0, 0.0
+        f.mass(time, q, f.p, M)
+        f.force(time, q, v, f.p, right[k, :n])
+        if m:
+            f.jacobian(time, q, f.p, Cq)
+            f.gamma(time, q, v, f.p, right[k, n:])
+        matrices[k, :n, :n], matrices[k, n:, :n], matrices[k, :n, n:] = M, Cq, Cq.T
+    matrices, right = matrices[finite], right[finite]
+    a, lam = np.full((t.size, n), np.nan), np.full((t.size, m), np.nan)
+    if len(matrices):
+        a[finite], lam[finite] = _solved(matrices, right, n)
+    return a.T, lam.T
+
+
+def _solved(matrices: Array, right: Array, n: int) -> tuple[Array, Array]:
+    """Solutions (n_t, n), (n_t, n_c) of linear equations with the matrices [M C_q^T; C_q 0], of least norm."""
+    Cq = matrices[:, n:, :n]
+    some = np.linspace(0, len(Cq) - 1, SAMPLES).astype(int)  # at a singular position more rows depend on others
+    chosen = max((_independent(each) for each in Cq[some]), key=len)
+    kept = np.concatenate([np.arange(n), n + chosen])
+    try:
+        solution = np.linalg.solve(matrices[:, kept[:, None], kept], right[:, kept, None])
+    except np.linalg.LinAlgError:
+        solution = np.linalg.pinv(matrices, hermitian=True) @ right[:, :, None]
+        return solution[:, :n, 0], solution[:, n:, 0]
+    a, lam = np.asarray(solution[:, :n], np.float64), np.asarray(solution[:, n:], np.float64)
+    if chosen.size < Cq.shape[1]:  # C_q = T C_r: of all with T^T lam = lam_r the one of least norm
+        Cr = Cq[:, chosen]
+        T = np.linalg.solve(Cr @ Cr.mT, Cr @ Cq.mT).mT
+        lam = T @ np.linalg.solve(T.mT @ T, lam)
+    return a[:, :, 0], lam[:, :, 0]
+
+
+def _independent(Cq: Array) -> NDArray[np.int64]:
+    """Rows of C_q that do not depend on one another, as many as there are."""
+    _, triangle, order = qr(Cq.T, mode="economic", pivoting=True)
+    diagonal = np.abs(np.diagonal(triangle))
+    return np.sort(order[: np.count_nonzero(diagonal > DEPENDENT * diagonal.max(initial=0.0))])
