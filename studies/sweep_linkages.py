@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -25,6 +26,8 @@ N_SCALING, N_SCALING_QUICK = 1_000, 10
 SPAN = (0.0, 6.0)
 RANGES = {"L1": (0.8, 1.5), "L2": (1.0, 2.0), "L3": (0.8, 1.6), "ground": (2.0, 3.0), "theta3": (-1.0, 1.0)}
 AT_REST = 1e-4  # of the largest velocity of a run: below it the linkage has turned back
+SAME = 1e-6  # s: zeros of several bars closer than this are one rest
+BARS = (2, 5, 8)  # angles of the three bars
 WAYS = (("processes", 1), ("processes", 2), ("threads", 1), ("threads", 2))
 SCALES = 1.8  # on two cores, as the project asks for
 
@@ -44,23 +47,38 @@ def drawn(n: int) -> list[dict[str, Any]]:
     return made
 
 
-def turning(t: float, q: Array, v: Array) -> float:
-    """Zero where the first bar turns back, as it does wherever the linkage is at rest."""
-    return float(v[2])
+def turning(angle: int, t: float, q: Array, v: Array) -> float:
+    """Zero where one bar turns back, as all do wherever the linkage is at rest."""
+    return float(v[angle])
+
+
+# of all three bars: one whose acceleration at rest is nearly zero turns back three times within milliseconds, of which
+# signs taken four times a step see one
+TURNING = tuple(partial(turning, angle) for angle in BARS)
+
+
+def rests(result: Result) -> Array:
+    """Times after the start at which the linkage is at rest."""
+    assert result.t_events is not None and result.v_events is not None
+    least = AT_REST * np.abs(result.v).max()
+    found = [
+        t[np.abs(v).max(axis=1, initial=0.0) < least] for t, v in zip(result.t_events, result.v_events, strict=True)
+    ]
+    times = np.sort(np.concatenate(found))
+    times = times[times > SAME]
+    return times[np.diff(times, prepend=0.0) > SAME]
 
 
 def measured(problem: Problem, result: Result) -> dict[str, Any]:
     """Energy error over the largest kinetic energy, and the period: the second return to rest is that to the start."""
     energy = result.energy
     kinetic = energy - problem.energy(result.t, result.q, 0.0 * result.v)
-    assert result.t_events is not None and result.v_events is not None
-    speeds = np.abs(result.v_events[0]).max(axis=1, initial=0.0)
-    rests = result.t_events[0][(speeds < AT_REST * np.abs(result.v).max()) & (result.t_events[0] > 0.0)]
-    known = len(rests) > 1
+    stops = rests(result)
+    known = len(stops) > 1
     return {
         "energy_error": _short(np.abs(energy - energy[0]).max() / kinetic.max(), 4),
-        "half": _short(rests[0], 12) if known else np.nan,
-        "period": _short(rests[1], 12) if known else np.nan,
+        "half": _short(stops[0], 12) if known else np.nan,
+        "period": _short(stops[1], 12) if known else np.nan,
         "n_evaluations": result.stats.n_evaluations,
     }
 
@@ -74,7 +92,7 @@ def make(output: Output) -> pd.DataFrame:
     """The rows of all linkages, then one of each way to sweep, with its wall-clock time."""
     quick = output.call.quick
     ways = WAYS[2:] if quick else WAYS  # new processes take seconds to start: not for a quick run
-    options: dict[str, Any] = {"measure": measured, "t_span": SPAN, "events": turning}
+    options: dict[str, Any] = {"measure": measured, "t_span": SPAN, "events": TURNING}
     # what an interrupted run leaves is of no use to other sources
     kept = output.file(f"sweep_linkages.{sources()[:16]}.partial.parquet")
     given = drawn(N_QUICK if quick else N_RUNS)

@@ -158,7 +158,7 @@ def test_every_variant_runs_with_both_kinds_of_steps():
     assert {run.solver.name for run in runs} == {PAPER, FROZEN, *RIVALS}
     for run in runs:
         if run.value in (1e-3, 0.04):
-            result, status, message = attempt(run, 0)
+            result, status, message, _ = attempt(run, 0)
             assert status == "REACHED_END", message
             assert ablation.measure(run, result)["h_max"] >= ablation.measure(run, result)["h_median"] > 0.0
 

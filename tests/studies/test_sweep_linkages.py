@@ -40,11 +40,19 @@ def said(rows):
 def test_the_default_linkage_has_the_period_of_its_reference():
     start = {"L1": 1.0, "L2": 2.0, "L3": 1.5, "ground": 3.0, "theta3": 0.0, "branch": -1}
     rows = sweep(
-        study.linkage, [start], measure=study.measured, parallel="threads", t_span=study.SPAN, events=study.turning
+        study.linkage, [start], measure=study.measured, parallel="threads", t_span=study.SPAN, events=study.TURNING
     )
     assert rows.loc[0, "period"] == pytest.approx(four_bar().reference.period, rel=1e-7)
     assert rows.loc[0, "half"] == pytest.approx(0.5 * four_bar().reference.period, rel=1e-7)
     assert 1e-12 < rows.loc[0, "energy_error"] < 1e-7
+
+
+def test_a_bar_that_turns_back_three_times_within_milliseconds_hides_no_rest():
+    start = study.drawn(5453)[5452]
+    rows = sweep(
+        study.linkage, [start], measure=study.measured, parallel="threads", t_span=study.SPAN, events=study.TURNING
+    )
+    assert rows.loc[0, "period"] == pytest.approx(2.0 * rows.loc[0, "half"], rel=1e-6)
 
 
 def test_draws_are_always_the_same_and_within_their_ranges():

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from studies import table3
+from studies.bench import REPEATS
 from studies.cli import Call
 from studies.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
 from studies.store import Output
@@ -170,7 +171,7 @@ def test_the_study_lists_all_cells_once():
 
     runs = table3.runs(*four_bar.cases(False), False)
     cells_ = [run for run in runs if run.group in FAMILIES and run.case.name == "four-bar"]
-    assert len(cells_) == 52 and all(run.repeats == 3 for run in cells_)
+    assert len(cells_) == 32 and all(run.repeats == REPEATS for run in cells_)
     assert len({run.key(0) for run in runs}) == len(runs)
     assert sum(run.repeats for run in table3.runs(*four_bar.cases(True), True)) < 100
 
