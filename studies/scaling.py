@@ -1,4 +1,4 @@
-"""Cost against size: open and closed chains and the N-four-bar mechanism, a step and an evaluation of each method.
+"""Cost against size: chains of point masses and of rigid bars, the N-four-bar mechanism: a step and an evaluation of each method.
 
 A part of `studies.work_precision`. What is timed are steps after the first `SKIPPED`, in which a run sets itself
 up. The rival is SciPy's DOP853 on the accelerations, whose linear algebra is dense.
@@ -16,9 +16,12 @@ from studies.render import table
 from studies.store import KeptRows, Row
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, n_four_bar
+from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 
 GROUP = "size"
+RIGID = "chain of rigid bars"
+BARS = (2, 5, 10, 20, 50, 100)
 CHAINS, WINDOWS = (1, 2, 5, 10, 20, 50, 100, 200), (1, 2, 5, 10, 20, 40)
 QUICK, QUICK_METHODS = (2, 10, 20), ("Adams",)
 METHODS = ("Taylor", "Adams", "DOP853", "Gauss6")
@@ -56,9 +59,26 @@ def chain(n: int, closed: bool) -> Problem:
     return Problem(name, system, q0, np.zeros(2 * n), (0.0, 1.0), rows.energy, conserved=True)
 
 
+def rigid_chain(n: int) -> Problem:
+    """Bars of 1/n kg and 1/n m with pins between them, in the arc of `chain` from rest, as one writes bodies and joints.
+
+    Three coordinates a bar, and no bandwidth declared.
+    """
+    length, angles = 1.0 / n, np.linspace(-0.2, -1.2, n)
+    along = length * np.column_stack([np.cos(angles), np.sin(angles)])
+    centres = np.cumsum(along, axis=0) - 0.5 * along
+    bars = PlanarBodies([f"bar {i + 1}" for i in range(n)], np.full(n, 1.0 / n), np.full(n, length**2 / 12.0 / n))
+    for i in range(n):
+        before = (GROUND, (0.0, 0.0)) if i == 0 else (i - 1, (0.5 * length, 0.0))
+        bars.pin(i, (-0.5 * length, 0.0), *before)
+    system, q0 = bars.system("chain of bars"), np.column_stack([centres, angles]).ravel()
+    return Problem("chain of bars", system, q0, np.zeros(3 * n), (0.0, 1.0), bars.energy, conserved=True)
+
+
 FAMILIES: dict[str, tuple[Callable[[int], Problem], tuple[int, ...]]] = {
     "open chain": (partial(chain, closed=False), CHAINS),
     "closed chain": (partial(chain, closed=True), CHAINS[1:]),
+    RIGID: (rigid_chain, BARS),
     "N-four-bar": (n_four_bar, WINDOWS),
 }
 
@@ -143,6 +163,7 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
         for what in ("step", "evaluation"):
             costs = middle[f"{what}_us"].to_numpy(float)
             line |= {what: [float(costs[0]), float(costs[-1])], f"{what}_exponent": exponent(sizes, costs)}
+        line["evaluations"] = dict(zip(map(str, sizes), middle["evaluation_us"].astype(float), strict=True))
         found.append(line)
     return found
 
@@ -153,3 +174,10 @@ def pivot(found: list[dict[str, Any]]) -> str:
     cells = {(line["family"], line["method"]): line["step_exponent"] if line["sizes"] else "failed" for line in found}
     lines = [[family, *(cells.get((family, method), "–") for method in methods)] for family in families]
     return table(["mechanism", *methods], lines)
+
+
+def evaluations(found: list[dict[str, Any]]) -> str:
+    """A table: microseconds of an evaluation on the chain of rigid bars, by number of bars and method."""
+    lines = {line["method"]: line["evaluations"] for line in found if line["family"] == RIGID and line["sizes"]}
+    sizes = list(dict.fromkeys(n for costs in lines.values() for n in costs))
+    return table(["bars", *lines], [[n, *(costs.get(n, "–") for costs in lines.values())] for n in sizes])

@@ -250,6 +250,7 @@ def ready(findings: dict[str, Any]) -> dict[str, str]:
         "ratios": table(["mechanism", *(power(e) for e in rivals.IN_TABLE)], rivals.lines(findings["rivals"])),
         "behind": table(profile, behind.lines(findings["behind"])),
         "scaling": scaling.pivot(findings["scaling"]),
+        "evaluations": scaling.evaluations(findings["scaling"]),
         "first": table(first, first_calls.lines(findings["first_calls"])),
     }
 

@@ -164,6 +164,14 @@ def test_a_failed_size_is_a_row_and_no_cost():
     assert line["failed"] and "| open chain | failed |" in scaling.pivot([line])
 
 
+def test_bars_of_a_chain_hang_together():
+    problem = scaling.rigid_chain(4)
+    assert np.abs(problem.system.constraint(0.0, problem.q0)).max() < 1e-15
+    lines = [scaling._row(scaling.RIGID, scaling.rigid_chain(n), n, "Adams", 0) for n in (2, 3)]
+    found = scaling.findings_of(pd.DataFrame(lines))
+    assert list(found[0]["evaluations"]) == ["2", "3"] and "| 3 |" in scaling.evaluations(found).replace("  ", " ")
+
+
 def test_the_limit_is_counted_and_shared():
     problem = four_bar()
     operations = program_of(problem.system, 0.0, problem.q0, problem.v0)[0].operations
