@@ -23,6 +23,7 @@ GROUP = "minimal coordinates"
 RIVAL = "fastest rival"
 ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+WRONG, ASKED = 0.1, 1e-3  # a run that ends with this error, though it was asked for at least so much, is wrong
 TIME_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes the limit is not asked on
 
 
@@ -50,24 +51,26 @@ def at_error(rows: pd.DataFrame, others: pd.DataFrame, error: float) -> dict[str
     """
     ours = others["family"] == "two-loop"
     found: dict[str, Any] = headline.of_error(pd.concat([others[ours], rows], ignore_index=True), error)
-    cheapest: dict[str, Any] = found[headline.BEST]["rival"]
+    cheapest = found[headline.BEST]["rival"]
     ranked = tables.costs_at(others[~ours], error)
     rival = min(ranked, key=lambda name: ranked[name][0], default=None)
-    line: dict[str, Any] = {"solver": rival, "call_s": None if rival is None else ranked[rival][0], "rival": cheapest}
+    line = {"solver": rival, "call_s": None if rival is None else ranked[rival][0], "rival": cheapest}
     found[RIVAL] = line | tables.compared(ranked, tables.costs_at(rows, error, doubt=True))
     return {"error": error, "minimal": cheapest, "standing": found}
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     """By mechanism and error, minimal coordinates beside constraints; `rows` and `everywhere` (`rivals`): medians."""
-    made = []
+    made: list[dict[str, Any]] = []
     for name, own in rows.groupby("case", sort=False) if len(rows) else ():
         others = everywhere[everywhere["case"] == name]
         made.append({"case": str(name), "at": [at_error(own, others, error) for error in ERRORS]})
     best = [at["standing"][headline.BEST] for each in made for at in each["at"]]
     pairs = [each for each in best if each["ratio"] is not None]
     verdicts, ratios = [each["verdict"] for each in pairs], [each["ratio"] for each in pairs]
-    found = {"mechanisms": made, "n": len(pairs)}
+    found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}
+    asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)] if len(rows) else pd.DataFrame({"error_q": []})
+    found |= {"asked": len(asked), "wrong": int((asked["error_q"].astype(float) > WRONG).sum())}
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
     sizes = (min(ratios), float(np.median(ratios)), max(ratios)) if ratios else (None, None, None)
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))

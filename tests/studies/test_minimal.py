@@ -7,6 +7,7 @@ from studies import minimal, rivals, work_precision
 from studies.bench import Run
 from studies.end_states import case_of
 from studies.solvers import CATALOGUE, MINIMAL, MINIMAL_FAMILY, OWN, RIVALS
+from tests.studies.test_rivals import stated
 from tests.studies.test_tables import rows
 from twoloop import mechanisms
 
@@ -53,6 +54,28 @@ def test_without_rows_nothing_is_said():
     assert found["mechanisms"] == [] and found["n"] == 0 and list(minimal.lines(found)) == []
     unmatched = minimal.findings_of(in_angles(1.0), everywhere().assign(case="other"))
     assert unmatched["n"] == 0 and unmatched["least"] is None
+
+
+@pytest.mark.parametrize(
+    ("time", "said"),
+    [
+        (0.5, "by hand: always faster than our best with constraints (0.50 to 0.50 times its time, median 0.50)."),
+        (3.0, "by hand: never faster than our best with constraints (3.0 to"),
+    ],
+)
+def test_the_report_says_what_the_rows_say(time, said):
+    text = stated(1.0, minimal=minimal.findings_of(in_angles(time), everywhere()))
+    assert "## Should I use a DAE at all?" in text and said in text and "error above" not in text
+    assert "Should I use a DAE" not in stated(1.0)
+
+
+def test_a_run_that_ends_with_a_wrong_state_is_told():
+    wrong = pd.concat([in_angles(1.0), in_angles(0.1, error=0.7)], ignore_index=True).assign(tol=1e-9)
+    found = minimal.findings_of(wrong, everywhere())
+    assert (found["asked"], found["wrong"]) == (4, 2)
+    assert found["mechanisms"][0]["at"][0]["minimal"]["call_s"] == 1.0
+    assert "Of their 4 settings 2 end with success and an error above 0.1" in stated(1.0, minimal=found)
+    assert minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0
 
 
 def test_no_ranking_of_solvers_with_constraints_sees_them():
