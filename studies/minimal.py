@@ -47,7 +47,8 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
 def at_error(rows: pd.DataFrame, others: pd.DataFrame, error: float) -> dict[str, Any]:
     """The cheapest in minimal coordinates (`rows`) at one error on one mechanism, and how those with constraints stand.
 
-    The ratio of each is the time in minimal coordinates over its own.
+    The ratio of each is the time in minimal coordinates over its own; `over_loop` is that over what our fastest spends
+    in its own loop, without the rest of the call.
     """
     ours = others["family"] == "two-loop"
     found: dict[str, Any] = headline.of_error(pd.concat([others[ours], rows], ignore_index=True), error)
@@ -56,7 +57,10 @@ def at_error(rows: pd.DataFrame, others: pd.DataFrame, error: float) -> dict[str
     rival = min(ranked, key=lambda name: ranked[name][0], default=None)
     line = {"solver": rival, "call_s": None if rival is None else ranked[rival][0], "rival": cheapest}
     found[RIVAL] = line | tables.compared(ranked, tables.costs_at(rows, error, doubt=True))
-    return {"error": error, "minimal": cheapest, "standing": found}
+    loops = [tables.time_for(own, error, "inside_s") for _, own in others[ours].groupby("solver")]
+    loop = min((time for time in loops if not np.isnan(time)), default=None)
+    beside = None if loop is None or cheapest["call_s"] is None else cheapest["call_s"] / loop
+    return {"error": error, "minimal": cheapest, "standing": found, "over_loop": beside}
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
@@ -72,6 +76,8 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)] if len(rows) else pd.DataFrame({"error_q": []})
     found |= {"asked": len(asked), "wrong": int((asked["error_q"].astype(float) > WRONG).sum())}
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
+    loops = [at["over_loop"] for each in made for at in each["at"] if at["over_loop"] is not None]
+    found["over_loop"] = float(np.median(loops)) if loops else None
     sizes = (min(ratios), float(np.median(ratios)), max(ratios)) if ratios else (None, None, None)
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))
 

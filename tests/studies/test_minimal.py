@@ -17,7 +17,7 @@ ANGLES, CVODE = MINIMAL
 def repeated(*lines, family="two-loop"):
     """Medians of rows of (solver, error, seconds) whose repetitions take the same time."""
     made = rows(*lines).assign(case="four-bar", tol=0.1, family=family)
-    return made.assign(times=[(time,) * 5 for time in made["call_s"]])
+    return made.assign(inside_s=0.25 * made["call_s"], times=[(time,) * 5 for time in made["call_s"]])
 
 
 def everywhere(default=4.0, compiled=1.0, rival=2.0):
@@ -45,6 +45,7 @@ def test_each_side_is_compared_with_the_cheapest_in_minimal_coordinates(time, ve
     assert at["standing"]["best of ours"]["solver"] == "auto, compiled"
     assert found["n"] == 1 and {f"n_{name}": n for name, n in verdicts.items()}.items() <= found.items()
     assert found["least"] == found["median"] == found["most"] == pytest.approx(time)
+    assert found["over_loop"] == pytest.approx(4.0 * time)  # of a call of 1 s
     ((case, first, *others),) = minimal.lines(found)
     assert (case, first) == ("four-bar", cells) and others == ["– · – · – · –"] * 3
 
@@ -59,7 +60,10 @@ def test_without_rows_nothing_is_said():
 @pytest.mark.parametrize(
     ("time", "said"),
     [
-        (0.5, "by hand: always faster than our best with constraints (0.50 to 0.50 times its time, median 0.50)."),
+        (
+            0.5,
+            "always faster than our best with constraints (0.50 to 0.50 times its time, median 0.50; 2.0 over the loop",
+        ),
         (3.0, "by hand: never faster than our best with constraints (3.0 to"),
     ],
 )
@@ -74,7 +78,8 @@ def test_a_run_that_ends_with_a_wrong_state_is_told():
     found = minimal.findings_of(wrong, everywhere())
     assert (found["asked"], found["wrong"]) == (4, 2)
     assert found["mechanisms"][0]["at"][0]["minimal"]["call_s"] == 1.0
-    assert "Of their 4 settings 2 end with success and an error above 0.1" in stated(1.0, minimal=found)
+    said = "Of their 4 settings 2 end with success and an error above 0.10.\n\nTime in minimal"
+    assert said in stated(1.0, minimal=found)
     assert minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0
 
 
