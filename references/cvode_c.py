@@ -90,7 +90,7 @@ def solve_cvode_c(
     arguments = (function, start, t0, t1, METHODS[method], float(rtol), float(atol))
 
     limit = TimeLimit(time_limit)
-    _, flag, reached, statistics = _run(*arguments, np.empty(0), limit)
+    _, flag, reached, statistics = integrate(*arguments, np.empty(0), limit)
     failure = ""
     if limit.exceeded:
         failure = limit.message("CVODE", reached, "take looser tolerances")
@@ -98,7 +98,7 @@ def solve_cvode_c(
         name = flag_name("CVodeGetReturnFlagName", flag)
         failure = f"CVODE failed after t = {reached:.10g} with {name} ({flag}). {ADVICE}"
     kept = times[times <= reached]
-    rows = _run(*arguments, kept, TimeLimit(None))[0]
+    rows = integrate(*arguments, kept, TimeLimit(None))[0]
     end = f"CVODE, {method}, reached the end, t = {t1:g}."
     return ode_result(system, kept[: len(rows)], rows.T, failure, end, statistics)
 
@@ -118,7 +118,7 @@ def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes)
     return right_hand_side
 
 
-def _run(
+def integrate(
     function: Any,
     start: Array,
     t0: float,

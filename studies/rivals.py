@@ -100,10 +100,11 @@ def runs(quick: bool) -> list[Run]:
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
     """Rows of all runs that are of use; on the four-bars every solver is asked for all accuracies."""
     quick = all(run.repeats == 1 for run in todo)
-    return adaptive.collect(todo, kept, _row, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
 
 
-def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+def row_at_end(run: Run, repeat: int, built: adaptive.Built) -> Row:
+    """A repetition of a run, measured by the end of the reference."""
     warm_up(run, repeat, built, COMPILING)
     row = row_of(run) | {"repeat": repeat, "keeps_constraints": run.solver.keeps_constraints}
     return row | {"n_steps": row.pop("n_accepted")}

@@ -63,6 +63,10 @@ RIVALS = (
     *("BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
 )
 
+# in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
+MINIMAL_FAMILY = "minimal coordinates"
+MINIMAL = ("heyoka, minimal coordinates", "CVODE from C, minimal coordinates")
+
 # of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
 COMPARED_OWN = ("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF")
 COMPARED = (
@@ -161,6 +165,19 @@ def _cvode_c(method: str, case: Case, tolerance: float, repeat: int) -> Result:
     setting = (method, tolerance, tolerance)
     times = np.append(0.0, case.instants)
     return _by_expressions(solve_cvode_c, *_start(case), *setting, t_eval=times, time_limit=case.time_limit)
+
+
+def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.minimal import NoMinimalCoordinates
+    from references.minimal_solvers import solve_cvode_minimal, solve_heyoka_minimal
+
+    more: dict[str, Any] = {"t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
+    try:
+        if kind == "heyoka":
+            return solve_heyoka_minimal(case.problem, case.t_end, tolerance, **more)
+        return solve_cvode_minimal(case.problem, case.t_end, tolerance, tolerance, **more)
+    except NoMinimalCoordinates as why:
+        raise NotApplicable(str(why)) from None
 
 
 def _cvode(case: Case, tolerance: float, repeat: int) -> Result:
@@ -275,6 +292,9 @@ def _all() -> Iterator[Solver]:
     for method in ("Adams", "BDF"):
         run = partial(_cvode_c, method)
         yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False, traces=True)
+    for name, kind in zip(MINIMAL, ("heyoka", "CVODE"), strict=True):
+        more = {"traces": True, "builds_each": kind == "heyoka"}
+        yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
     yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True, traces=True)

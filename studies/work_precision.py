@@ -23,6 +23,7 @@ from studies import (
     goals,
     headline,
     limit,
+    minimal,
     rivals,
     scaling,
     study,
@@ -59,6 +60,7 @@ PARTS = (
     limit.GROUP,
     behind.GROUP,
     first_calls.GROUP,
+    minimal.GROUP,
 )  # groups of rows that are not of the four cases
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
@@ -175,6 +177,7 @@ def make(output: Output) -> pd.DataFrame:
         made = [adaptive.collect(at_length, kept, _row, lambda run: True, errors)]
         made += [rivals.collect(rivals.runs(quick), kept), behind.collect(kept, quick)]
         made += [scaling.collect(quick, kept), limit.collect(kept, quick), first_calls.collect(kept, quick)]
+        made.append(minimal.collect(kept, quick))
     return pd.concat(made, ignore_index=True)
 
 
@@ -209,6 +212,8 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
     findings |= {"fitted": scaling.FITTED, "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
+    in_angles = part(rows, minimal.GROUP)
+    findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)
     text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
@@ -252,6 +257,7 @@ def ready(findings: dict[str, Any]) -> dict[str, str]:
         "scaling": scaling.pivot(findings["scaling"]),
         "evaluations": scaling.evaluations(findings["scaling"]),
         "first": table(first, first_calls.lines(findings["first_calls"])),
+        "minimal": table(["mechanism", *(power(e) for e in minimal.ERRORS)], minimal.lines(findings["minimal"])),
     }
 
 

@@ -197,6 +197,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
         "cases": [],
         "scaling": [],
         "first_calls": [],
+        "minimal": {"mechanisms": []},
         "fitted": 10,
         "default": "auto",
         "rivals": rivals.findings_of(table),
