@@ -1,4 +1,4 @@
-"""Cost against size: chains of point masses and of rigid bars, the N-four-bar mechanism: a step and an evaluation of each method.
+"""Cost against size: a step and an evaluation of each method on chains of points or bars and the N-four-bar mechanism.
 
 A part of `studies.work_precision`. What is timed are steps after the first `SKIPPED`, in which a run sets itself
 up. The rival is SciPy's DOP853 on the accelerations, whose linear algebra is dense.
@@ -60,7 +60,7 @@ def chain(n: int, closed: bool) -> Problem:
 
 
 def rigid_chain(n: int) -> Problem:
-    """Bars of 1/n kg and 1/n m with pins between them, in the arc of `chain` from rest, as one writes bodies and joints.
+    """Bars of 1/n kg and 1/n m with pins between them, in the arc of `chain` from rest: bodies and joints.
 
     Three coordinates a bar, and no bandwidth declared.
     """
