@@ -78,6 +78,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "IDAS, CasADi": (RED, "d"),
     "collocation, CasADi": (GREY, "d"),
     "IDA from C, stabilised": (BLACK, ">"),
+    "IDA from C, q and v tested": (GREEN, ">"),
     "IDA from C, order 2, positions tested": (BLUE, ">"),
     "IDA, stabilised": (GREY, "<"),
     "IDA, index1": (SKY, "<"),
