@@ -76,6 +76,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Dopri8, diffrax": (PINK, "X"),
     "Pr9, index 1": (ORANGE, "p"),
     "IDAS, CasADi": (RED, "d"),
+    "CVODES, CasADi": (BLUE, "d"),
     "collocation, CasADi": (GREY, "d"),
     "IDA from C, stabilised": (BLACK, ">"),
     "IDA from C, q and v tested": (GREEN, ">"),

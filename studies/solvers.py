@@ -60,8 +60,8 @@ GEAR_STARTS = ("accurate", "ramp")
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
     *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi"),
-    *("collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Pr9, index 1"),
-    *("Radau, index 1", "BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
+    *("CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
+    *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
 )
 
 # of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
@@ -178,11 +178,12 @@ def _diffrax(case: Case, tolerance: float, repeat: int) -> Result:
     return _by_expressions(solve_diffrax, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
 
 
-def _idas(case: Case, tolerance: float, repeat: int) -> Result:
-    from references.casadi_integrators import solve_idas
+def _casadi(integrator: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.casadi_integrators import solve_cvodes, solve_idas
 
+    solve = {"IDAS": solve_idas, "CVODES": solve_cvodes}[integrator]
     times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
-    return _by_expressions(solve_idas, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
+    return _by_expressions(solve, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
 
 
 def _collocation(case: Case, step: float, repeat: int) -> Result:
@@ -283,7 +284,9 @@ def _all() -> Iterator[Solver]:
         yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False, traces=True)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
-    yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True, traces=True)
+    for name in ("IDAS", "CVODES"):
+        run, more = partial(_casadi, name), {"builds_each": True, "traces": True}
+        yield _solver(f"{name}, CasADi", "CasADi", "compiled", "tol", run, keeps=False, **more)
     yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False, traces=True)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)

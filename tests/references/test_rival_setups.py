@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from references.casadi_integrators import solve_cvodes, solve_idas
 from references.ida_c import solve_ida_c
 from twoloop.mechanisms import four_bar, projection_pendulum
 
@@ -28,3 +29,12 @@ def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipl
     assert 1e-12 < errors["states"] < 1e-3, errors
     steps = {test: result.stats.n_accepted for test, result in made.items()}
     assert steps["positions"] < steps["states"] < steps["all"], steps
+
+
+def test_cvodes_of_casadi_is_cvodes_and_right():
+    pytest.importorskip("casadi")
+    result = run(solve_cvodes, PENDULUM, 1e-9, 1e-9, t_end=2.0)
+    assert 1e-13 < np.abs(result.q[:, -1] - PENDULUM.q0).max() < 1e-5
+    assert result.message.startswith("CVODES of CasADi reached the end")
+    assert result.stats.cpu_time > 0.0
+    assert result.stats.n_accepted != run(solve_idas, PENDULUM, 1e-9, 1e-9, t_end=2.0).stats.n_accepted
