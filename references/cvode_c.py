@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, UserCall, check_choice, check_run, check_tolerances, user_call
 from references.ode import ADVICE, ode_result, output_times
-from references.straight_line import straight_line
+from references.straight_line import straight_line, straight_line_jacobian
 from references.sundials import REAL, check, context, counted, flag_name, library, made
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
@@ -45,8 +45,10 @@ def solve_cvode_c(
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
 
     What it was given: accelerations as straight-line code of the one mechanism (`references.straight_line`); Adams with
-    fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's and dense differences; timed is
-    a second use of CVODE's memory, as its guide has it: `CVodeReInit`, then `CVode` without output.
+    fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's, dense and with the analytic
+    Jacobian as straight-line code, up to `straight_line.MOST_OPERATIONS` (which compile in a few seconds), else with
+    differences; timed is a second use of CVODE's memory, as its guide has it: `CVodeReInit`, then `CVode` without
+    output.
 
     Parameters
     ----------
@@ -86,8 +88,9 @@ def solve_cvode_c(
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
-    function, start = _right_hand_side(system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
-    arguments = (function, start, t0, t1, METHODS[method], float(rtol), float(atol))
+    at, start = (system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
+    jacobian = _jacobian(*at) if method == "BDF" else None
+    arguments = (_right_hand_side(*at), jacobian, start, t0, t1, METHODS[method], float(rtol), float(atol))
 
     limit = TimeLimit(time_limit)
     _, flag, reached, statistics = _run(*arguments, np.empty(0), limit)
@@ -118,8 +121,26 @@ def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes)
     return right_hand_side
 
 
+@lru_cache(maxsize=256)
+def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    """CVODE's Jacobian function; None where it is too long to be compiled."""
+    derivatives = straight_line_jacobian(system, t0, np.frombuffer(q0), np.frombuffer(v0))
+    if derivatives is None:
+        return None
+    array_of, matrix_of, size = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data, 2 * system.n_q
+    pointer = types.voidptr
+
+    @cfunc(types.int32(types.float64, *[pointer] * 7), error_model="numpy")
+    def jacobian(t, y, rate, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
+        derivatives(t, carray(array_of(y), (size,)), carray(matrix_of(J), (size, size)))  # CVODE has set J to zero
+        return 0
+
+    return jacobian
+
+
 def _run(
     function: Any,
+    jacobian: Any,
     start: Array,
     t0: float,
     t1: float,
@@ -146,6 +167,8 @@ def _run(
             matrix = made(stack, "SUNDenseMatrix", sundials.SUNMatDestroy, n, n, own)
             linear = made(stack, "SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix, own)
             check("CVodeSetLinearSolver", sundials.CVodeSetLinearSolver(memory, linear, matrix))
+            if jacobian is not None:
+                check("CVodeSetJacFn", sundials.CVodeSetJacFn(memory, jacobian.address))
         for name, value in (
             ("MaxNumSteps", STEPS_A_CALL),
             ("MaxStep", t1 - t0),
@@ -174,13 +197,14 @@ def _statistics(memory: Any, kind: int, cpu: float) -> Statistics:
     def number(what: str) -> int:
         return counted(f"CVodeGetNum{what}", memory)
 
-    differenced = kind == METHODS["BDF"]
+    newton = kind == METHODS["BDF"]
     return Statistics(
         n_accepted=number("Steps"),
         n_rejected_error=number("ErrTestFails"),
         n_rejected_convergence=number("StepSolveFails"),
         n_outer=number("NonlinSolvIters"),
-        n_evaluations=number("RhsEvals") + (number("LinRhsEvals") if differenced else 0),
-        n_factorizations=number("LinSolvSetups") if differenced else 0,
+        n_evaluations=number("RhsEvals") + (number("LinRhsEvals") if newton else 0),
+        n_factorizations=number("LinSolvSetups") if newton else 0,
+        n_jacobians=number("JacEvals") if newton else 0,
         cpu_time=cpu,
     )

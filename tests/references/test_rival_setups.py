@@ -1,14 +1,23 @@
 """Rivals as their authors would set them up: what the error test sees, exact Jacobians, CVODE's own projection."""
 
+import math
+
 import numpy as np
 import pytest
 
+from references import cvode_c
 from references.casadi_integrators import solve_cvodes, solve_idas
+from references.cvode_c import solve_cvode_c
+from references.duals import Dual, functions_on_duals
+from references.expressions import FUNCTIONS, functions_of
 from references.ida_c import solve_ida_c
-from twoloop.mechanisms import four_bar, projection_pendulum
+from references.straight_line import straight_line, straight_line_jacobian
+from twoloop import ConstrainedSystem, callback
+from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
 
 FOUR_BAR = four_bar()
 PENDULUM = projection_pendulum()
+DOUBLE = double_pendulum()
 
 
 def run(solve, problem, *arguments, t_end=None, **options):
@@ -38,3 +47,97 @@ def test_cvodes_of_casadi_is_cvodes_and_right():
     assert result.message.startswith("CVODES of CasADi reached the end")
     assert result.stats.cpu_time > 0.0
     assert result.stats.n_accepted != run(solve_idas, PENDULUM, 1e-9, 1e-9, t_end=2.0).stats.n_accepted
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = 1.0 + 0.1 * math.exp(-q[0] * q[0])
+    M[1, 1] = 2.0 + math.sinh(0.1 * q[1]) ** 2
+    M[0, 1] = M[1, 0] = 0.2 * math.sin(q[1])  # none of q[2], which the constraint carries along
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    Q[0] = -p[0] * math.sqrt(1.0 + v[0] * v[0]) * math.tanh(v[0]) / (1.0 + q[1] * q[1]) + math.log(3.0 + q[2])
+    Q[1] = -math.hypot(q[0], v[2] + 2.0) - 0.3 * v[1] ** 3
+    Q[2] = math.tan(0.3 * q[2]) * math.cos(t) - math.atan(v[2]) - 2.0 / (3.0 + v[0])
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    C[0] = q[0] * q[1] - math.sin(q[2]) + 0.5 * t
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    Cq[0, 0], Cq[0, 1], Cq[0, 2] = q[1], q[0], -math.cos(q[2])
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):
+    Ct[0] = 0.5
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    Qd[0] = -2.0 * v[0] * v[1] - math.sin(q[2]) * v[2] * v[2]
+
+
+DRIVEN = ConstrainedSystem(
+    n_q=3,
+    n_c=1,
+    mass=mass,
+    force=force,
+    constraint=constraint,
+    jacobian=jacobian,
+    gamma=gamma,
+    constraint_rate=constraint_rate,
+    parameters=[0.7],
+    name="singular mass",
+)
+STATES = {
+    "singular mass": (DRIVEN, np.array([0.5, 0.4, 0.2]), np.array([0.3, -0.2, 0.1])),
+    "double pendulum": (DOUBLE.system, DOUBLE.q0, DOUBLE.v0),
+    "pendulum": (PENDULUM.system, PENDULUM.q0, PENDULUM.v0),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_the_jacobian_of_the_accelerations_is_their_derivative(name):
+    system, q, v = STATES[name]
+    rate, derivatives = (make(system, 0.0, q, v) for make in (straight_line, straight_line_jacobian))
+    y = np.concatenate([q, v]) + 0.02 * np.random.default_rng(1).standard_normal(2 * system.n_q)
+    columns, differences = np.zeros((y.size, y.size)), np.empty((y.size, y.size))
+    derivatives(0.3, y, columns)
+    for k in range(y.size):
+        ahead, behind, moved = np.empty(y.size), np.empty(y.size), np.zeros(y.size)
+        moved[k] = 1e-6
+        rate(0.3, y + moved, ahead)
+        rate(0.3, y - moved, behind)
+        differences[k] = (ahead - behind) / 2e-6
+    assert np.abs(differences).max() > 0.5
+    assert np.abs(columns - differences).max() < 1e-5 * np.abs(differences).max()
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_of_duals_have_their_derivatives(name):
+    plain = functions_of(math)
+    made = functions_on_duals(plain)[name](Dual(0.4, {2: 3.0}))
+    assert made.value == plain[name](0.4)
+    assert made.by[2] == pytest.approx(3.0 * (plain[name](0.4 + 1e-6) - plain[name](0.4 - 1e-6)) / 2e-6, rel=1e-8)
+
+
+def test_cvode_takes_the_analytic_jacobian_and_differences_of_what_is_too_long(monkeypatch):
+    pytest.importorskip("sksundae")
+    exact = run(solve_cvode_c, PENDULUM, "BDF", 1e-9, 1e-9, t_end=2.0)
+    monkeypatch.setattr(cvode_c, "_jacobian", lambda *_: None)
+    differenced = run(solve_cvode_c, PENDULUM, "BDF", 1e-9, 1e-9, t_end=2.0)
+    for result in (exact, differenced):
+        assert 1e-13 < np.abs(result.q[:, -1] - PENDULUM.q0).max() < 1e-5 and result.stats.n_jacobians > 1
+    more = [each.stats.n_evaluations - each.stats.n_outer for each in (exact, differenced)]
+    assert more[0] < exact.stats.n_jacobians and more[1] >= 4 * differenced.stats.n_jacobians  # one for each unknown
+
+
+def test_a_long_jacobian_is_not_compiled():
+    problem = spatial_slider_crank()
+    assert straight_line_jacobian(problem.system, 0.0, problem.q0, problem.v0) is None
