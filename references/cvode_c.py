@@ -1,19 +1,20 @@
 """SUNDIALS CVODE without Python in its way: the library of scikit-sundae, driven by ctypes, its right-hand side in C.
 
 The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-line machine code. The constraints are
-not kept. See `references.ida_c` for what the library promises.
+not kept, unless CVODE is given a projection. See `references.ida_c` for what the library promises.
 """
 
 import ctypes
 import itertools
 from contextlib import ExitStack
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, cfunc, types
 from numpy.typing import ArrayLike, NDArray
 
+from references.cvode_projection import projection_for_cvode
 from references.driver import TimeLimit, UserCall, check_choice, check_run, check_tolerances, user_call
 from references.ode import ADVICE, ode_result, output_times
 from references.straight_line import straight_line, straight_line_jacobian
@@ -30,6 +31,15 @@ STEPS_A_CALL = 100  # between two looks at the clock
 CV_NORMAL, CV_TSTOP_RETURN, CV_TOO_MUCH_WORK = 1, 1, -1
 
 
+class Functions(NamedTuple):
+    """What CVODE is given: compiled functions, or None of those that it shall do without, and their data."""
+
+    rate: Any
+    jacobian: Any
+    projection: Any
+    data: Array
+
+
 def solve_cvode_c(
     system: ConstrainedSystem,
     t_span: tuple[float, float],
@@ -39,6 +49,7 @@ def solve_cvode_c(
     rtol: float = 1e-8,
     atol: float = 1e-8,
     *,
+    projected: bool = False,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
 ) -> Result:
@@ -62,6 +73,9 @@ def solve_cvode_c(
         Orders up to 12, or up to 5.
     rtol, atol : float
         CVODE's tolerances.
+    projected : bool
+        Whether CVODE projects each step, and its estimate of the error, onto C = 0 and C_q v + C_t = 0
+        (`references.cvode_projection`), which it can with BDF alone. What it interpolates for t_eval is not projected.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution, interpolated by CVODE, in a second run that is not
         timed. None: 1001 times, evenly.
@@ -84,13 +98,16 @@ def solve_cvode_c(
         If scikit-sundae is not the one that this was written for.
     """
     check_choice("method", method, METHODS)
+    if projected and method != "BDF":
+        raise ValueError(f"projected needs method 'BDF', with which alone CVODE projects; given {method!r}")
     check_tolerances(rtol, atol)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
     at, start = (system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
     jacobian = _jacobian(*at) if method == "BDF" else None
-    arguments = (_right_hand_side(*at), jacobian, start, t0, t1, METHODS[method], float(rtol), float(atol))
+    functions = Functions(_right_hand_side(*at), jacobian, *_projection(system, projected, rtol, atol))
+    arguments = (functions, start, t0, t1, METHODS[method], float(rtol), float(atol))
 
     limit = TimeLimit(time_limit)
     _, flag, reached, statistics = _run(*arguments, np.empty(0), limit)
@@ -138,9 +155,19 @@ def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any
     return jacobian
 
 
+def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: float) -> tuple[Any, Array]:
+    """CVODE's projection function, None without one, and the user data."""
+    f = system.functions
+    if not projected or system.n_c == 0:
+        return None, np.empty(0)
+    projection, size = projection_for_cvode(*f[2:5], system.n_q, system.n_c, f.p.size)
+    data = np.zeros(size)
+    data[: f.p.size + 2] = [*f.p, rtol, atol]
+    return projection, data
+
+
 def _run(
-    function: Any,
-    jacobian: Any,
+    functions: Functions,
     start: Array,
     t0: float,
     t1: float,
@@ -158,7 +185,7 @@ def _run(
         own = context(stack)
         y = made(stack, "N_VMake_Serial", sundials.N_VDestroy, n, state.ctypes.data, own)
         memory = made(stack, "CVodeCreate", lambda pointer: sundials.CVodeFree(ctypes.byref(pointer)), kind, own)
-        check("CVodeInit", sundials.CVodeInit(memory, function.address, t0, y))
+        check("CVodeInit", sundials.CVodeInit(memory, functions.rate.address, t0, y))
         check("CVodeSStolerances", sundials.CVodeSStolerances(memory, rtol, atol))
         if kind == METHODS["Adams"]:
             iteration = made(stack, "SUNNonlinSol_FixedPoint", sundials.SUNNonlinSolFree_FixedPoint, y, 0, own)
@@ -167,8 +194,11 @@ def _run(
             matrix = made(stack, "SUNDenseMatrix", sundials.SUNMatDestroy, n, n, own)
             linear = made(stack, "SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix, own)
             check("CVodeSetLinearSolver", sundials.CVodeSetLinearSolver(memory, linear, matrix))
-            if jacobian is not None:
-                check("CVodeSetJacFn", sundials.CVodeSetJacFn(memory, jacobian.address))
+            if functions.jacobian is not None:
+                check("CVodeSetJacFn", sundials.CVodeSetJacFn(memory, functions.jacobian.address))
+            if functions.projection is not None:
+                check("CVodeSetUserData", sundials.CVodeSetUserData(memory, functions.data.ctypes.data))
+                check("CVodeSetProjFn", sundials.CVodeSetProjFn(memory, functions.projection.address))
         for name, value in (
             ("MaxNumSteps", STEPS_A_CALL),
             ("MaxStep", t1 - t0),

@@ -64,6 +64,8 @@ FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
         "CVodeSStolerances": (INT, POINTER, REAL, REAL),
         "CVodeSetLinearSolver": (INT, POINTER, POINTER, POINTER),
         "CVodeSetJacFn": (INT, POINTER, POINTER),
+        "CVodeSetProjFn": (INT, POINTER, POINTER),
+        "CVodeSetUserData": (INT, POINTER, POINTER),
         "SUNNonlinSol_FixedPoint": (POINTER, POINTER, INT, POINTER),
         "SUNNonlinSolFree_FixedPoint": (INT, POINTER),
         "CVodeSetNonlinearSolver": (INT, POINTER, POINTER),

@@ -72,6 +72,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "heyoka": (GREEN, "*"),
     "CVODE from C, Adams": (SKY, ">"),
     "CVODE from C, BDF": (ORANGE, ">"),
+    "CVODE from C, BDF, projected": (PINK, ">"),
     "CVODE, Adams": (ORANGE, "<"),
     "Dopri8, diffrax": (PINK, "X"),
     "Pr9, index 1": (ORANGE, "p"),

@@ -53,14 +53,15 @@ OWN = (
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
+CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 GEAR_STARTS = ("accurate", "ramp")
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
-    *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi"),
-    *("CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
+    *(HEYOKA, CVODE_C, "CVODE from C, BDF", CVODE_C_PROJECTED, IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX),
+    *("IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
     *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised"),
     *("Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
 )
@@ -157,12 +158,12 @@ def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
     return _by_expressions(solve_heyoka, *_start(case), tolerance, t_eval=times, time_limit=case.time_limit)
 
 
-def _cvode_c(method: str, case: Case, tolerance: float, repeat: int) -> Result:
+def _cvode_c(method: str, projected: bool, case: Case, tolerance: float, repeat: int) -> Result:
     from references.cvode_c import solve_cvode_c
 
     setting = (method, tolerance, tolerance)
-    times = np.append(0.0, case.instants)
-    return _by_expressions(solve_cvode_c, *_start(case), *setting, t_eval=times, time_limit=case.time_limit)
+    options = {"projected": projected, "t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
+    return _by_expressions(solve_cvode_c, *_start(case), *setting, **options)
 
 
 def _cvode(case: Case, tolerance: float, repeat: int) -> Result:
@@ -280,9 +281,10 @@ def _all() -> Iterator[Solver]:
     for name, options in of_ida.items():
         yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
     yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True, traces=True)
-    for method in ("Adams", "BDF"):
-        run = partial(_cvode_c, method)
-        yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False, traces=True)
+    for name, method in ((CVODE_C, "Adams"), ("CVODE from C, BDF", "BDF"), (CVODE_C_PROJECTED, "BDF")):
+        keeps = name == CVODE_C_PROJECTED
+        run = partial(_cvode_c, method, keeps)
+        yield _solver(name, "SUNDIALS", "compiled", "tol", run, keeps=keeps, traces=True)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
     for name in ("IDAS", "CVODES"):

@@ -1,6 +1,7 @@
 """Rivals as their authors would set them up: what the error test sees, exact Jacobians, CVODE's own projection."""
 
 import math
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -8,12 +9,18 @@ import pytest
 from references import cvode_c
 from references.casadi_integrators import solve_cvodes, solve_idas
 from references.cvode_c import solve_cvode_c
+from references.cvode_projection import projection_for_cvode
 from references.duals import Dual, functions_on_duals
 from references.expressions import FUNCTIONS, functions_of
 from references.ida_c import solve_ida_c
 from references.straight_line import straight_line, straight_line_jacobian
 from twoloop import ConstrainedSystem, callback
-from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
+from twoloop.mechanisms import (
+    double_pendulum,
+    four_bar,
+    projection_pendulum,
+    spatial_slider_crank,
+)
 
 FOUR_BAR = four_bar()
 PENDULUM = projection_pendulum()
@@ -66,26 +73,30 @@ def force(t, q, v, p, Q):
 @callback("constraint")
 def constraint(t, q, p, C):
     C[0] = q[0] * q[1] - math.sin(q[2]) + 0.5 * t
+    C[1] = 2.0 * C[0]  # redundant
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
     Cq[0, 0], Cq[0, 1], Cq[0, 2] = q[1], q[0], -math.cos(q[2])
+    for j in range(3):
+        Cq[1, j] = 2.0 * Cq[0, j]
 
 
 @callback("constraint_rate")
 def constraint_rate(t, q, p, Ct):
-    Ct[0] = 0.5
+    Ct[0], Ct[1] = 0.5, 1.0
 
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
     Qd[0] = -2.0 * v[0] * v[1] - math.sin(q[2]) * v[2] * v[2]
+    Qd[1] = 2.0 * Qd[0]
 
 
 DRIVEN = ConstrainedSystem(
     n_q=3,
-    n_c=1,
+    n_c=2,
     mass=mass,
     force=force,
     constraint=constraint,
@@ -141,3 +152,54 @@ def test_cvode_takes_the_analytic_jacobian_and_differences_of_what_is_too_long(m
 def test_a_long_jacobian_is_not_compiled():
     problem = spatial_slider_crank()
     assert straight_line_jacobian(problem.system, 0.0, problem.q0, problem.v0) is None
+
+
+def kept(system, t, q, v):
+    """The largest residual of the constraints on positions, and on velocities."""
+    rates = system.jacobian(t, q) @ v + system.constraint_rate(t, q)
+    return np.abs(system.constraint(t, q)).max(), np.abs(rates).max()
+
+
+def test_cvode_keeps_the_constraints_that_it_projects_onto():
+    pytest.importorskip("sksundae")
+    problem = PENDULUM
+    free, made = (run(solve_cvode_c, problem, "BDF", 1e-8, 1e-8, projected=each) for each in (False, True))
+    assert 1e-14 < error(problem, made) < 6e-5
+    end = problem.reference.t
+    assert max(kept(problem.system, end, made.q[:, -1].copy(), made.v[:, -1].copy())) < 1e-13
+    assert max(kept(problem.system, end, free.q[:, -1].copy(), free.v[:, -1].copy())) > 1e-11
+
+
+def test_the_projection_is_the_shortest_one_and_projects_the_error():
+    sundials = pytest.importorskip("references.sundials")
+    pytest.importorskip("sksundae")
+    rng, t, f = np.random.default_rng(2), 0.3, DRIVEN.functions
+    projection, size = projection_for_cvode(*f[2:5], 3, 2, 1)
+    data = np.zeros(size)
+    data[:3] = 0.7, 1e-12, 1e-12
+    y, corr, err = 0.5 + 0.1 * rng.standard_normal(6), np.empty(6), rng.standard_normal(6)
+    given, estimate = y.copy(), err.copy()
+    with ExitStack() as stack:
+        own = sundials.context(stack)
+        vectors = [
+            sundials.made(stack, "N_VMake_Serial", sundials.library().N_VDestroy, 6, each.ctypes.data, own).value
+            for each in (y, corr, err)
+        ]
+        call = projection.ctypes
+        assert call(t, *vectors[:2], 0.1, 0, data.ctypes.data) == 0
+        alone = corr.copy()
+        assert call(t, *vectors[:2], 0.1, vectors[2], data.ctypes.data) == 0
+        assert np.array_equal(alone, corr) and np.array_equal(y, given)
+        y[0] = np.nan
+        assert call(t, *vectors[:2], 0.1, 0, data.ctypes.data) > 0
+    q, v = np.split(given + alone, 2)
+    Cq = DRIVEN.jacobian(t, q)
+    assert max(kept(DRIVEN, t, q, v)) < 1e-14 and np.abs(alone).max() > 0.05
+    free = np.eye(3) - np.linalg.pinv(Cq) @ Cq
+    assert np.abs(free @ alone[3:]).max() < 1e-14
+    assert np.allclose(err, np.concatenate([free @ estimate[:3], free @ estimate[3:]]), rtol=0.0, atol=1e-13)
+
+
+def test_adams_is_not_projected():
+    with pytest.raises(ValueError, match="projected needs method 'BDF'.*; given 'Adams'"):
+        run(solve_cvode_c, PENDULUM, "Adams", projected=True)
