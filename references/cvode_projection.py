@@ -95,7 +95,8 @@ def projection_for_cvode(
         p, rtol, atol = data[:after_p], data[after_p], data[after_p + 1]
         Cq, S = data[after_tol:after_Cq].reshape((m, n)), data[after_Cq:after_S].reshape((m, m))
         r, x = data[after_S:after_r], data[after_r:]
-        state[:] = given
+        for k in range(size):  # the assignment of one slice to another doubles the time of compiling
+            state[k] = given[k]
         q, v = state[:n], state[n:]
         try:
             for iteration in range(MOST_ITERATIONS):

@@ -14,6 +14,8 @@ from references.duals import Dual, functions_on_duals
 from references.expressions import FUNCTIONS, functions_of
 from references.ida_c import solve_ida_c
 from references.straight_line import straight_line, straight_line_jacobian
+from studies.figures import STYLES
+from studies.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
 from twoloop import ConstrainedSystem, callback
 from twoloop.mechanisms import (
     double_pendulum,
@@ -201,5 +203,12 @@ def test_the_projection_is_the_shortest_one_and_projects_the_error():
 
 
 def test_adams_is_not_projected():
-    with pytest.raises(ValueError, match="projected needs method 'BDF'.*; given 'Adams'"):
+    with pytest.raises(ValueError, match=r"projected needs method 'BDF'.*; given 'Adams'"):
         run(solve_cvode_c, PENDULUM, "Adams", projected=True)
+
+
+def test_each_set_up_is_run_beside_the_others_and_drawn_as_itself():
+    added = {IDA_C_STATES: True, CVODE_C_PROJECTED: True, "CVODES, CasADi": False}
+    assert {name: CATALOGUE[name].keeps_constraints for name in added} == added
+    assert set(added) <= set(RIVALS) and len(set(RIVALS)) == len(RIVALS)
+    assert [list(STYLES.values()).count(STYLES[name]) for name in added] == [1, 1, 1]
