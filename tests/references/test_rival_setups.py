@@ -13,6 +13,7 @@ from references.cvode_projection import projection_for_cvode
 from references.duals import Dual, functions_on_duals
 from references.expressions import FUNCTIONS, functions_of
 from references.ida_c import solve_ida_c
+from references.ida_options import NOT_TESTED, tolerances
 from references.straight_line import straight_line, straight_line_jacobian
 from studies.figures import STYLES
 from studies.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
@@ -42,11 +43,11 @@ def error(problem, result):
 
 def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipliers():
     pytest.importorskip("sksundae")
-    made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("all", "states", "positions")}
-    errors = {test: error(FOUR_BAR, result) for test, result in made.items()}
-    assert 1e-12 < errors["states"] < 1e-3, errors
-    steps = {test: result.stats.n_accepted for test, result in made.items()}
-    assert steps["positions"] < steps["states"] < steps["all"], steps
+    tested = tolerances(FOUR_BAR.system, 34, "states", 1e-7)
+    assert (tested[:18] == 1e-7).all() and (tested[18:] == NOT_TESTED).all()
+    made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("states", "positions")}
+    assert 1e-9 < error(FOUR_BAR, made["states"]) < 2e-4
+    assert made["positions"].stats.n_accepted < 0.8 * made["states"].stats.n_accepted
 
 
 def test_cvodes_of_casadi_is_cvodes_and_right():
