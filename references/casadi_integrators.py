@@ -1,4 +1,4 @@
-"""IDAS and collocation of CasADi (J. Andersson et al.) on a ConstrainedSystem, by its expressions.
+"""IDAS, CVODES and collocation of CasADi (J. Andersson et al.) on a ConstrainedSystem, by its expressions.
 
 The equations are those that `references.expressions` makes of the callbacks, as the ODE of index 1: on the four-bar,
 IDAS takes a quarter to a half less time for an error with it than with the multipliers as algebraic unknowns, and the
@@ -25,7 +25,9 @@ from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-STEPS_A_RUN = 100_000  # at most, of IDAS
+PLUGINS = {"idas": "IDAS of CasADi", "cvodes": "CVODES of CasADi", "collocation": "CasADi's collocation"}
+SUNDIALS = ("idas", "cvodes")
+STEPS_A_RUN = 100_000  # at most, of IDAS and CVODES
 LARGEST_COMPILED = 9  # coordinates; the compiler takes minutes for the exact Jacobian of large ones
 OUTPUTS = 1000  # of collocation, at most: CasADi divides its elements at every output
 DEGREE = 5  # of the Gauss collocation, so of order 10
@@ -79,13 +81,42 @@ def solve_idas(
     RuntimeError
         If CasADi is not installed.
     """
-    check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
-    times = output_times(times, t0, t1)
-    check_start(system, t0, q0, v0, derivatives=False)
-    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": STEPS_A_RUN}
-    options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
-    return _solved(system, "idas", t0, np.array([t1]), times, q0, v0, options, time_limit)
+    return _by_sundials("idas", system, t_span, q0, v0, rtol, atol, t_eval, time_limit)
+
+
+def solve_cvodes(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    *,
+    t_eval: ArrayLike | None = None,
+    time_limit: float | None = None,
+) -> Result:
+    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODES of CasADi.
+
+    What it was given: as `solve_idas`; BDF with Newton's iteration, which is how CasADi sets CVODES up.
+
+    Parameters
+    ----------
+    system, t_span, q0, v0 : see `solve_idas`
+    rtol, atol : float
+        CVODES' tolerances.
+    t_eval, time_limit : see `solve_idas`
+
+    Returns
+    -------
+    Result
+        As `solve_idas`; n_evaluations are those of the accelerations.
+
+    Raises
+    ------
+    TypeError, ValueError, RuntimeError
+        As `solve_idas`.
+    """
+    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit)
 
 
 def solve_collocation(
@@ -127,6 +158,26 @@ def solve_collocation(
     return _solved(system, "collocation", t0, ends[1:], ends, q0, v0, options, time_limit)
 
 
+def _by_sundials(
+    plugin: str,
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    rtol: float,
+    atol: float,
+    t_eval: ArrayLike | None,
+    time_limit: float | None,
+) -> Result:
+    check_tolerances(rtol, atol)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    times = output_times(times, t0, t1)
+    check_start(system, t0, q0, v0, derivatives=False)
+    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": STEPS_A_RUN}
+    options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
+    return _solved(system, plugin, t0, np.array([t1]), times, q0, v0, options, time_limit)
+
+
 def _solved(
     system: ConstrainedSystem,
     plugin: str,
@@ -139,10 +190,10 @@ def _solved(
     time_limit: float | None,
 ) -> Result:
     """The Result at `times`, with the clock of a run that stores at `timed`."""
-    check_choice("plugin", plugin, ("idas", "collocation"))
+    check_choice("plugin", plugin, PLUGINS)
     made = partial(_integrator, plugin, system, t0, q0.tobytes(), v0.tobytes(), tuple(options.items()))
     start = np.concatenate([q0, v0])
-    t1, name = float(timed[-1]), {"idas": "IDAS of CasADi", "collocation": "CasADi's collocation"}[plugin]
+    t1, name = float(timed[-1]), PLUGINS[plugin]
     limit, failure, cpu, states = TimeLimit(time_limit), "", None, np.empty((start.size, 0))
     counts: dict[str, Any] = {}
     after = times[times > t0]
@@ -152,7 +203,7 @@ def _solved(
         with user_call as clock:
             states = np.array(integrator(x0=start)["xf"])
         cpu = clock.seconds
-        counts = integrator.stats() if plugin == "idas" else {}
+        counts = integrator.stats() if plugin in SUNDIALS else {}
         if limit.passed():
             failure = limit.message(name, t1, "take looser tolerances, or fewer steps")
         if after.size != timed.size:
@@ -197,7 +248,7 @@ def _integrator(
     casadi, compiler = _casadi(), shutil.which("cc")
     arguments = ("motion", plugin, _equations(system, t0, q0, v0), t0, np.frombuffer(times).tolist())
     given = dict(options) | ({"rootfinder_options": ROOT} if plugin == "collocation" else {})
-    if plugin != "idas" or compiler is None or system.n_q > LARGEST_COMPILED:
+    if plugin not in SUNDIALS or compiler is None or system.n_q > LARGEST_COMPILED:
         return casadi.integrator(*arguments, given)
     # CasADi writes for the compiler into the working folder, whatever it is told; it has loaded all when it returns
     with tempfile.TemporaryDirectory() as folder, chdir(folder):

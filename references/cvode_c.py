@@ -1,22 +1,23 @@
 """SUNDIALS CVODE without Python in its way: the library of scikit-sundae, driven by ctypes, its right-hand side in C.
 
 The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-line machine code. The constraints are
-not kept. See `references.ida_c` for what the library promises.
+not kept, unless CVODE is given a projection. See `references.ida_c` for what the library promises.
 """
 
 import ctypes
 import itertools
 from contextlib import ExitStack
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, cfunc, types
 from numpy.typing import ArrayLike, NDArray
 
+from references.cvode_projection import projection_for_cvode
 from references.driver import TimeLimit, UserCall, check_choice, check_run, check_tolerances, user_call
 from references.ode import ADVICE, ode_result, output_times
-from references.straight_line import straight_line
+from references.straight_line import straight_line, straight_line_jacobian
 from references.sundials import REAL, check, context, counted, flag_name, library, made
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
@@ -30,6 +31,15 @@ STEPS_A_CALL = 100  # between two looks at the clock
 CV_NORMAL, CV_TSTOP_RETURN, CV_TOO_MUCH_WORK = 1, 1, -1
 
 
+class Functions(NamedTuple):
+    """What CVODE is given: compiled functions, or None of those that it shall do without, and their data."""
+
+    rate: Any
+    jacobian: Any
+    projection: Any
+    data: Array
+
+
 def solve_cvode_c(
     system: ConstrainedSystem,
     t_span: tuple[float, float],
@@ -39,14 +49,17 @@ def solve_cvode_c(
     rtol: float = 1e-8,
     atol: float = 1e-8,
     *,
+    projected: bool = False,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
 
     What it was given: accelerations as straight-line code of the one mechanism (`references.straight_line`); Adams with
-    fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's and dense differences; timed is
-    a second use of CVODE's memory, as its guide has it: `CVodeReInit`, then `CVode` without output.
+    fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's, dense and with the analytic
+    Jacobian as straight-line code, up to `straight_line.MOST_OPERATIONS` (which compile in a few seconds), else with
+    differences; timed is a second use of CVODE's memory, as its guide has it: `CVodeReInit`, then `CVode` without
+    output.
 
     Parameters
     ----------
@@ -60,6 +73,9 @@ def solve_cvode_c(
         Orders up to 12, or up to 5.
     rtol, atol : float
         CVODE's tolerances.
+    projected : bool
+        Whether CVODE projects each step, and its estimate of the error, onto C = 0 and C_q v + C_t = 0
+        (`references.cvode_projection`), which it can with BDF alone. What it interpolates for t_eval is not projected.
     t_eval : array_like, optional
         Increasing times in t_span at which to store the solution, interpolated by CVODE, in a second run that is not
         timed. None: 1001 times, evenly.
@@ -82,12 +98,16 @@ def solve_cvode_c(
         If scikit-sundae is not the one that this was written for.
     """
     check_choice("method", method, METHODS)
+    if projected and method != "BDF":
+        raise ValueError(f"projected needs method 'BDF', with which alone CVODE projects; given {method!r}")
     check_tolerances(rtol, atol)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
-    function, start = _right_hand_side(system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
-    arguments = (function, start, t0, t1, METHODS[method], float(rtol), float(atol))
+    at, start = (system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
+    jacobian = _jacobian(*at) if method == "BDF" else None
+    functions = Functions(_right_hand_side(*at), jacobian, *_projection(system, projected, rtol, atol))
+    arguments = (functions, start, t0, t1, METHODS[method], float(rtol), float(atol))
 
     limit = TimeLimit(time_limit)
     _, flag, reached, statistics = integrate(*arguments, np.empty(0), limit)
@@ -118,8 +138,36 @@ def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes)
     return right_hand_side
 
 
+@lru_cache(maxsize=256)
+def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    """CVODE's Jacobian function; None where it is too long to be compiled."""
+    derivatives = straight_line_jacobian(system, t0, np.frombuffer(q0), np.frombuffer(v0))
+    if derivatives is None:
+        return None
+    array_of, matrix_of, size = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data, 2 * system.n_q
+    pointer = types.voidptr
+
+    @cfunc(types.int32(types.float64, *[pointer] * 7), error_model="numpy")
+    def jacobian(t, y, rate, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
+        derivatives(t, carray(array_of(y), (size,)), carray(matrix_of(J), (size, size)))  # CVODE has set J to zero
+        return 0
+
+    return jacobian
+
+
+def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: float) -> tuple[Any, Array]:
+    """CVODE's projection function, None without one, and the user data."""
+    f = system.functions
+    if not projected or system.n_c == 0:
+        return None, np.empty(0)
+    projection, size = projection_for_cvode(*f[2:5], system.n_q, system.n_c, f.p.size)
+    data = np.zeros(size)
+    data[: f.p.size + 2] = [*f.p, rtol, atol]
+    return projection, data
+
+
 def integrate(
-    function: Any,
+    functions: Functions,
     start: Array,
     t0: float,
     t1: float,
@@ -137,7 +185,7 @@ def integrate(
         own = context(stack)
         y = made(stack, "N_VMake_Serial", sundials.N_VDestroy, n, state.ctypes.data, own)
         memory = made(stack, "CVodeCreate", lambda pointer: sundials.CVodeFree(ctypes.byref(pointer)), kind, own)
-        check("CVodeInit", sundials.CVodeInit(memory, function.address, t0, y))
+        check("CVodeInit", sundials.CVodeInit(memory, functions.rate.address, t0, y))
         check("CVodeSStolerances", sundials.CVodeSStolerances(memory, rtol, atol))
         if kind == METHODS["Adams"]:
             iteration = made(stack, "SUNNonlinSol_FixedPoint", sundials.SUNNonlinSolFree_FixedPoint, y, 0, own)
@@ -146,6 +194,11 @@ def integrate(
             matrix = made(stack, "SUNDenseMatrix", sundials.SUNMatDestroy, n, n, own)
             linear = made(stack, "SUNLinSol_Dense", sundials.SUNLinSolFree, y, matrix, own)
             check("CVodeSetLinearSolver", sundials.CVodeSetLinearSolver(memory, linear, matrix))
+            if functions.jacobian is not None:
+                check("CVodeSetJacFn", sundials.CVodeSetJacFn(memory, functions.jacobian.address))
+            if functions.projection is not None:
+                check("CVodeSetUserData", sundials.CVodeSetUserData(memory, functions.data.ctypes.data))
+                check("CVodeSetProjFn", sundials.CVodeSetProjFn(memory, functions.projection.address))
         for name, value in (
             ("MaxNumSteps", STEPS_A_CALL),
             ("MaxStep", t1 - t0),
@@ -174,13 +227,14 @@ def _statistics(memory: Any, kind: int, cpu: float) -> Statistics:
     def number(what: str) -> int:
         return counted(f"CVodeGetNum{what}", memory)
 
-    differenced = kind == METHODS["BDF"]
+    newton = kind == METHODS["BDF"]
     return Statistics(
         n_accepted=number("Steps"),
         n_rejected_error=number("ErrTestFails"),
         n_rejected_convergence=number("StepSolveFails"),
         n_outer=number("NonlinSolvIters"),
-        n_evaluations=number("RhsEvals") + (number("LinRhsEvals") if differenced else 0),
-        n_factorizations=number("LinSolvSetups") if differenced else 0,
+        n_evaluations=number("RhsEvals") + (number("LinRhsEvals") if newton else 0),
+        n_factorizations=number("LinSolvSetups") if newton else 0,
+        n_jacobians=number("JacEvals") if newton else 0,
         cpu_time=cpu,
     )

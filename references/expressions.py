@@ -18,6 +18,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from references.driver import check_system
+from references.duals import Dual, functions_on_duals
 from twoloop.kernels.common import GAMMA_GIVEN
 from twoloop.series import on_symbols
 from twoloop.system import ConstrainedSystem
@@ -113,8 +114,36 @@ class Expressions:
 
     def accelerations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> list[Any]:
         """The accelerations (n_q,) of eq. (6) as expressions."""
-        made, n = self.equations(functions, t, q, v), self.system.n_q
-        Cq, gamma = made.jacobian[self.rows], made.gamma[self.rows]
+        made = self.equations(functions, t, q, v)
+        right = self._right(made.jacobian, made.force, made.gamma)
+        return _substituted(_factored(self._matrix(made), self.order), right)[: self.system.n_q]
+
+    def derivatives(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> list[list[Any]]:
+        """The derivatives of the accelerations by each of [q, v], as 2 n_q lists (n_q,) of expressions.
+
+        The matrix of eq. (6) is factorised once: its derivatives times the solution go to the right-hand side.
+        """
+        n = self.system.n_q
+        moving = [Dual(x, {k: 1.0}) for k, x in enumerate([*q, *v])]
+        made = self.equations(functions_on_duals(functions), t, moving[:n], moving[n:])
+        values = SimpleNamespace(**{name: _parts(of, None) for name, of in vars(made).items()})
+        factors = _factored(self._matrix(values), self.order)
+        solution = _substituted(factors, self._right(values.jacobian, values.force, values.gamma))
+        columns = []
+        for k in range(2 * n):
+            M, Cq, Q, gamma = (_parts(getattr(made, name), k) for name in ("mass", "jacobian", "force", "gamma"))
+            for i, j in np.argwhere(M != 0.0):
+                Q[i] = Q[i] - M[i, j] * solution[j]
+            for row, multiplier in zip(self.rows, solution[n:], strict=True):
+                for j in np.flatnonzero(Cq[row] != 0.0):
+                    Q[j] = Q[j] - Cq[row, j] * multiplier
+                    gamma[row] = gamma[row] - Cq[row, j] * solution[j]
+            columns.append(_substituted(factors, self._right(values.jacobian, Q, gamma))[:n])
+        return columns
+
+    def _matrix(self, made: SimpleNamespace) -> dict[tuple[int, int], Any]:
+        """The matrix of eq. (6) without what is zero."""
+        Cq, n = made.jacobian[self.rows], self.system.n_q
         matrix: dict[tuple[int, int], Any] = {}
         for i, j in np.argwhere(self.mass_pattern):
             matrix[int(i), int(j)] = made.mass[i, j]
@@ -126,17 +155,33 @@ class Expressions:
                     matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
         for k, i in np.argwhere(self.jacobian_pattern):
             matrix[n + int(k), int(i)] = matrix[int(i), n + int(k)] = Cq[k, i]
-        right = [*made.force]
-        for i in range(n):
+        return matrix
+
+    def _right(self, jacobian: NDArray[Any], force: NDArray[Any], gamma: NDArray[Any]) -> list[Any]:
+        """The right-hand side of eq. (6) for that matrix."""
+        Cq, gamma = jacobian[self.rows], gamma[self.rows]
+        right = [*force]
+        for i in range(self.system.n_q):
             for k in self.added:
                 if self.jacobian_pattern[k, i]:
                     right[i] = right[i] + Cq[k, i] * gamma[k]
-        return _solved(matrix, [*right, *gamma], self.order)[:n]
+        return [*right, *gamma]
 
 
 def functions_of(package: Any) -> dict[str, Callable[[Any], Any]]:
     """Those of FUNCTIONS that a package has under these names."""
     return {name: getattr(package, name) for name in FUNCTIONS if hasattr(package, name)}
+
+
+def _parts(made: NDArray[Any], k: int | None) -> NDArray[Any]:
+    """The values of an array of duals and numbers, or their derivatives by the unknown k."""
+    parts = np.full(made.shape, 0.0, dtype=object)
+    for place, each in np.ndenumerate(made):
+        if isinstance(each, Dual):
+            parts[place] = each.value if k is None else each.by.get(k, 0.0)
+        elif k is None:
+            parts[place] = each
+    return parts
 
 
 def _kinds(n: int, m: int, q: Any, v: Any) -> list[tuple[str, tuple[int, ...], tuple[Any, ...]]]:
@@ -217,9 +262,9 @@ def _order(pattern: NDArray[np.bool_], n: int) -> list[int]:
     return order
 
 
-def _solved(matrix: dict[tuple[int, int], Any], right: list[Any], order: list[int]) -> list[Any]:
-    """Solution of a symmetric system by LDL^T in this order; entries that are not in `matrix` are zero."""
-    rows: list[dict[int, Any]] = [{} for _ in right]
+def _factored(matrix: dict[tuple[int, int], Any], order: list[int]) -> list[tuple[int, Any, list[tuple[int, Any]]]]:
+    """Factors LDL^T, in this order, of a symmetric matrix; entries that are not in `matrix` are zero."""
+    rows: list[dict[int, Any]] = [{} for _ in order]
     for (i, j), value in matrix.items():
         rows[i][j] = value
     factors: list[tuple[int, Any, list[tuple[int, Any]]]] = []
@@ -230,11 +275,18 @@ def _solved(matrix: dict[tuple[int, int], Any], right: list[Any], order: list[in
             for k, value in rows[i].items():
                 rows[j][k] = rows[j][k] - multiple * value if k in rows[j] else -(multiple * value)
             del rows[j][i]
-            right[j] = right[j] - multiple * right[i]
         factors.append((i, inverse, column))
+    return factors
+
+
+def _substituted(factors: list[tuple[int, Any, list[tuple[int, Any]]]], right: list[Any]) -> list[Any]:
+    """The solution of the factorised system."""
     solution: list[Any] = list(right)
+    for i, _, column in factors:
+        for j, multiple in column:
+            solution[j] = solution[j] - multiple * solution[i]
     for i, inverse, column in reversed(factors):
-        total = right[i] * inverse
+        total = solution[i] * inverse
         for j, multiple in column:
             total = total - multiple * solution[j]
         solution[i] = total

@@ -92,9 +92,10 @@ def solve_ida(
     max_order : int
         The highest order of the BDF, 1 to 5. Those above 2 are unstable for undamped vibrations that the step does not
         resolve.
-    error_test : {"all", "positions"}
+    error_test : {"all", "states", "positions"}
         What the error test, and that of Newton's iteration, sees: all unknowns but the algebraic lam of the form
-        "index1", or q alone. IDA's norm is a mean over all unknowns: the fewer it sees, the looser the same tolerance.
+        "index1", q and v, or q alone. IDA's norm is a mean over all unknowns: the fewer it sees, the looser the same
+        tolerance.
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at in every evaluation of the residual. A run past it
         is a failed one. None: no limit.

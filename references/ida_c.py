@@ -75,10 +75,10 @@ def solve_ida_c(
     max_order : int
         The highest order of the BDF, 1 to 5. Those above 2 are unstable for undamped vibrations that the step does not
         resolve.
-    error_test : {"all", "positions"}
-        What the error test, and that of Newton's iteration, sees: all unknowns, or q alone. IDA's norm is a mean over
-        all unknowns, so that without the others the same tolerances allow q an error sqrt((2 n_q + 2 n_c)/n_q) times
-        as large.
+    error_test : {"all", "states", "positions"}
+        What the error test, and that of Newton's iteration, sees: all unknowns, q and v, or q alone. IDA's norm is a
+        mean over all unknowns, so that without the others the same tolerances allow q an error
+        sqrt((2 n_q + 2 n_c)/n_q) times as large, and q and v one sqrt(1 + n_c/n_q) times as large.
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps and at output times. A
         run past it is a failed one. None: no limit.

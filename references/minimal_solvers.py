@@ -12,7 +12,7 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numpy.typing import ArrayLike, NDArray
 
-from references.cvode_c import METHODS, integrate
+from references.cvode_c import METHODS, Functions, integrate
 from references.driver import TimeLimit, check_run, check_tolerances, user_call
 from references.heyoka_taylor import STEPS_A_CALL
 from references.minimal import Minimal, minimal
@@ -105,7 +105,8 @@ def solve_cvode_minimal(
     """
     check_tolerances(rtol, atol)
     own, times = _checked(problem, t_end, t_eval, time_limit)
-    arguments = (_right_hand_side(own), np.array(own.start), 0.0, t_end, METHODS["Adams"], float(rtol), float(atol))
+    functions = Functions(_right_hand_side(own), None, None, np.empty(0))
+    arguments = (functions, np.array(own.start), 0.0, t_end, METHODS["Adams"], float(rtol), float(atol))
     limit = TimeLimit(time_limit)
     _, flag, reached, statistics = integrate(*arguments, np.empty(0), limit)
     failure = ""

@@ -1,4 +1,4 @@
-"""Accelerations of one mechanism as straight-line machine code, for solvers that call compiled functions.
+"""Accelerations of one mechanism, and their Jacobian, as straight-line machine code, for solvers of compiled functions.
 
 The equations come from `references.expressions`: every loop unrolled, every zero left out, common terms computed once.
 That is the fastest right-hand side that a foreign solver driven from compiled code can be given here.
@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 COMMUTES = "+*"
+MOST_OPERATIONS = 3000  # of a Jacobian: numba takes two or three milliseconds for each
 
 
 class Program:
@@ -99,10 +100,9 @@ class Value:
 
 def program_of(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Program, list[str]]:
     """The program of the accelerations, of the values t, q0, q1, ..., v0, v1, ..., and the names of its results."""
-    program, n = Program(), system.n_q
-    q, v = ([Value(program, f"{letter}{i}") for i in range(n)] for letter in "qv")
-    made = Expressions(system, t0, q0, v0).accelerations(program.functions(), Value(program, "t"), q, v)
-    return program, [each.name if isinstance(each, Value) else repr(float(each)) for each in made]
+    program, t, q, v = _inputs(system)
+    made = Expressions(system, t0, q0, v0).accelerations(program.functions(), t, q, v)
+    return program, [_name(each) for each in made]
 
 
 def straight_line(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> Callable[..., Any]:
@@ -110,13 +110,52 @@ def straight_line(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) ->
     return _compiled(system, t0, q0.tobytes(), v0.tobytes())
 
 
+def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> Callable[..., Any] | None:
+    """(t, y, columns) -> None: what is not zero of d y'[i]/d y[k] into columns[k, i], compiled; kept.
+
+    None where that takes more than `MOST_OPERATIONS`, as on mechanisms of a dozen coordinates and more.
+    """
+    return _compiled_jacobian(system, t0, q0.tobytes(), v0.tobytes())
+
+
 @lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
     n = system.n_q
     program, names = program_of(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
-    lines = [f"q{i} = y[{i}]" for i in range(n)] + [f"v{i} = y[{n + i}]" for i in range(n)] + program.lines
-    lines += [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
+    results = [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
+    return _machine_code(system, "rate", program, results)
+
+
+@lru_cache(maxsize=256)
+def _compiled_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
+    n, (program, t, q, v) = system.n_q, _inputs(system)
+    expressions = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
+    made = expressions.derivatives(program.functions(), t, q, v)
+    if program.operations > MOST_OPERATIONS:
+        return None
+    results = [f"columns[{n + i}, {i}] = 1.0" for i in range(n)]
+    for k, column in enumerate(made):
+        places = [(i, _name(each)) for i, each in enumerate(column) if isinstance(each, Value) or each != 0.0]
+        results += [f"columns[{k}, {n + i}] = {name}" for i, name in places]
+    return _machine_code(system, "columns", program, results)
+
+
+def _inputs(system: ConstrainedSystem) -> tuple[Program, Value, list[Value], list[Value]]:
+    """An empty program, and the values t, q0, q1, ..., v0, v1, ... that it is of."""
+    program = Program()
+    q, v = ([Value(program, f"{letter}{i}") for i in range(system.n_q)] for letter in "qv")
+    return program, Value(program, "t"), q, v
+
+
+def _name(made: Any) -> str:
+    return made.name if isinstance(made, Value) else repr(float(made))
+
+
+def _machine_code(system: ConstrainedSystem, into: str, program: Program, results: list[str]) -> Callable[..., Any]:
+    """(t, y, into) -> None: the program at y = [q, v], and then what writes its results."""
+    n = system.n_q
+    lines = [f"q{i} = y[{i}]" for i in range(n)] + [f"v{i} = y[{n + i}]" for i in range(n)] + program.lines + results
     scope: dict[str, Any] = functions_of(math)
-    text = "\n    ".join(["def derivative(t, y, rate):", *lines])
+    text = "\n    ".join([f"def derivative(t, y, {into}):", *lines])
     exec(compile(text, f"<straight-line code of {system.name}>", "exec"), scope)
     return njit(**_OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]

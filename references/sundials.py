@@ -63,6 +63,9 @@ FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
         "CVodeReInit": (INT, POINTER, REAL, POINTER),
         "CVodeSStolerances": (INT, POINTER, REAL, REAL),
         "CVodeSetLinearSolver": (INT, POINTER, POINTER, POINTER),
+        "CVodeSetJacFn": (INT, POINTER, POINTER),
+        "CVodeSetProjFn": (INT, POINTER, POINTER),
+        "CVodeSetUserData": (INT, POINTER, POINTER),
         "SUNNonlinSol_FixedPoint": (POINTER, POINTER, INT, POINTER),
         "SUNNonlinSolFree_FixedPoint": (INT, POINTER),
         "CVodeSetNonlinearSolver": (INT, POINTER, POINTER),
@@ -79,6 +82,7 @@ FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
         "CVodeGetNumRhsEvals": COUNTER,
         "CVodeGetNumLinRhsEvals": COUNTER,
         "CVodeGetNumLinSolvSetups": COUNTER,
+        "CVodeGetNumJacEvals": COUNTER,
     },
 }
 

@@ -30,6 +30,7 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
+IDA_C_STATES = "IDA from C, q and v tested"
 CANONICAL = "Gauss6, momenta, symmetric"
 ADAMS, TAYLOR = "Adams", "Taylor"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
@@ -52,15 +53,17 @@ OWN = (
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
+CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 GEAR_STARTS = ("accurate", "ramp")
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
-    *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi", "collocation, CasADi"),
-    *("CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Pr9, index 1", "Radau, index 1"),
-    *("BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
+    *(HEYOKA, CVODE_C, "CVODE from C, BDF", CVODE_C_PROJECTED, IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX),
+    *("IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
+    *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised"),
+    *("Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
 )
 
 # in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
@@ -159,12 +162,12 @@ def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
     return _by_expressions(solve_heyoka, *_start(case), tolerance, t_eval=times, time_limit=case.time_limit)
 
 
-def _cvode_c(method: str, case: Case, tolerance: float, repeat: int) -> Result:
+def _cvode_c(method: str, projected: bool, case: Case, tolerance: float, repeat: int) -> Result:
     from references.cvode_c import solve_cvode_c
 
     setting = (method, tolerance, tolerance)
-    times = np.append(0.0, case.instants)
-    return _by_expressions(solve_cvode_c, *_start(case), *setting, t_eval=times, time_limit=case.time_limit)
+    options = {"projected": projected, "t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
+    return _by_expressions(solve_cvode_c, *_start(case), *setting, **options)
 
 
 def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
@@ -194,11 +197,12 @@ def _diffrax(case: Case, tolerance: float, repeat: int) -> Result:
     return _by_expressions(solve_diffrax, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
 
 
-def _idas(case: Case, tolerance: float, repeat: int) -> Result:
-    from references.casadi_integrators import solve_idas
+def _casadi(integrator: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.casadi_integrators import solve_cvodes, solve_idas
 
+    solve = {"IDAS": solve_idas, "CVODES": solve_cvodes}[integrator]
     times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
-    return _by_expressions(solve_idas, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
+    return _by_expressions(solve, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
 
 
 def _collocation(case: Case, step: float, repeat: int) -> Result:
@@ -286,18 +290,26 @@ def _all() -> Iterator[Solver]:
     for form in IDA_FORMS:
         keeps, run = form == "stabilised", partial(_ida, form)
         yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
-    for name, options in ((IDA_C, {}), (IDA_C_ORDER_2, {"max_order": 2, "error_test": "positions"})):
+    of_ida: dict[str, dict[str, Any]] = {
+        IDA_C: {},
+        IDA_C_STATES: {"error_test": "states"},
+        IDA_C_ORDER_2: {"max_order": 2, "error_test": "positions"},
+    }
+    for name, options in of_ida.items():
         yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
     yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True, traces=True)
-    for method in ("Adams", "BDF"):
-        run = partial(_cvode_c, method)
-        yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False, traces=True)
     for name, kind in zip(MINIMAL, ("heyoka", "CVODE"), strict=True):
         more = {"traces": True, "builds_each": kind == "heyoka"}
         yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
+    for name, method in ((CVODE_C, "Adams"), ("CVODE from C, BDF", "BDF"), (CVODE_C_PROJECTED, "BDF")):
+        keeps = name == CVODE_C_PROJECTED
+        run = partial(_cvode_c, method, keeps)
+        yield _solver(name, "SUNDIALS", "compiled", "tol", run, keeps=keeps, traces=True)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
-    yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True, traces=True)
+    for name in ("IDAS", "CVODES"):
+        run, more = partial(_casadi, name), {"builds_each": True, "traces": True}
+        yield _solver(f"{name}, CasADi", "CasADi", "compiled", "tol", run, keeps=False, **more)
     yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False, traces=True)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)

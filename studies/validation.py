@@ -15,7 +15,19 @@ from studies import deceived, figures, study
 from studies.bench import Run, warm_up
 from studies.end_states import DECADES, EXACT, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
 from studies.render import number, percent, power, render, table
-from studies.solvers import ADAMS, CATALOGUE, CVODE_C, DEFAULT, EXUDYN, HEYOKA, IDA_C, OWN_BDF, OWN_EXPLICIT, TAYLOR
+from studies.solvers import (
+    ADAMS,
+    CATALOGUE,
+    CVODE_C,
+    CVODE_C_PROJECTED,
+    DEFAULT,
+    EXUDYN,
+    HEYOKA,
+    IDA_C,
+    OWN_BDF,
+    OWN_EXPLICIT,
+    TAYLOR,
+)
 from studies.store import Output
 from twoloop import mechanisms
 from twoloop.mechanisms import Problem
@@ -45,7 +57,10 @@ MAKE: tuple[Callable[[], Problem], ...] = (
 )
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
-OTHERS = (IDA_C, HEYOKA, CVODE_C, "IDAS, CasADi", "LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1")
+OTHERS = (
+    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, "IDAS, CasADi"),
+    *("LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1"),
+)
 QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 QUICK_TOLERANCES = (1e-6, 1e-10)

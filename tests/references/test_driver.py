@@ -206,7 +206,7 @@ def test_wrong_arguments_are_named(solve, changed, error, words):
         (solve_index1, {"method": ["DOP853"]}, r"method must be one of .*; given \['DOP853'\]"),
         (solve_ida, {"form": None}, "form must be one of index1, stabilised; given None"),
         (solve_fully_implicit, {"method": "Gauss"}, "method must be one of Radau, Radau9, BDF; given 'Gauss'"),
-        (solve_ida_c, {"error_test": []}, r"error_test must be one of all, positions; given \[\]"),
+        (solve_ida_c, {"error_test": []}, r"error_test must be one of all, states, positions; given \[\]"),
     ],
 )
 def test_wrong_options_are_named(solve, changed, words):
