@@ -51,6 +51,7 @@ OWN = (
 )
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
+RADII = (1.0, 0.6)  # spectral radii of GeneralizedAlpha, besides Exudyn's default of 0.9
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
@@ -60,7 +61,8 @@ GEAR_STARTS = ("accurate", "ramp")
 RIVALS = (
     *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi", "collocation, CasADi"),
     *("CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Pr9, index 1", "Radau, index 1"),
-    *("BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
+    *("BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae"),
+    *("Exudyn, GeneralizedAlpha", *(f"Exudyn, GeneralizedAlpha {radius:g}" for radius in RADII)),
 )
 
 # of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
@@ -201,7 +203,7 @@ def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, 
 
     n_steps = round(case.t_end / step)
     more = {"store_every": max(1, n_steps // STORED), "time_limit": case.time_limit, **options}
-    if has_model(case.problem) and not options:
+    if has_model(case.problem):
         return solve_exudyn_mechanism(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
     if "L3" not in case.problem.parameters:  # of the four-bar linkage
         raise NotApplicable(
@@ -292,7 +294,7 @@ def _all() -> Iterator[Solver]:
     for solver in EXUDYN:
         keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
         yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **model)
-    for radius in (1.0, 0.6):
+    for radius in RADII:
         fixed = {"spectral_radius": radius}
         run = partial(_exudyn, "GeneralizedAlpha", fixed)
         yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **model)
