@@ -42,6 +42,7 @@ def solve_idas(
     *,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    most_steps: int = STEPS_A_RUN,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with IDAS of CasADi.
 
@@ -64,7 +65,9 @@ def solve_idas(
         timed. None: 1001 times, evenly.
     time_limit : float, optional
         Wall-clock time that the integration may take, s. CasADi does not look at the clock: a run ends after
-        `STEPS_A_RUN` steps, and one that took longer than the limit is a failed one. None: no limit.
+        `most_steps` steps, and one that took longer than the limit is a failed one. None: no limit.
+    most_steps : int
+        Steps after which a run ends.
 
     Returns
     -------
@@ -83,7 +86,11 @@ def solve_idas(
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
-    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": STEPS_A_RUN}
+    options: dict[str, Any] = {
+        "reltol": float(rtol),
+        "abstol": float(atol),
+        "max_num_steps": check_size("most_steps", most_steps, 1),
+    }
     options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
     return _solved(system, "idas", t0, np.array([t1]), times, q0, v0, options, time_limit)
 

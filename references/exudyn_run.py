@@ -1,9 +1,9 @@
 """What the Exudyn models share: sensors, a run with a fixed step, silence, statistics.
 
-There is no line with error control. Of `adaptiveStep` of the implicit solvers Exudyn's documentation says "the step size
-may be reduced if step fails; no automatic stepsize control"; those with error control (`automaticStepSize`: DOPRI5,
-ODE23) are explicit and refuse joints: "explicit integrator detected object 2 which contains constraints that cannot be
-solved" (1.13.6).
+There is no line with error control. Of `adaptiveStep` of the implicit solvers Exudyn's documentation says "the step
+size may be reduced if step fails; no automatic stepsize control"; those with error control (`automaticStepSize`:
+DOPRI5, ODE23) are explicit and refuse joints: "explicit integrator detected object 2 which contains constraints that
+cannot be solved" (1.13.6).
 """
 
 import contextlib

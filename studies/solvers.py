@@ -52,14 +52,14 @@ OWN = (
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 RADII = (1.0, 0.6)  # spectral radii of GeneralizedAlpha, besides Exudyn's default of 0.9
-HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
+HEYOKA, CVODE_C, DIFFRAX, IDAS = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax", "IDAS, CasADi"
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 GEAR_STARTS = ("accurate", "ramp")
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
-    *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_ORDER_2, DIFFRAX, "IDAS, CasADi", "collocation, CasADi"),
+    *(HEYOKA, CVODE_C, "CVODE from C, BDF", IDA_C, IDA_C_ORDER_2, DIFFRAX, IDAS, "collocation, CasADi"),
     *("CVODE, Adams", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Pr9, index 1", "Radau, index 1"),
     *("BDF, index 1", "IDA, stabilised", "Radau, solve_dae", "Radau9, solve_dae"),
     *("Exudyn, GeneralizedAlpha", *(f"Exudyn, GeneralizedAlpha {radius:g}" for radius in RADII)),
@@ -279,7 +279,7 @@ def _all() -> Iterator[Solver]:
         yield _solver(f"CVODE from C, {method}", "SUNDIALS", "compiled", "tol", run, keeps=False, traces=True)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
-    yield _solver("IDAS, CasADi", "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True, traces=True)
+    yield _solver(IDAS, "CasADi", "compiled", "tol", _idas, keeps=False, builds_each=True, traces=True)
     yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False, traces=True)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
