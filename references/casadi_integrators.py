@@ -44,6 +44,7 @@ def solve_idas(
     *,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    most_steps: int = STEPS_A_RUN,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with IDAS of CasADi.
 
@@ -66,7 +67,9 @@ def solve_idas(
         timed. None: 1001 times, evenly.
     time_limit : float, optional
         Wall-clock time that the integration may take, s. CasADi does not look at the clock: a run ends after
-        `STEPS_A_RUN` steps, and one that took longer than the limit is a failed one. None: no limit.
+        `most_steps` steps, and one that took longer than the limit is a failed one. None: no limit.
+    most_steps : int
+        Steps after which a run ends.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def solve_idas(
     RuntimeError
         If CasADi is not installed.
     """
-    return _by_sundials("idas", system, t_span, q0, v0, rtol, atol, t_eval, time_limit)
+    return _by_sundials("idas", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps)
 
 
 def solve_cvodes(
@@ -116,7 +119,7 @@ def solve_cvodes(
     TypeError, ValueError, RuntimeError
         As `solve_idas`.
     """
-    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit)
+    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, STEPS_A_RUN)
 
 
 def solve_collocation(
@@ -168,12 +171,14 @@ def _by_sundials(
     atol: float,
     t_eval: ArrayLike | None,
     time_limit: float | None,
+    most_steps: int,
 ) -> Result:
     check_tolerances(rtol, atol)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
-    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": STEPS_A_RUN}
+    most_steps = check_size("most_steps", most_steps, 1)
+    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps}
     options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
     return _solved(system, plugin, t0, np.array([t1]), times, q0, v0, options, time_limit)
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from references.driver import TimeLimit, check_run, check_tolerances, user_call
 from references.expressions import Expressions, NotSymbolic, functions_of
 from references.ode import ADVICE, ode_result, output_times
+from twoloop.checks import check_size
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
 from twoloop.system import ConstrainedSystem
@@ -34,6 +35,7 @@ def solve_diffrax(
     *,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    most_steps: int = MOST_STEPS,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with diffrax's Dopri8.
 
@@ -56,7 +58,9 @@ def solve_diffrax(
         run that is not timed. None: 1001 times, evenly.
     time_limit : float, optional
         Wall-clock time that the integration may take, s. Compiled code does not look at the clock: a run ends after
-        `MOST_STEPS` steps, and one that took longer than the limit is a failed one. None: no limit.
+        `most_steps` steps, and one that took longer than the limit is a failed one. None: no limit.
+    most_steps : int
+        Steps after which a run ends, rejected ones included.
 
     Returns
     -------
@@ -72,6 +76,7 @@ def solve_diffrax(
         If diffrax is not installed.
     """
     check_tolerances(rtol, atol)
+    most_steps = check_size("most_steps", most_steps, 1)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
     times = output_times(times, t0, t1)
     if system.n_q > LARGEST:
@@ -79,7 +84,7 @@ def solve_diffrax(
             f"system must have at most {LARGEST} coordinates for diffrax; {system.name!r} has {system.n_q}"
         )
     check_start(system, t0, q0, v0, derivatives=False)
-    solve = _compiled(system, t0, q0.tobytes(), v0.tobytes())
+    solve = _compiled(system, t0, q0.tobytes(), v0.tobytes(), most_steps)
     start = np.concatenate([q0, v0])
 
     end, soon = np.array([t1]), t0 + 1e-6 * (t1 - t0)
@@ -92,7 +97,7 @@ def solve_diffrax(
     if limit.passed():
         failure = limit.message("diffrax", t1, "take looser tolerances")
     elif status:
-        reason = f"{MOST_STEPS} steps were not enough" if steps + rejected >= MOST_STEPS else f"diffrax says: {status}"
+        reason = f"{most_steps} steps were not enough" if steps + rejected >= most_steps else f"diffrax says: {status}"
         failure = f"diffrax failed: {reason}. {ADVICE}"
     if failure:
         kept = np.isfinite(states).all(axis=0)
@@ -107,7 +112,7 @@ def solve_diffrax(
 
 
 @lru_cache(maxsize=256)
-def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
+def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_steps: int) -> Callable[..., Any]:
     """(t0, t1, y0, rtol, atol, times) -> states as rows, what failed ("": nothing), steps, rejected ones."""
     try:
         import diffrax
@@ -134,7 +139,7 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Cal
             y0=y0,
             saveat=diffrax.SaveAt(ts=times),
             stepsize_controller=controller,
-            max_steps=MOST_STEPS,
+            max_steps=most_steps,
             throw=False,
         )
 

@@ -94,10 +94,16 @@ class Expressions:
         pattern[:n, n:] = self.jacobian_pattern.T
         return pattern
 
-    def equations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> SimpleNamespace:
-        """M, Q, C, C_q, C_t and Q_d as arrays of expressions; what is zero is the number 0.0."""
+    def equations(
+        self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any], parameters: Sequence[Any] | None = None
+    ) -> SimpleNamespace:
+        """M, Q, C, C_q, C_t and Q_d as arrays of expressions; what is zero is the number 0.0.
+
+        `parameters` may be expressions; None: the numbers of the system.
+        """
         f, n, m = self.system.functions, self.system.n_q, self.system.n_c
-        p, positions, velocities = _objects(f.p.tolist()), _objects(q), _objects(v)
+        p = _objects(f.p.tolist() if parameters is None else parameters)
+        positions, velocities = _objects(q), _objects(v)
         made = SimpleNamespace()
         for name, shape, state in _kinds(n, m, positions, velocities):
             out = np.full(shape, 0.0, dtype=object)
@@ -112,9 +118,11 @@ class Expressions:
             setattr(made, name, out)
         return made
 
-    def accelerations(self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any]) -> list[Any]:
+    def accelerations(
+        self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any], parameters: Sequence[Any] | None = None
+    ) -> list[Any]:
         """The accelerations (n_q,) of eq. (6) as expressions."""
-        made = self.equations(functions, t, q, v)
+        made = self.equations(functions, t, q, v, parameters)
         right = self._right(made.jacobian, made.force, made.gamma)
         return _substituted(_factored(self._matrix(made), self.order), right)[: self.system.n_q]
 

@@ -19,8 +19,7 @@ from exudyn.itemInterface import (
 from numpy.typing import NDArray
 
 from references.driver import check_problem
-from references.exudyn_run import ALPHA, SOLVERS, SPECTRAL_RADIUS, add_sensors, check_steps, run
-from twoloop.checks import check_number
+from references.exudyn_run import ALPHA, SOLVERS, add_sensors, check_option, check_radius, check_steps, run
 from twoloop.mechanisms.problem import Problem
 from twoloop.result import Result
 
@@ -91,24 +90,11 @@ def solve_exudyn(
     """
     check_problem(problem, "L3", "a linkage of twoloop.mechanisms.four_bar")
     t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
-    radius = _option("spectral_radius", spectral_radius, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
-    strength = _option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
+    radius = check_radius(spectral_radius, solver)
+    strength = check_option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
     q0 = _positions(problem)
     _container, mbs, sensors = _model(problem, q0)
     return run(mbs, sensors, q0, 8, t_end, n_steps, solver, store_every, time_limit, radius, strength)
-
-
-def _option(
-    name: str, value: float | None, default: float, span: tuple[float, float], owner: str, solver: str
-) -> float:
-    """The value of an option that belongs to one solver, checked."""
-    if value is None:
-        return default
-    if solver != owner:
-        raise ValueError(f"{name} belongs to solver={owner!r}; given {name}={value!r} with solver={solver!r}")
-    if not span[0] <= check_number(name, value) <= span[1]:
-        raise ValueError(f"{name} must be between {span[0]:g} and {span[1]:g}; given {value!r}")
-    return float(value)
 
 
 def _positions(problem: Problem) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from references.exudyn_model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
-from references.exudyn_run import check_steps, run
+from references.exudyn_run import check_radius, check_steps, run
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
 from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
@@ -31,6 +31,7 @@ def solve_exudyn_mechanism(
     n_steps: int,
     solver: str = "GeneralizedAlpha",
     *,
+    spectral_radius: float | None = None,
     store_every: int = 1,
     time_limit: float | None = None,
 ) -> Result:
@@ -42,8 +43,8 @@ def solve_exudyn_mechanism(
         One of those in `MODELS`, by its name, or of A02. Its parameters and its start are read, not its system.
     t_end : float
         End, s; the run starts at 0.
-    n_steps, solver, store_every, time_limit
-        As of `references.exudyn_four_bar.solve_exudyn`, spectral radius 0.9.
+    n_steps, solver, spectral_radius, store_every, time_limit
+        As of `references.exudyn_four_bar.solve_exudyn`.
 
     Returns
     -------
@@ -59,6 +60,7 @@ def solve_exudyn_mechanism(
     if not has_model(problem):
         raise ValueError(f"problem must be of A02 or one of {', '.join(MODELS)}; given {problem.name!r}")
     t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
+    radius = check_radius(spectral_radius, solver)
     model = (_n_four_bar if problem.name.startswith("A02") else MODELS[problem.name])(problem)
     model.mbs.Assemble()
     result = run(
@@ -71,6 +73,7 @@ def solve_exudyn_mechanism(
         solver,
         store_every,
         time_limit,
+        radius,
         dependent_rows=problem.name.startswith(REDUNDANT),
     )
     if problem.name == bricard().name:

@@ -1,4 +1,10 @@
-"""What the Exudyn models share: sensors, a run with a fixed step, silence, statistics."""
+"""What the Exudyn models share: sensors, a run with a fixed step, silence, statistics.
+
+There is no line with error control. Of `adaptiveStep` of the implicit solvers Exudyn's documentation says "the step
+size may be reduced if step fails; no automatic stepsize control"; those with error control (`automaticStepSize`:
+DOPRI5, ODE23) are explicit and refuse joints: "explicit integrator detected object 2 which contains constraints that
+cannot be solved" (1.13.6).
+"""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -10,7 +16,7 @@ from exudyn.itemInterface import SensorNode
 from numpy.typing import NDArray
 
 from references.driver import TimeLimit, check_choice, check_time_limit, user_call
-from twoloop.checks import check_positive, check_size
+from twoloop.checks import check_number, check_positive, check_size
 from twoloop.result import Result, Statistics, Status
 
 Array = NDArray[np.float64]
@@ -41,6 +47,24 @@ def check_steps(
         raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
     check_choice("solver", solver, SOLVERS)
     return float(t_end), n_steps, store_every
+
+
+def check_radius(value: float | None, solver: str) -> float:
+    """The spectral radius of the generalized-alpha method; Exudyn's default for None."""
+    return check_option("spectral_radius", value, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
+
+
+def check_option(
+    name: str, value: float | None, default: float, span: tuple[float, float], owner: str, solver: str
+) -> float:
+    """The value of an option that belongs to one solver, checked."""
+    if value is None:
+        return default
+    if solver != owner:
+        raise ValueError(f"{name} belongs to solver={owner!r}; given {name}={value!r} with solver={solver!r}")
+    if not span[0] <= check_number(name, value) <= span[1]:
+        raise ValueError(f"{name} must be between {span[0]:g} and {span[1]:g}; given {value!r}")
+    return float(value)
 
 
 def add_sensors(mbs: Any, node: int) -> list[int]:

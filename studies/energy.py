@@ -17,7 +17,6 @@ from studies.energy_runs import (
     MOMENTA,
     NEWMARK,
     ONE,
-    PROJECTED,
     RADAU,
     SUN,
     SWITCHING,
@@ -26,7 +25,7 @@ from studies.energy_runs import (
     Variant,
 )
 from studies.render import number
-from studies.solvers import IDA_C, IRK, OWN_EXPLICIT
+from studies.solvers import CVODE_C, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.study import Series, Study, key
 from studies.tables import setting, unfinished
 
@@ -156,7 +155,7 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
     long = rows[(rows["case"] == SWITCHING) & (rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
     long = long.assign(error_q=long["energy"].abs(), floor=0.0, solver=long["name"])
-    drawn = (OWN_EXPLICIT, "Gauss12", IDA_C, PROJECTED, TRAPEZOIDAL, KEEPING, IRK)
+    drawn = (OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)
     long = long[long["solver"].isin(drawn) & ((long["solver"] != KEEPING) | long["h"].notna())]
     title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
     figure = figures.work_precision(long, drawn, title, "largest energy error over the run (J)")

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from references.casadi_integrators import solve_idas
+from references.diffrax_dopri8 import solve_diffrax
 from references.four_bar_minimal import MinimalFourBar
 from references.index1 import solve_index1
 from studies.bench import Case, Run, Solver
 from studies.energy_drift import drift, windows
 from studies.reference_motion import ReferenceMotion
-from studies.solvers import CATALOGUE, IDA_C, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.solvers import CATALOGUE, CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.plan import Method
@@ -31,6 +33,8 @@ GEOMETRIES: dict[str, dict[str, Any]] = {
 LONG, QUICK = 10_000.0, 75.0  # s
 FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
 TIME_LIMIT = 300.0  # CPU s
+MOST_STEPS = 10_000_000  # of solvers that count them and do not look at the clock
+NOT_QUICK = (DIFFRAX, IDAS)  # compile for seconds
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 SUN, GAUSS, RADAU, MIDPOINT = "Sun Radau IIB(3)", "Gauss(3)", "Radau IIA(3)", "implicit midpoint"
@@ -64,6 +68,8 @@ OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tigh
     OWN_EXPLICIT: (1e-6, 1e-8, 1e-10, 1e-12),
     "Gauss12": (1e-5, 1e-7),
     IDA_C: (1e-6, 1e-8, 1e-10),
+    **dict.fromkeys((HEYOKA, CVODE_C, DIFFRAX), (1e-6, 1e-8, 1e-10, 1e-12)),
+    IDAS: (1e-6, 1e-8, 1e-10),
     LSODA: (1e-10,),
     PROJECTED: (1e-7, 1e-9),
     ALPHA: (0.01,),
@@ -120,6 +126,11 @@ def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int
     return solve_index1(p.system, span, p.q0, p.v0, method, tol, tol, **options)
 
 
+def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> Result:
+    p, options = case.problem, {"time_limit": case.time_limit, "most_steps": MOST_STEPS}
+    return solve(p.system, (0.0, case.t_end), p.q0, p.v0, tol, tol, t_eval=np.append(0.0, case.instants), **options)
+
+
 def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
     from references.exudyn_four_bar import solve_exudyn
 
@@ -132,7 +143,9 @@ def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
 ADAPTERS: dict[str, Callable[[Case, float, int], Result]] = {  # that store states at the case's instants
     OWN_EXPLICIT: partial(_controlled, "DOP853"),
     "Gauss12": partial(_controlled, "Gauss12"),
-    IDA_C: CATALOGUE[IDA_C].run,
+    **{name: CATALOGUE[name].run for name in (IDA_C, HEYOKA, CVODE_C)},
+    DIFFRAX: partial(_long, solve_diffrax),
+    IDAS: partial(_long, solve_idas),
     LSODA: partial(_index1, "LSODA", "none"),
     PROJECTED: partial(_index1, "DOP853", "projection"),
     ALPHA: partial(_exudyn, "GeneralizedAlpha"),
@@ -153,6 +166,8 @@ def runs(quick: bool) -> Iterator[Run]:
     """All runs, the longest first so that no core waits at the end."""
     cases = {name: case_of(name, QUICK if quick else LONG) for name in GEOMETRIES}
     for name, values in OTHERS.items():
+        if quick and name in NOT_QUICK:
+            continue
         solver = replace(CATALOGUE[name], run=ADAPTERS[name])
         for value in reversed(values[:1] if quick else values):
             yield Run(cases[SWITCHING], solver, value, "other", 1)

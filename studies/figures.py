@@ -97,6 +97,8 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Radau, index 1": (PINK, "d"),
     "BDF, index 1": (YELLOW, "d"),
     "Exudyn, GeneralizedAlpha": (RED, "8"),
+    "Exudyn, GeneralizedAlpha 0.6": (ORANGE, "8"),
+    "Exudyn, GeneralizedAlpha 1": (BLACK, "8"),
     "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
 }
 SAME = {  # a tableau looks like the preset that is made of it

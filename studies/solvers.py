@@ -52,7 +52,8 @@ OWN = (
 )
 IDA_FORMS = ("index1", "stabilised")
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
-HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
+RADII = (1.0, 0.6)  # spectral radii of GeneralizedAlpha, besides Exudyn's default of 0.9
+HEYOKA, CVODE_C, DIFFRAX, IDAS = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax", "IDAS, CasADi"
 CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
 ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
@@ -61,9 +62,10 @@ GEAR_STARTS = ("accurate", "ramp")
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
     *(HEYOKA, CVODE_C, "CVODE from C, BDF", CVODE_C_PROJECTED, IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX),
-    *("IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
+    *(IDAS, "CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
     *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised"),
-    *("Radau, solve_dae", "Radau9, solve_dae", "Exudyn, GeneralizedAlpha"),
+    *("Radau, solve_dae", "Radau9, solve_dae"),
+    *("Exudyn, GeneralizedAlpha", *(f"Exudyn, GeneralizedAlpha {radius:g}" for radius in RADII)),
 )
 
 # in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
@@ -222,7 +224,7 @@ def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, 
 
     n_steps = round(case.t_end / step)
     more = {"store_every": max(1, n_steps // STORED), "time_limit": case.time_limit, **options}
-    if has_model(case.problem) and not options:
+    if has_model(case.problem):
         return solve_exudyn_mechanism(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
     if "L3" not in case.problem.parameters:  # of the four-bar linkage
         raise NotApplicable(
@@ -324,7 +326,7 @@ def _all() -> Iterator[Solver]:
     for solver in EXUDYN:
         keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
         yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **model)
-    for radius in (1.0, 0.6):
+    for radius in RADII:
         fixed = {"spectral_radius": radius}
         run = partial(_exudyn, "GeneralizedAlpha", fixed)
         yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **model)

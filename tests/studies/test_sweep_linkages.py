@@ -33,7 +33,7 @@ def made_up(**changes):
 
 
 def said(rows):
-    tables = {"scaling": ""}
+    tables = {"scaling": "", "many": ""}
     return render("sweep_linkages", study.findings_of(rows), tables, stamp="stamp", quick=False)
 
 

@@ -1,0 +1,75 @@
+"""Exudyn's spectral radius on every mechanism that has a model, and why there are no steps by error control."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("exudyn")
+
+import exudyn as exu
+
+from references import exudyn_run
+from references.exudyn_four_bar import _model, _positions
+from references.exudyn_mechanisms import MODELS, solve_exudyn_mechanism
+from studies import validation
+from studies.bench import Case
+from studies.solvers import CATALOGUE, RADII, RIVALS
+from twoloop.mechanisms import four_bar
+
+PROBLEMS = {problem.name: problem for problem in (make() for make in validation.MAKE)}
+TOP = PROBLEMS["heavy top"]
+
+
+def top_at(radius):
+    return solve_exudyn_mechanism(TOP, 0.2, 200, spectral_radius=radius)
+
+
+def test_the_radius_reaches_the_solver_and_the_default_is_exudyns():
+    default, same, other = top_at(None), top_at(exudyn_run.SPECTRAL_RADIUS), top_at(0.6)
+    assert default.success and other.success
+    np.testing.assert_array_equal(default.q, same.q)
+    assert 1e-12 < np.abs(default.q - other.q).max() < 1e-2
+
+
+def test_more_damping_is_less_accurate_and_of_order_two():
+    fine = solve_exudyn_mechanism(TOP, 0.2, 6400).q[:, -1]
+    errors = {
+        (radius, n): np.abs(solve_exudyn_mechanism(TOP, 0.2, n, spectral_radius=radius).q[:, -1] - fine).max()
+        for radius, n in ((0.9, 200), (0.3, 200), (0.3, 400))
+    }
+    assert errors[0.3, 200] > errors[0.9, 200]
+    assert 3.3 < errors[0.3, 200] / errors[0.3, 400] < 4.7
+
+
+@pytest.mark.parametrize("radius", [-0.1, 1.1])
+def test_a_radius_out_of_range_is_named(radius):
+    with pytest.raises(ValueError, match="spectral_radius must be between 0 and 1; given"):
+        top_at(radius)
+
+
+def test_the_radius_belongs_to_one_solver():
+    with pytest.raises(ValueError, match="spectral_radius belongs to solver='GeneralizedAlpha'"):
+        solve_exudyn_mechanism(TOP, 0.2, 200, "HHT", spectral_radius=0.6)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_runs_with_another_radius(name):
+    """It was refused where there is a model and an option."""
+    solver = CATALOGUE["Exudyn, GeneralizedAlpha 0.6"]
+    result = solver.run(Case(name, PROBLEMS[name], 0.02), 1e-3, 0)
+    assert result.success and result.t[-1] == pytest.approx(0.02)
+    assert np.abs(result.q[:, 0] - PROBLEMS[name].q0).max() < 1e-12
+
+
+def test_the_radii_are_among_the_rivals():
+    assert {f"Exudyn, GeneralizedAlpha {radius:g}" for radius in RADII} <= set(RIVALS)
+
+
+@pytest.mark.parametrize("name", ["DOPRI5", "ODE23"])
+def test_solvers_with_error_control_refuse_joints(name):
+    """When one of them no longer does, it belongs into the catalogue."""
+    problem = four_bar()
+    _container, mbs, _ = _model(problem, _positions(problem))
+    settings = exudyn_run._settings(0.1, 10, 1)
+    settings.timeIntegration.automaticStepSize = True
+    with exudyn_run._silence(), pytest.raises(exu.ModelError, match="constraints that cannot be solved"):
+        mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, name))
