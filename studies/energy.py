@@ -62,7 +62,7 @@ def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC,
 def told(row: pd.Series) -> dict[str, Any]:
     """A run as a finding."""
     found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
-    found |= {name: row[name] for name in ("verdict", "kinetic", "status")}
+    found |= {name: row[name] for name in ("verdict", "status")}
     found["label"] = f"{row['name']}, {setting(row)}"
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
     found |= {"calm": row["verdict"] in CALM, "drifts": row["verdict"] in (DRIFTS, SLOWLY)}
