@@ -375,6 +375,7 @@ def test_report_rows_and_findings(folder):
         row = rows[rows["claim"] == claim.key].iloc[0]
         assert row["verdict"].capitalize() in text and row["number"] in text and row["criterion"] == claim.criterion
     assert "nan" not in text and (folder / "errata.md").exists()
+    assert len(text.split()) < 1000
 
 
 def test_report_is_written_again_from_rows(folder):
