@@ -10,6 +10,7 @@ from studies.claims import experiments, findings_of, judge_of
 from studies.claims.rows import BEAMS, NotRun, Rows
 from studies.claims.verdicts import Judgement, Verdict, load, span_known
 from studies.render import render
+from studies.solvers import NEWMARK, QUARTER
 from twoloop import Result, paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -83,3 +84,21 @@ def test_a_span_leaves_out_what_is_not_known():
     assert span_known([math.nan, 2.0, 1.0]) == [1.0, 2.0]
     with pytest.raises(NotRun, match="no error"):
         span_known([math.nan])
+
+
+def test_newmark_is_compared_where_no_run_of_it_is_bad():
+    """On the stiffer beam stability bounds its steps, and all errors are below 1e-5."""
+    slow = {"very flexible": 1e-3, "moderately stiff": 5e-6}
+    rows = [
+        {"case": case, "solver": solver, "tol": 1e-1, "error_q": error, "call_s": 2.0}
+        for case, error in slow.items()
+        for solver, error in (("PaperIRK", 1e-9), (NEWMARK, error), (QUARTER, error))
+    ]
+    beam = pd.DataFrame(rows).assign(group="run", t_end=2.0, floor=0.0)
+    names = ("PaperIRK, Atol = Rtol varied", NEWMARK, QUARTER)
+    linkage = pd.DataFrame([{"solver": name, "error_q": e, "call_s": 1.0} for name in names for e in (0.2, 0.02)])
+    linkage = linkage.assign(problem=four_bar().name, t_end=100.0, floor=0.0, err_in=np.nan)
+    beam.loc[(beam["case"] == "moderately stiff") & (beam["solver"] != "PaperIRK"), "tol"] = 1e-3
+    claim = next(claim for claim in load() if claim.key == "more_efficient")
+    found = claim.judgement(judge_of(claim), Rows({"beam": beam, "table3": linkage.assign(tol=1e-3)}, {}))
+    assert found.verdict is not Verdict.NOT_RUN and found.values["stiff"] == [1.0, 1.0]
