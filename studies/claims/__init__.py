@@ -2,14 +2,14 @@
 
 import importlib
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from studies import cli
-from studies.claims import experiments, judges
+from studies.claims import beam_judges, experiments, judges
 from studies.claims.rows import STUDIES, Rows, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 from studies.cli import Call, StudyError
@@ -22,9 +22,15 @@ COLUMNS = ("section", "statement", "criterion", "fixed", "judge", "stand_in", "a
 Judged = Mapping[str, tuple[Claim, Judgement]]
 
 
+def judge_of(claim: Claim) -> Callable[..., Judgement]:
+    """The function that claims.toml names."""
+    found: Callable[..., Judgement] = (vars(judges) | vars(beam_judges))[claim.judge]
+    return found
+
+
 def judged(rows: Rows) -> dict[str, tuple[Claim, Judgement]]:
     """Every claim with its judgement."""
-    return {claim.key: (claim, claim.judgement(getattr(judges, claim.judge), rows)) for claim in load()}
+    return {claim.key: (claim, claim.judgement(judge_of(claim), rows)) for claim in load()}
 
 
 def findings_of(pairs: Judged) -> dict[str, Any]:
@@ -36,6 +42,7 @@ def findings_of(pairs: Judged) -> dict[str, Any]:
     verdicts = [found.verdict for _, found in pairs.values()]
     return {
         "n": len(pairs),
+        "after": sum(claim.fixed == "after" for claim, _ in pairs.values()),
         "counts": {verdict.value: verdicts.count(verdict) for verdict in Verdict},
         "claims": {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()},
         "circular": circular,

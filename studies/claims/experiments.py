@@ -1,17 +1,20 @@
 """Small runs behind the claims that no other study makes: single steps and runs of a second."""
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from references.four_bar_minimal import MinimalFourBar
-from references.paper_step import Step, advance, true_states
+from references.paper_step import Step, advance, independents, true_states
 from studies import end_states, validation
-from twoloop import ConstrainedSystem, ConstraintWarning, Result, paper_irk, solve_dae
-from twoloop.mechanisms import Problem, four_bar, knife_edge, rolling_disc
+from studies.beam.runs import without_tangent
+from studies.solvers import IMPLICIT
+from twoloop import ConstrainedSystem, ConstraintWarning, Result, RungeKutta, paper_irk, solve_dae
+from twoloop.mechanisms import Problem, four_bar, knife_edge, moderately_stiff_beam, rolling_disc, very_flexible_beam
 from twoloop.tableaux import sun_radau_iib
 
 Array = NDArray[np.float64]
@@ -22,6 +25,22 @@ SUN = sun_radau_iib(3)
 NEAR = 1e-3  # of the state known: 100 times the tolerance
 TIME_LIMIT = 60.0  # s of a published mechanism
 STEP = 0.06  # s, about the median step of the paper's procedure
+CLOSE = 1e-4  # m or rad, error at which the outer loops are compared
+BEAM_END, PARTS = 0.2, range(3, 14)  # s of a beam; 2^k fixed steps
+OUTER: tuple[Literal["fixed-point"], Literal["newton"]] = ("fixed-point", "newton")
+ORDERS = dict(zip(IMPLICIT, (5, 6, 12, 5, 9, 13, 2, 4, 2, 5), strict=True))
+STEPS = (4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128)  # a second
+FALLING = (1e-9, 1e-2)  # errors between which an order is seen
+ENOUGH = 0.9  # of the order
+HALF = 0.5  # of the steps: "most"
+PAIRS = 200  # of successive steps at which the choice of coordinates is compared
+GEOMETRIES = (  # lengths of the bars and of the ground, m: the assumed one, that of Table 3 beside it, and others
+    *((1.0, 2.0, 1.5, 3.0), (0.8, 1.2, 1.0, 2.0), (1.0, 1.2, 0.5, 1.0)),
+    *((2.0, 2.0, 1.0, 1.5), (2.0, 2.5, 1.0, 2.0), (1.0, 1.0, 0.5, 0.75)),
+)
+PASSES = 1e-3  # m above 0 from which y3 passes the line
+BETAS = (0.0, 0.25, 0.5)
+SWING, SWING_STEP, SWING_STEPS = (2.0, 0.0), 0.2, 100  # a pendulum's start (rad, rad/s), step (s) and steps
 
 
 def make(quick: bool) -> dict[str, float]:
@@ -29,7 +48,8 @@ def make(quick: bool) -> dict[str, float]:
     linkage = four_bar()
     states = true_states(linkage, 8 if quick else 40)
     found = local_error(linkage, states) | predictor(linkage, states) | values_alone(linkage)
-    return found | generality(validation.MAKE[:: 7 if quick else 1]) | nonholonomic()
+    found |= generality(validation.MAKE[:: 7 if quick else 1]) | nonholonomic()
+    return found | outer_loops() | orders() | passing(GEOMETRIES[: 1 if quick else None]) | newmark_areas()
 
 
 def local_error(problem: Problem, states: list[tuple[float, Array, Array]]) -> dict[str, float]:
@@ -99,9 +119,113 @@ def ended(problem: Problem) -> tuple[Result, float]:
 
 
 def generality(make: Sequence[Callable[[], Problem]]) -> dict[str, float]:
-    """How many of these mechanisms the paper's procedure brings to the state known."""
-    right = [result.success and error < NEAR for result, error in (ended(one()) for one in make)]
-    return {"mechanisms": float(len(right)), "mechanisms right": float(sum(right))}
+    """How many of these mechanisms the paper's procedure brings to the state known; where it keeps its coordinates."""
+    right, same = [], [repeated_choices(linkage := four_bar(), ended(linkage)[0])]
+    for problem in (one() for one in make):
+        result, error = ended(problem)
+        right.append(result.success and error < NEAR)
+        if problem.system.n_c and not problem.system.n_a and "redundant" not in problem.tags:
+            same.append(repeated_choices(problem, result))
+    found = {"mechanisms": float(len(right)), "mechanisms right": float(sum(right))}
+    found |= {"partitions seen": float(len(same)), "partitions mostly kept": float(sum(share > HALF for share in same))}
+    return found | {"partition kept, least": min(same), "partition kept, linkage": same[0]}
+
+
+def repeated_choices(problem: Problem, result: Result) -> float:
+    """Share of steps at which the decomposition of C_q picks out the independent coordinates of the step before."""
+    places = np.unique(np.linspace(0, result.t.size - 2, PAIRS).astype(int))
+    chosen = [
+        [independents(problem.system.jacobian(float(result.t[n]), result.q[:, n])) for n in (k, k + 1)] for k in places
+    ]
+    return float(np.mean([before == after for before, after in chosen]))
+
+
+def outer_loops() -> dict[str, float]:
+    """Evaluations of Newton's method, Jacobian by differences, over those of the fixed point: nothing else differs.
+
+    Both with Sun's tableau, at the least number of equal steps for an error of `CLOSE` in q at the end.
+    """
+    found = {}
+    known = (("linkage", four_bar(), 1.0), ("very flexible", very_flexible_beam(), BEAM_END))
+    for name, problem, t_end in (*known, ("moderately stiff", moderately_stiff_beam(), BEAM_END)):
+        start, least = (problem.q0, problem.v0), []
+        truth = solve_dae(problem.system, (0.0, t_end), *start, method="DOP853", rtol=LOOPS, atol=LOOPS).q[:, -1]
+        for outer in OUTER:
+            method, system = RungeKutta(SUN, outer, inner_tol=LOOPS, outer_tol=LOOPS), without_tangent(problem)
+            made = (solve_dae(system, (0.0, t_end), *start, method=method, step_size=t_end / 2**k) for k in PARTS)
+            good = (run for run in made if run.success and np.abs(run.q[:, -1] - truth).max() < CLOSE)
+            best = next(good, None)
+            if best is None:
+                raise RuntimeError(f"{outer} comes nowhere within {CLOSE:g} on the {name}")
+            least.append(best.stats.n_evaluations or 0)
+        found[f"Newton over fixed point, {name}"] = least[1] / least[0]
+    return found
+
+
+def orders() -> dict[str, float]:
+    """How many implicit methods reach nine tenths of their order, in fixed steps on a linkage of lasting partition."""
+    problem = four_bar((1.0, 1.2, 0.5), 1.0, math.pi, 1)
+    truth, reached = MinimalFourBar.from_parameters(problem.parameters), 0
+    for method, order in ORDERS.items():
+        seen: list[tuple[float, float]] = []
+        for n in STEPS:
+            result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method=method, step_size=1.0 / n)
+            q, v = truth.states(result.t)
+            error = float(np.abs(np.concatenate([result.q - q, result.v - v])).max())
+            if result.success and FALLING[0] < error < FALLING[1]:
+                seen.append((math.log(n), math.log(error)))
+        points = np.array(seen).T
+        reached += len(seen) > 1 and -float(np.polyfit(points[0], points[1], 1)[0]) > ENOUGH * order
+    return {"methods": float(len(ORDERS)), "methods of their order": float(reached)}
+
+
+def passing(geometries: Sequence[tuple[float, float, float, float]]) -> dict[str, float]:
+    """Of linkages released with bar 3 horizontal: how many pass y3 = 0, how far, and what their energy changes by."""
+    tops, changes = [], []
+    for *lengths, ground in geometries:
+        for theta3, branch in ((0.0, -1), (0.0, 1), (math.pi, -1), (math.pi, 1)):
+            try:
+                problem = four_bar((lengths[0], lengths[1], lengths[2]), ground, theta3, branch)
+            except ValueError:  # it cannot be assembled
+                continue
+            truth = MinimalFourBar.from_parameters(problem.parameters)
+            t = np.linspace(0.0, truth.period, 1000)
+            q, v = truth.states(t)
+            assert problem.energy is not None
+            tops.append(float(q[7].max()))
+            changes.append(float(np.ptp(problem.energy(t, q, v))))
+    found = {"linkages": float(len(tops)), "linkages passing": float(sum(top > PASSES for top in tops))}
+    return found | {"highest y3": max(tops), "energy change": max(changes)}
+
+
+def newmark_areas() -> dict[str, float]:
+    """Largest change of an area of states of a pendulum by Newmark's method: gamma = 1/2, any beta; gamma = 0.6.
+
+    Of the area in (q - beta h^2 q'', q'), which is what gamma = 1/2 keeps (C. Kane et al., Int. J. Numer. Methods Eng.
+    49 (2000) 1295-1325): that of the states themselves with beta = 0 only. The plain area is the latter, for the
+    paper's beta = 1/2.
+    """
+
+    def change(beta: float, gamma: float, plain: bool = False) -> float:
+        h, (q, v), worst = SWING_STEP, SWING, 0.0
+        tangent = np.eye(2)
+        scale = 0.0 if plain else beta * h * h
+        first = 1.0 + scale * math.cos(q)  # of d(q - beta h^2 q'')/dq, q'' = -sin q
+        for _ in range(SWING_STEPS):
+            a, slope, end = -math.sin(q), -math.cos(q), q
+            for _ in range(50):
+                end = q + h * v + h * h * ((0.5 - beta) * a - beta * math.sin(end))
+            end_slope = -math.cos(end)
+            ahead = np.array([1.0 + h * h * (0.5 - beta) * slope, h]) / (1.0 - h * h * beta * end_slope)
+            by_q = h * ((1.0 - gamma) * slope + gamma * end_slope * ahead[0])
+            tangent = np.array([ahead, [by_q, 1.0 + h * gamma * end_slope * ahead[1]]]) @ tangent
+            v += h * ((1.0 - gamma) * a - gamma * math.sin(end))
+            q = end
+            worst = max(worst, abs(float(np.linalg.det(tangent)) * (1.0 - scale * end_slope) / first - 1.0))
+        return worst
+
+    found = {"Newmark's area": max(change(beta, 0.5) for beta in BETAS), "Newmark's plain area": change(0.5, 0.5, True)}
+    return found | {"Newmark's area, gamma 0.6": change(0.25, 0.6)}
 
 
 def nonholonomic() -> dict[str, float]:

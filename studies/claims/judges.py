@@ -1,19 +1,31 @@
-"""The judges: functions from rows to a verdict and the numbers that decide, named in claims.toml, in its order."""
+"""The judges but those of the beams: from rows to a verdict and the numbers that decide; named in claims.toml."""
 
 import numpy as np
 import pandas as pd
 
 from studies import ablation
-from studies.claims.rows import DEFAULT, LONG, NotRun, Rows, common_costs
-from studies.claims.verdicts import Judgement, decide, span
-from studies.metrics import ASTRAY
-from studies.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, PAPER_TOL, QUARTER, gear
+from studies.claims.beam_judges import FOLLOWS, TIPS
+from studies.claims.experiments import PASSES
+from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
+from studies.claims.verdicts import Judgement, decide, span, span_known
+from studies.metrics import ASTRAY, LOST
+from studies.solvers import (
+    ADAMS,
+    GEAR_ORDERS,
+    IDA_C,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    OWN_BDF,
+    OWN_EXPLICIT,
+    QUARTER,
+    TAYLOR,
+    gear,
+)
 from studies.table3_causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells
-from studies.tables import time_for
 
 IRK_GROUP, NEWMARK_GROUP, GSTIFF_GROUP = "Table 3: IRK", "Table 3: Newmark", "GSTIFF stand-in"
 COARSEST, FINEST = TOLERANCES[0], TOLERANCES[-1]
-BEAMS = ("very flexible", "moderately stiff")
 
 GROWTH = 10.0  # of the violation from the first tenth of a run to its last: it drifts
 SATISFIED = 1e-12  # violation that counts as rounding
@@ -21,23 +33,19 @@ GROWS, TIMES = 0.25, 2.0  # a violation grows if it goes as t^p with a greater p
 DEARER = 1.2  # times the cost: beyond the noise of times
 FACTOR = 2.0  # within which an estimate, or a limit, counts as the same
 NEEDLESS = 0.1  # share of steps given up, or of work, that counts as little
-STIFFER = 10.0  # times w_max of the very flexible beam, whose modulus is a hundredth
 RESOLVED = 3.0  # standard errors from which a slope counts as a drift
 EPS = float(np.finfo(float).eps)
 AGREE = 1e-10  # m or rad
-PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it
 VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
 STEP = 0.02  # s
 MAIN = 2.0  # times a logarithm must exceed another for its tolerance to be the one that governs
 CHANGE = 1.1  # times the steps: a tolerance affects them
 PRINTED_RATIO = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]  # 50.93 s over 3.60 s
-SECONDS = (56.27, 6278.54)  # s of the beams, printed
-HALF_A_DECADE = 10.0**0.5
-FOLLOWS = 1e-3  # m, of the tip over the run
-A_LOT = 5.0  # times; the frequencies grow by 10
-TIP = 1e-4  # m, tip error at which methods are compared on the beams
-TIPS = (1e-2, 1e-3, 1e-4)  # m or rad, errors over the run at which costs are compared: tip, or the linkage
 TARGETS = (1e-1, *TIPS)
+FINER = (*TIPS, 1e-5, 1e-6)  # m, on the stiffer beam no run of Newmark's method is much worse
+# of the linkage's solvers: all coordinates integrated and put onto the constraints, and independent ones alone
+PROJECTING = ("IDA, stabilised", IDA_C, "DOP853, projected", OWN_EXPLICIT, ADAMS, TAYLOR)
+STATE_SPACE = (IRK_LINE, NEWMARK, QUARTER, "SunRadau5", "Gauss6", "Gauss12", OWN_BDF)
 ERRORS = (0.3, 0.1, 0.03, 0.01)  # the same for Newmark's method on the linkage, which reaches no less
 
 
@@ -67,13 +75,20 @@ def projection_exact(rows: Rows) -> Judgement:
     return decide((each < SATISFIED for each in worst.values()), **worst)
 
 
+def _cheapest(rows: Rows, solvers: tuple[str, ...], what: str) -> list[float]:
+    """Least costs of any of these solvers on the linkage, at each of `TARGETS`; NaN where none has the error."""
+    runs = rows.long("table3", solver=solvers, group="comparison", problem=DEFAULT)
+    return [cheapest(runs, target, what) for target in TARGETS]
+
+
 def projection_inefficient(rows: Rows) -> Judgement:
-    ratios: list[float] = []
-    for names in (("IDA, stabilised", "IDA, index1"), ("DOP853, projected", "DOP853, index 1")):
-        with_it, without = (rows.long("table3", solver=name, problem=DEFAULT) for name in names)
+    spans = {}
+    for key, solvers in (("paper", (IRK_LINE,)), ("best", STATE_SPACE)):
+        found: list[float] = []
         for what in ("n_evaluations", "call_s"):
-            ratios += common_costs(with_it, without, TARGETS, what)
-    return decide((ratio > DEARER for ratio in ratios), ratio=span(ratios))
+            found += (np.array(_cheapest(rows, PROJECTING, what)) / _cheapest(rows, solvers, what)).tolist()
+        spans[key] = span_known(found)
+    return decide((least > DEARER for least, _ in spans.values()), **spans)
 
 
 def every_stage(rows: Rows) -> Judgement:
@@ -86,12 +101,6 @@ def every_stage(rows: Rows) -> Judgement:
     return decide((least > DEARER for least, _ in spans.values()), **spans)
 
 
-def jacobian_difficult(rows: Rows) -> Judgement:
-    soft, stiff = ([time_for(rows.beam(case, name), TIP) for name in ("differences", IRK)] for case in BEAMS)
-    values = {"stiff": stiff[0], "stiff_paper": stiff[1], "soft": soft[0], "soft_paper": soft[1]}
-    return decide((newton > paper for newton, paper in (soft, stiff)), **values)
-
-
 def constraints_kept(rows: Rows) -> Judgement:
     run = rows.long("violation", solver=IRK, group="line-up").iloc[0]
     worst = max(float(run[f"violation_{level}"]) for level in "qva")
@@ -100,30 +109,48 @@ def constraints_kept(rows: Rows) -> Judgement:
     return decide([worst < SATISFIED and not grows], levels=worst, loosest=loosest)
 
 
-def stiff_applicable(rows: Rows) -> Judgement:
-    limit = rows.pick("beam", named="latest stages", group="limit").iloc[0]
-    steps = [float(_paper_on(rows, case)["h_median"]) for case in BEAMS]
-    h_omega = [steps[0] * limit["w_max"], steps[1] * limit["w_max"] * STIFFER]
-    limited = max(h_omega) < limit["theory"] and max(h_omega) < FACTOR * min(h_omega)  # h goes as 1 / w_max
-    return decide([not limited], h_omega=span(h_omega), limit=float(limit["theory"]))
+def _steady(runs: pd.DataFrame) -> pd.Series:
+    """Which runs reach their end without drift of the energy: no slope beyond its error, or rounding."""
+    rounding = EPS * runs["kinetic"] * runs["n_steps"] / runs["t_end"]
+    steady = runs["slope"].abs() <= np.maximum(RESOLVED * runs["slope_error"], rounding)
+    return steady & (runs["status"] == "REACHED_END") & ~runs["lost"]
 
 
 def symplectic_stable(rows: Rows) -> Judgement:
+    """In part: it does not lose the energy, yet drifts, so that this has another reason."""
     runs = rows.pick("energy", 10.0 * LONG, solver=("Sun Radau IIB(3)", IRK), partition="lasting")
     runs = runs[runs["t_end"] == runs["t_end"].max()]
-    rounding = EPS * runs["kinetic"] * runs["n_steps"] / runs["t_end"]
-    steady = runs["slope"].abs() <= np.maximum(RESOLVED * runs["slope_error"], rounding)
-    drifts = (runs["status"] != "REACHED_END") | ~steady
+    drifts = ~_steady(runs)
     own, canonical = runs["variables"] == "velocities", (runs["variables"] == "momenta") & runs["h"].notna()
-    change = float((runs["slope"].abs() * runs["t_end"])[own].max())
-    steady_on_momenta, t_end = int((~drifts[canonical]).sum()), float(runs["t_end"].max())
-    values = {"drifting": int(drifts[own].sum()), "runs": int(own.sum()), "change": change, "t_end": t_end}
-    return decide([not drifts[own].any()], steady_on_momenta=steady_on_momenta, **values)
+    change = (runs["slope"].abs() * runs["t_end"])[own]
+    share, least = 100.0 * float((change / runs["kinetic"][own]).max()), change.idxmin()
+    stable = share < 100.0 * LOST and not runs["lost"][own].any() and (runs["status"][own] == "REACHED_END").all()
+    values = {"drifting": int(drifts[own].sum()), "runs": int(own.sum()), "share": share}
+    values |= {"least": float(change[least]), "kinetic": float(runs["kinetic"][least])}
+    values |= {"steady_on_momenta": int((~drifts[canonical]).sum()), "t_end": float(runs["t_end"].max())}
+    return decide([stable, not drifts[own].any()], stable, **values)
+
+
+def newmark_symplectic(rows: Rows) -> Judgement:
+    area, plain, other = (rows.number(f"Newmark's {key}") for key in ("area", "plain area", "area, gamma 0.6"))
+    runs = rows.pick("energy", 10.0 * LONG, named="Newmark", partition="lasting")
+    kept, values = int(_steady(runs).sum()), {"plain": 100.0 * plain, "other": 100.0 * other, "runs": len(runs)}
+    return decide([area < SATISFIED, other > SATISFIED, kept], False, area=area, kept=kept, **values)
 
 
 def euler_predictor(rows: Rows) -> Judgement:
+    """No limit is set: in part, if the other prediction saves anything."""
     euler, continued = rows.number("iterations from Euler"), rows.number("iterations from the step before")
-    return decide([continued > (1.0 - NEEDLESS) * euler], euler=euler, continued=continued)
+    saved = 100.0 * (1.0 - continued / euler)
+    return decide([saved <= 0.0], True, euler=euler, continued=continued, saved=saved)
+
+
+def partition_kept(rows: Rows) -> Judgement:
+    least, linkage = (100.0 * rows.number(f"partition kept, {key}") for key in ("least", "linkage"))
+    mechanisms, most = (int(rows.number(f"partitions {key}")) for key in ("seen", "mostly kept"))
+    return decide(
+        [most == mechanisms], most > mechanisms / 2, least=least, linkage=linkage, most=most, mechanisms=mechanisms
+    )
 
 
 def dependents_in_the_loop(rows: Rows) -> Judgement:
@@ -145,17 +172,17 @@ def difference_is_the_error(rows: Rows) -> Judgement:
     return decide([1.0 / FACTOR < ratio < FACTOR], ratio=ratio)
 
 
-def limit_reset_34(rows: Rows) -> Judgement:
-    runs = pd.concat([rows.beam(case, IRK) for case in BEAMS])
-    share = 100.0 * runs["n_rejected_convergence"] / (runs["n_steps"] + runs["n_rejected"])
-    return decide(share < 100.0 * NEEDLESS, share=span(share))
-
-
 def agree_and_reach(rows: Rows) -> Judgement:
     runs = rows.long("motion", solver=(IRK, NEWMARK), group="line-up")
     met = (runs["error_y3_short"] < VISIBLE).all() & (runs["top"] < PASSES) & (runs["top_late"] > -PASSES)
     late, top, short = 1e3 * runs["top_late"].min(), 1e3 * runs["top"].max(), runs["error_y3_short"].max()
     return decide(met, short=short, late=late, top=top)
+
+
+def energy_bounds_y3(rows: Rows) -> Judgement:
+    passing, linkages = (int(rows.number(key)) for key in ("linkages passing", "linkages"))
+    top, change = rows.number("highest y3"), rows.number("energy change")
+    return decide([passing == 0], False, passing=passing, linkages=linkages, top=top, change=change)
 
 
 def gstiff(rows: Rows, part: str) -> Judgement:
@@ -267,7 +294,7 @@ def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
                 one, other, tuple(e for e in ERRORS if e < one["error_q"].max()), "call_s"
             )
         for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
-            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), TIPS, "call_s")
+            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), FINER, "call_s")
     return ratios
 
 
@@ -291,40 +318,6 @@ def because_of_order(rows: Rows) -> Judgement:
     return decide([*near, least, *won], least and any(won), won=sum(won), cases=len(won), **found)
 
 
-def implicit_needed(rows: Rows) -> Judgement:
-    names = ("DOP853, projected", "DOP853 (two-loop)", IRK)
-    costs = np.array([[time_for(rows.beam(case, name), TIP, "n_evaluations") for name in names] for case in BEAMS])
-    ratios = costs[:, :2].min(axis=1) / costs[:, 2]
-    return decide(ratios > 1.0, ratio=span(ratios))
-
-
-def _paper_on(rows: Rows, case: str) -> pd.Series:
-    return rows.beam(case, IRK, tol=PAPER_TOL).iloc[0]
-
-
-def step_order(rows: Rows, case: str, order: float) -> Judgement:
-    run = _paper_on(rows, case)
-    met = order / HALF_A_DECADE <= run["h_median"] <= order * HALF_A_DECADE
-    return decide([met], median=float(run["h_median"]))
-
-
-def beams_work(rows: Rows) -> Judgement:
-    runs = [_paper_on(rows, case) for case in BEAMS]
-    good = (run["status"] == "REACHED_END" and run["error_q"] < FOLLOWS for run in runs)
-    return decide(good, soft=float(runs[0]["error_q"]), stiff=float(runs[1]["error_q"]))
-
-
-def grows_a_lot(rows: Rows) -> Judgement:
-    soft, stiff = (_paper_on(rows, case) for case in BEAMS)
-    time, evaluations = (float(stiff[what] / soft[what]) for what in ("call_s", "n_evaluations"))
-    return decide([min(time, evaluations) >= A_LOT], time=time)
-
-
-def beam_seconds(rows: Rows) -> Judgement:
-    over = [seconds / float(_paper_on(rows, case)["call_s"]) for seconds, case in zip(SECONDS, BEAMS, strict=True)]
-    return decide([max(over) <= FLAT * min(over)], soft=over[0], stiff=over[1])
-
-
 def values_alone(rows: Rows) -> Judgement:
     worst, given, differenced = (rows.number(key) for key in ("difference", "calls given", "calls differenced"))
     met = [worst < AGREE, differenced <= given]
@@ -332,10 +325,8 @@ def values_alone(rows: Rows) -> Judgement:
 
 
 def any_method(rows: Rows) -> Judgement:
-    line_up = rows.pick("motion", solver=IMPLICIT, group="line-up")[["solver", "status"]]
-    others = rows.pick("energy", variables="velocities", partition="lasting")[["solver", "status"]]
-    reached = pd.concat([line_up, others]).groupby("solver")["status"].agg(lambda each: "REACHED_END" in set(each))
-    return decide(reached, reached=int(reached.sum()), methods=len(reached))
+    reached, methods = (int(rows.number(key)) for key in ("methods of their order", "methods"))
+    return decide([reached == methods], reached > 0, reached=reached, methods=methods)
 
 
 def general(rows: Rows) -> Judgement:

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from studies import tables
+from studies.cases.beam import SOFT, STIFF
 from studies.cli import StudyError
 from twoloop.mechanisms import four_bar
 
@@ -17,6 +18,7 @@ STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam", "abla
 DEFAULT = four_bar().name
 LONG = 100.0  # s, the length of the paper's runs
 BEAM_END = 2.0  # s, of a full run of the beams
+BEAMS = (SOFT, STIFF)
 
 
 class NotRun(Exception):
@@ -106,3 +108,9 @@ def common_costs(one: pd.DataFrame, other: pd.DataFrame, targets: tuple[float, .
     if not ratios:
         raise NotRun(f"{one['solver'].iloc[0]} and {other['solver'].iloc[0]} have no error in common")
     return ratios
+
+
+def cheapest(runs: pd.DataFrame, target: float, what: str) -> float:
+    """Least cost of any solver at an error; NaN where none has it."""
+    costs = [tables.time_for(own, target, what) for _, own in runs.groupby("solver")]
+    return min((cost for cost in costs if np.isfinite(cost)), default=float("nan"))

@@ -50,6 +50,14 @@ def span(values: Iterable[Any]) -> list[float]:
     return [float(array.min()), float(array.max())]
 
 
+def span_known(ratios: Iterable[float]) -> list[float]:
+    """Least and largest of those that are known."""
+    known = [ratio for ratio in ratios if np.isfinite(ratio)]
+    if not known:
+        raise NotRun("no error that both sides reach")
+    return span(known)
+
+
 @dataclass(frozen=True)
 class Claim:
     """A claim of the paper, as `claims.toml` has it; that file says what its keys mean."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853, RK45
 
+from references.four_bar_minimal import MinimalFourBar
 from references.paper_step import Step, choice, independents, kkt, true_states
 from studies.claims import ERRATA
 from studies.render import render
@@ -81,6 +82,22 @@ def test_closure():
     sine = lengths @ np.sin(angles)
     printed = sine + lengths[2] * (np.cos(angles[2]) - np.sin(angles[2]))
     assert np.abs(sine).max() < 1e-12 and np.abs(printed).max() > 0.1
+
+
+def test_energy_at_y3_of_0():
+    """The other assembly of the same linkage passes 0 with what bars 1 and 2 have lost since the start."""
+    problem = four_bar(branch=1)
+    truth = MinimalFourBar.from_parameters(problem.parameters)
+    t = np.linspace(0.0, truth.period, 4001)
+    q, v = truth.states(t)
+    assert problem.energy is not None
+    k = np.flatnonzero((q[7, 1:-1] < 0.0) & (q[7, 2:] >= 0.0))[0] + 1  # before it passes
+    share = -q[7, k] / (q[7, k + 1] - q[7, k])
+    kinetic = problem.energy(0.0, q, v) - problem.energy(0.0, q, 0.0 * v)
+    lengths = np.array([problem.parameters[name] for name in ("L1", "L2")])
+    lost = 9.81 * lengths @ (q[[1, 4], :1] - q[[1, 4]])
+    at_0 = [x[k] + share * (x[k + 1] - x[k]) for x in (kinetic, lost)]
+    assert q[7].max() > 0.1 and at_0[0] > 1.0 and at_0[0] == pytest.approx(at_0[1], rel=1e-3)
 
 
 def test_gamma():
