@@ -24,6 +24,7 @@ from studies import (
     headline,
     limit,
     minimal,
+    processors,
     rivals,
     scaling,
     study,
@@ -214,6 +215,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"fitted": scaling.FITTED, "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
     in_angles = part(rows, minimal.GROUP)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
+    findings["processors"] = [] if output.call.quick else processors.kept(output, rows)
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)
     text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
