@@ -24,7 +24,7 @@ PLACE = ["case", "error", "who"]
 
 
 def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """Who is ahead at each error on each mechanism, by the time of the call and by that inside; `rows`: all of a run."""
+    """Who is ahead at each error on each mechanism, by the time of the call and by that inside; `rows`: of all runs."""
     rows = rows[rows["group"] == rivals.GROUP]
     lines = []
     for time, column in TIMES.items():
@@ -53,7 +53,7 @@ def kept(output: Output, rows: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """For each two processors: how many pairs both have, by which time, and where ahead on one is behind on the other."""
+    """For each two processors: how many pairs both have, by which time, and where ahead turns to behind."""
     found = []
     for one, other in combinations(dict.fromkeys(table["processor"]), 2):
         for time in TIMES:
