@@ -10,6 +10,7 @@ from typing import Any
 from studies.cli import StudyError
 from studies.render import number, power, render
 from studies.store import TIMED, WHOLE_CALL, Output
+from studies.takes import takes
 
 # claims and compare_page read the others' rows
 STUDIES = (
@@ -143,7 +144,8 @@ def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
 def _render(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
     default = found["work_precision"]["default"] if "work_precision" in found else ""
     entries = classes(found)
-    more |= {"classes": entries, "advice": advice(entries), "cases": cases_of(found), "default": default}
+    groups = advice(entries)
+    more |= {"classes": entries, "cases": cases_of(found), "default": default, "takes": takes(found, groups)}
     return render(template, found, {}, **more)
 
 
@@ -164,7 +166,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     more["n_errors"] = sum(len(entry["at"]) for entry in entries)
     more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
     more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]
-    return _render("index", found, quick=quick, **more)
+    return _render("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
 
 
 def write_index(output: Output) -> None:
@@ -179,4 +181,5 @@ def put_in_readme(folder: Path, readme: Path) -> None:
         raise StudyError(f"there is no work_precision.json in {folder}; run python -m studies.work_precision")
     begin, end = "<!-- generated: begin -->\n", "<!-- generated: end -->"
     before, rest = readme.read_text().split(begin, 1)
-    readme.write_text(f"{before}{begin}{_render('readme', found)}{end}{rest.split(end, 1)[1]}")
+    text = _render("readme", found, docs="docs/", reports="reports", every=False)
+    readme.write_text(f"{before}{begin}{text}{end}{rest.split(end, 1)[1]}")
