@@ -37,7 +37,7 @@ def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 
 
 def asked(rivals: pd.DataFrame, error: float) -> bool:
-    """Whether any rival was put to a case and misses an error with all that it can; a refusal is that of our adapter."""
+    """Whether any rival was put to a case (a refusal is our adapter's) and misses an error with all that it can."""
     put = rivals[~rivals["status"].isin((*NOTHING_RUN, "RAISED"))]
     return any(tables.missed(own, error) for _, own in put.groupby("solver"))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.cli import StudyError
+from studies.headline import BEST
 from studies.render import number, power, render
 from studies.store import TIMED, WHOLE_CALL, Output
 from studies.takes import takes
@@ -106,11 +107,14 @@ def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         if runs:
             which = min(runs)[1]
             best, other = line[which], line["others" if which == "ours" else "ours"]
-            new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours"}
+            new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours", "asked": True}
             pick = made.setdefault(best["solver"], new | {"accuracies": [], "call_s": [], "over": []})
             pick["accuracies"].append(line["accuracy"])
             pick["call_s"].append(best["call_s"])
             pick["over"] += [other["call_s"] / best["call_s"]] if other else []
+            # of no other time is known: none gets there only if one was asked for as much
+            alone = line.get("standing") is None or line["standing"][BEST]["verdict"] == "alone"
+            pick["asked"] = pick["asked"] and (other is not None or alone)
     return list(made.values())
 
 
@@ -174,6 +178,11 @@ def write_index(output: Output) -> None:
     output.write("README.md", first_screen(output.path, output.call.quick))
 
 
+def readme_block(found: dict[str, dict[str, Any]]) -> str:
+    """The generated piece of the project's README."""
+    return _render("readme", found, docs="docs/", reports="reports", every=False)
+
+
 def put_in_readme(folder: Path, readme: Path) -> None:
     """Write the generated piece of the project's README, between its two marks, from the findings in a folder."""
     found = findings(folder)
@@ -181,5 +190,4 @@ def put_in_readme(folder: Path, readme: Path) -> None:
         raise StudyError(f"there is no work_precision.json in {folder}; run python -m studies.work_precision")
     begin, end = "<!-- generated: begin -->\n", "<!-- generated: end -->"
     before, rest = readme.read_text().split(begin, 1)
-    text = _render("readme", found, docs="docs/", reports="reports", every=False)
-    readme.write_text(f"{before}{begin}{text}{end}{rest.split(end, 1)[1]}")
+    readme.write_text(f"{before}{begin}{readme_block(found)}{end}{rest.split(end, 1)[1]}")

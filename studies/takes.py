@@ -23,26 +23,28 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         what = f"{group[0]['class']} ({'; '.join(entry['name'] for entry in group)})"
         picks = [f"{call(pick['solver'])} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]]
         rows.append({"what": what, "take": "; ".join(picks) or "no solver compared reaches these errors"})
-    mechanisms = found.get("work_precision", {}).get("rivals", {}).get("mechanisms", [])
-    return rows + [row for kind in KINDS if (row := _of_kind(kind, mechanisms))]
+    return rows + _of_kinds(found.get("work_precision", {}).get("rivals", {}).get("mechanisms", []))
 
 
-def _of_kind(kind: str, mechanisms: Sequence[Mapping[str, Any]]) -> dict[str, str] | None:
-    """Who is the cheapest of all over mechanisms of a kind and decades of error, in most; None: there are none."""
-    these = [each for each in mechanisms if kind in each.get("tags", ())]
-    cheapest: Counter[str] = Counter()
-    for at in (at for each in these for at in each["at"]):
-        runs = [(run["call_s"], run["solver"]) for run in (at["ours"], at["others"]) if run]
-        cheapest.update(name for _, name in sorted(runs)[:1])
-    if not cheapest:
-        return None
-    solver, n = cheapest.most_common(1)[0]
-    of_all = f"in {n} of {cheapest.total()} pairs of mechanism and error"
-    if 2 * n > cheapest.total():
-        said = f"{call(solver)}, the cheapest {of_all}"
-    else:
-        said = f"the default: no solver is the cheapest in most, {call(solver)} {of_all}"
-    return {"what": f"{KINDS[kind]} ({len(these)} mechanism{'s' if len(these) > 1 else ''})", "take": said}
+def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Of each kind who is the cheapest in most pairs of mechanism and error; kinds with none such are told together."""
+    rows, undecided = [], []
+    for kind, words in KINDS.items():
+        these = [each for each in mechanisms if kind in each.get("tags", ())]
+        cheapest: Counter[str] = Counter()
+        for at in (at for each in these for at in each["at"]):
+            runs = [(run["call_s"], run["solver"]) for run in (at["ours"], at["others"]) if run]
+            cheapest.update(name for _, name in sorted(runs)[:1])
+        solver, n = cheapest.most_common(1)[0] if cheapest else ("", 0)
+        if 2 * n > cheapest.total():
+            said = f"{call(solver)}, the cheapest in {n} of {cheapest.total()} pairs of mechanism and error"
+            rows.append({"what": words, "take": said})
+        elif cheapest:
+            undecided.append(words)
+    if undecided:
+        said = "the default: no solver is the cheapest in most pairs of mechanism and error"
+        rows.append({"what": "; ".join(undecided), "take": said})
+    return rows
 
 
 def call(solver: str) -> str:

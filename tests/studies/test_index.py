@@ -170,16 +170,17 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     }
     text = front(tmp_path, [case()], honesty=honesty)
     assert "under 15 kinds of sharp everyday forces" in text and "on 2 mechanisms, and on 20 other traps" in text
-    assert "| the default | the compiled default | our other methods | other projects' solvers |\n" in text
-    assert "\n| 0 of 50 | 3 of 50 | 5 of 50 | 7 of 50 |\n" in text
+    assert (
+        "0 of 50 runs of the default, 3 of 50 of the compiled default, 5 of 50 of our other methods and 7 of 50" in text
+    )
     assert "step over" not in text and "random mechanisms under such forces" not in text
     trust["default"] |= {"unasked": 2}
     sharp = {"n": 3000, "wrong and silent": 4}
     text = front(
         tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
     )
-    assert "\n2 more runs of the default step over a force of 1 ms. Of 3000 runs of random" in text
-    assert "under such forces, by every preset, 4 end wrong in this way" in text
+    assert ". 2 more runs of the default step over a force of 1 ms. Of 3000 runs of random mechanisms" in text
+    assert "under such forces, by every preset, 4 are wrong in this way" in text
     assert "**Trust**" not in front(tmp_path, [case()])
 
 
