@@ -52,6 +52,14 @@ def test_a_failing_study_is_named_and_the_others_run(monkeypatch, capsys):
     assert "broken on purpose" in capsys.readouterr().err
 
 
+def test_the_block_of_the_readme_is_written_by_its_name(monkeypatch):
+    written = []
+    monkeypatch.setattr(command, "put_in_readme", lambda folder, readme: written.append((folder.name, readme.name)))
+    monkeypatch.setattr(sys, "argv", ["studies", "readme"])
+    command.main()
+    assert written == [("reports", "README.md")]
+
+
 def test_one_study_runs_by_its_name(monkeypatch):
     ran = []
     monkeypatch.setattr(command.importlib, "import_module", lambda name: type("S", (), {"main": ran.append}))
