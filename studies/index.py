@@ -187,9 +187,8 @@ def put_in_readme(folder: Path, readme: Path) -> None:
     """Write the generated piece of the project's README, between its two marks, from the findings in a folder."""
     found = findings(folder)
     if "work_precision" not in found:
-        raise StudyError(
-            f"there is no work_precision.json in {folder} with times of the whole call; run python -m studies.work_precision"
-        )
+        lacks = f"there is no work_precision.json in {folder} with times of the whole call"
+        raise StudyError(f"{lacks}; run python -m studies.work_precision")
     begin, end = "<!-- generated: begin -->\n", "<!-- generated: end -->"
     before, rest = readme.read_text().split(begin, 1)
     readme.write_text(f"{before}{begin}{readme_block(found)}{end}{rest.split(end, 1)[1]}")
