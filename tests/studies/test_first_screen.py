@@ -14,6 +14,8 @@ from studies.bench import Case
 from studies.render import number, render
 from studies.takes import takes
 from tests.studies.test_index import energy
+from tests.studies.test_table3 import found_of
+from tests.studies.test_table3 import rows as rows_of_table3
 from twoloop.mechanisms import bricard, four_bar
 
 ROOT = Path(__file__).parents[2]
@@ -266,3 +268,11 @@ def test_no_other_gets_there_is_said_where_one_was_asked(verdict, said):
     entries = index.classes({"work_precision": found})
     text = render("advice", {}, {}, advice=index.advice(entries), cases=[], default="auto")
     assert said in text
+
+
+def test_the_report_on_table_3_has_the_same_sentence(tmp_path):
+    made = rows_of_table3().replace({"solver": {"Gauss12": "Taylor"}})
+    ratios = found_of(tmp_path, made)["explicit"]["over"]
+    text = (tmp_path / "table3.md").read_text()
+    assert "\n- `DOP853`, `Taylor`, `Adams` are explicit: " in text
+    assert min(ratios) > 1.0 and "faster at every error" in text and f"takes {number(min(ratios))}" in text
