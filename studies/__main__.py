@@ -4,16 +4,19 @@ import importlib
 import sys
 import traceback
 
+from studies import cli
 from studies.cli import REPORTS, ROOT
 from studies.index import STUDIES, put_in_readme
 
-USAGE = "usage: python -m studies [NAME | all | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
+USAGE = "usage: python -m studies [NAME | all | readme | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 
 
 def main() -> None:
     name, *words = sys.argv[1:] or [""]
     if name == "all":
         run_all(words)
+    elif name == "readme":  # its generated block alone, from the findings of all studies
+        cli.main(lambda words: put_in_readme(REPORTS, ROOT / "README.md"), words)
     elif name in (*STUDIES, "compare"):
         importlib.import_module(f"studies.{name}").main(words)
     elif name and name not in ("-h", "--help"):

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from studies.cli import StudyError
+from studies.headline import BEST
 from studies.render import number, power, render
 from studies.store import TIMED, WHOLE_CALL, Output
+from studies.takes import takes
 
 # claims and compare_page read the others' rows
 STUDIES = (
@@ -105,11 +107,14 @@ def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         if runs:
             which = min(runs)[1]
             best, other = line[which], line["others" if which == "ours" else "ours"]
-            new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours"}
+            new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours", "asked": True}
             pick = made.setdefault(best["solver"], new | {"accuracies": [], "call_s": [], "over": []})
             pick["accuracies"].append(line["accuracy"])
             pick["call_s"].append(best["call_s"])
             pick["over"] += [other["call_s"] / best["call_s"]] if other else []
+            # of no other time is known: none gets there only if one was asked for as much
+            alone = line.get("standing") is None or line["standing"][BEST]["verdict"] == "alone"
+            pick["asked"] = pick["asked"] and (other is not None or alone)
     return list(made.values())
 
 
@@ -143,7 +148,8 @@ def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
 def _render(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
     default = found["work_precision"]["default"] if "work_precision" in found else ""
     entries = classes(found)
-    more |= {"classes": entries, "advice": advice(entries), "cases": cases_of(found), "default": default}
+    groups = advice(entries)
+    more |= {"classes": entries, "cases": cases_of(found), "default": default, "takes": takes(found, groups)}
     return render(template, found, {}, **more)
 
 
@@ -164,7 +170,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     more["n_errors"] = sum(len(entry["at"]) for entry in entries)
     more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
     more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]
-    return _render("index", found, quick=quick, **more)
+    return _render("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
 
 
 def write_index(output: Output) -> None:
@@ -172,11 +178,17 @@ def write_index(output: Output) -> None:
     output.write("README.md", first_screen(output.path, output.call.quick))
 
 
+def readme_block(found: dict[str, dict[str, Any]]) -> str:
+    """The generated piece of the project's README."""
+    return _render("readme", found, docs="docs/", reports="reports", every=False)
+
+
 def put_in_readme(folder: Path, readme: Path) -> None:
     """Write the generated piece of the project's README, between its two marks, from the findings in a folder."""
     found = findings(folder)
     if "work_precision" not in found:
-        raise StudyError(f"there is no work_precision.json in {folder}; run python -m studies.work_precision")
+        lacks = f"there is no work_precision.json in {folder} with times of the whole call"
+        raise StudyError(f"{lacks}; run python -m studies.work_precision")
     begin, end = "<!-- generated: begin -->\n", "<!-- generated: end -->"
     before, rest = readme.read_text().split(begin, 1)
-    readme.write_text(f"{before}{begin}{_render('readme', found)}{end}{rest.split(end, 1)[1]}")
+    readme.write_text(f"{before}{begin}{readme_block(found)}{end}{rest.split(end, 1)[1]}")

@@ -62,6 +62,12 @@ def problems(quick: bool) -> dict[str, Problem]:
     return {name: problem for name, problem in made.items() if not quick or name in QUICK}
 
 
+@cache
+def tags() -> dict[str, tuple[str, ...]]:
+    """What kind of mechanism each of the published ones is."""
+    return {problem.name: problem.tags for problem in (make() for make in MAKE)}
+
+
 def _end_of_second(problem: Problem) -> Reference:
     """Its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
 
@@ -140,7 +146,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Ratios of the fastest rival to the fastest of ours by mechanism and decade, and what of the goals holds."""
     by_case = {str(name): own for name, own in rows.groupby("case", sort=False)}
     made: list[dict[str, Any]] = [
-        {"case": name, "at": [at_decade(own, error) for error in DECADES]} for name, own in by_case.items()
+        {"case": name, "tags": list(tags().get(name, ())), "at": [at_decade(own, error) for error in DECADES]}
+        for name, own in by_case.items()
     ]
     every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
     behind = [at for at in every if at["verdict"] == "behind"]
@@ -155,6 +162,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         all(at["verdict"] != "behind" for at in each["at"] if at["error"] >= 0.5 * DOWN_TO) for each in made
     )
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
+    asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
+    found["not_put"] = [name for name in found["alone"] if name not in asked]
     found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
     return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
 
@@ -214,7 +223,7 @@ def _cell(at: dict[str, Any]) -> str:
 
 def _standing(found: dict[str, Any]) -> str:
     if found["ratio"] is None:
-        return {"alone": "ours", "missed": "others", "none": "–"}[found["verdict"]]
+        return {"alone": "ours", "unasked": "ours", "missed": "others", "none": "–"}[found["verdict"]]
     text = number(found["ratio"])
     return {"behind": f"**{text}**", "undecided": f"({text})"}.get(found["verdict"], text)
 

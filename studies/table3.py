@@ -19,6 +19,7 @@ from studies.solvers import (
     ERR_IN,
     IDA_C,
     IDA_FORMS,
+    IRK,
     IRK_LINE,
     NEWMARK,
     OWN_EXPLICIT,
@@ -34,6 +35,7 @@ from twoloop.tableaux import gauss
 
 TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
+EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
 OTHERS = (
     *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C, "IDA, stabilised"),
     *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
@@ -143,6 +145,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["newmark_over_irk"] = [min(ratios), max(ratios)] if ratios else []
     found["newmark_dearer_everywhere"] = bool(ratios and min(ratios) > 1.0)
     found["cheapest"] = [line for error in TARGETS[::2] if (line := _cheapest(_compared(first), error)) is not None]
+    found["explicit"] = _explicit(first)
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
     return found | causes(first)
@@ -177,6 +180,18 @@ def _newmark_over_irk(first: pd.DataFrame) -> list[float]:
         )
         ratios += [newmark / irk for newmark in (half, quarter)]
     return [float(ratio) for ratio in ratios if not np.isnan(ratio)]
+
+
+def _explicit(first: pd.DataFrame) -> dict[str, Any]:
+    """Time of the paper's Runge-Kutta procedure over that of the cheapest explicit method on all coordinates."""
+    fine = _at_least_fine(first)
+    over = {}
+    for error in TARGETS:
+        paper, *explicit = (tables.time_for(fine[fine["solver"] == name], error) for name in (IRK_LINE, *EXPLICIT))
+        least = np.fmin.reduce(explicit)  # of those that get there
+        if not np.isnan(paper) and not np.isnan(least):
+            over[power(error)] = float(paper / least)
+    return {"solvers": list(EXPLICIT), "paper": IRK, "errors": list(over), "over": list(over.values())}
 
 
 def _compared(first: pd.DataFrame) -> pd.DataFrame:

@@ -214,6 +214,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
     findings |= {"fitted": scaling.FITTED, "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
     in_angles = part(rows, minimal.GROUP)
+    findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
     findings["processors"] = [] if output.call.quick else processors.kept(output, rows)
     output.save_findings(findings)

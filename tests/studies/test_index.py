@@ -52,6 +52,14 @@ def test_a_failing_study_is_named_and_the_others_run(monkeypatch, capsys):
     assert "broken on purpose" in capsys.readouterr().err
 
 
+def test_the_block_of_the_readme_is_written_by_its_name(monkeypatch):
+    written = []
+    monkeypatch.setattr(command, "put_in_readme", lambda folder, readme: written.append((folder.name, readme.name)))
+    monkeypatch.setattr(sys, "argv", ["studies", "readme"])
+    command.main()
+    assert written == [("reports", "README.md")]
+
+
 def test_one_study_runs_by_its_name(monkeypatch):
     ran = []
     monkeypatch.setattr(command.importlib, "import_module", lambda name: type("S", (), {"main": ran.append}))
@@ -179,8 +187,8 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     text = front(
         tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
     )
-    assert "; 2 more of the default step over a force of 1 ms." in text
-    assert "Of 3000 runs of random mechanisms under such forces, by every preset, 4 are" in text
+    assert ". 2 more runs of the default step over a force of 1 ms. Of 3000 runs of random mechanisms" in text
+    assert "under such forces, by every preset, 4 are wrong in this way" in text
     assert "**Trust**" not in front(tmp_path, [case()])
 
 
@@ -283,7 +291,7 @@ def test_each_promise_has_its_opposite(study, tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "right on 17, ours only on 1 (and on 1 not put to others), others only on 0" in text
+    assert "right on 17, ours only on 1 that were put to others (and on 1 that our adapters refuse to put" in text
     assert "1 of ours, 57 of others" in text
     assert "1 of ours, 2 of others" in screen(tmp_path, honesty=TRAPS)
     text = screen(tmp_path, robustness={"n_linkages": 300, "long": [{}, {}], "silent": [{}]})

@@ -49,7 +49,8 @@ def test_the_headline_names_default_compiled_default_and_best_in_this_order():
     table = rows(*((name, "heyoka" if name == "heyoka" else "two-loop", "compiled", 1e-14, s) for name, s in lines))
     slow = table[table["solver"] == "heyoka"].assign(times=[(1.0, 9.0, 0.5, 8.0, 0.7)])  # scatters about 2
     undecided = pd.concat([table[table["solver"] != "heyoka"], slow.assign(call_s=1.0)]).assign(case="four-bar, second")
-    alone = table[table["solver"] != "heyoka"].assign(case="knife edge")
+    missed = table[table["solver"] == "heyoka"].assign(error_q=0.1, tol=tables.TIGHTEST)
+    alone = pd.concat([table[table["solver"] != "heyoka"], missed]).assign(case="knife edge")
     text = render("standings", {}, {}, standings=rivals.findings_of(pd.concat([table, undecided, alone]))["standings"])
     n = len(rivals.DECADES)
     assert [line.split(" is ahead")[0] for line in text.splitlines() if line] == [

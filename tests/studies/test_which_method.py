@@ -4,7 +4,9 @@ import json
 
 import pytest
 
-from studies.which_method import call, page, table, takes
+from studies.index import advice
+from studies.takes import call, takes
+from studies.which_method import page, table
 
 SOLVER = {"family": "two-loop", "right": 9, "wrong": 0, "said so": 1, "ratio": 0.1}
 VALIDATION = {"n": 4, "tight": 1e-10, "decades": 2}
@@ -73,7 +75,7 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
     tight = {"solver": "auto, compiled", "accuracies": ["1e-6"]}
     picked = [loose, tight]
     entries = [{"class": "stiff", "name": name, "picks": picked} for name in ("a beam", "another")]
-    (row,) = takes(entries)
+    (row,) = takes({}, advice(entries))
     assert row["what"] == "stiff (a beam; another)"
     assert row["take"] == '`method="TRBDF2"` for errors of 1e-2 and 1e-4; `compiled=True` for errors of 1e-6'
 
