@@ -5,7 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from studies import ablation, energy, figures, motion, step_size, violation
+from studies import ablation, energy, figures, motion, step_size, store, violation
+
+
+@pytest.fixture(autouse=True)
+def own_lock(monkeypatch, tmp_path_factory):
+    """A lock of timed studies for each test: neither a study on this machine nor another test makes it fail."""
+    monkeypatch.setattr(store, "LOCK", str(tmp_path_factory.mktemp("lock") / "timed.lock"))
 
 
 @pytest.fixture
