@@ -154,8 +154,9 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
 
 def cost_figure(rows: pd.DataFrame) -> Figure:
     """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
-    long = rows[(rows["case"] == SWITCHING) & (rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
-    long = long.assign(error_q=long["energy"].abs(), floor=0.0, solver=long["name"])
+    long = rows[rows["case"] == SWITCHING]
+    ended = (long["status"] == "REACHED_END") & ~long["lost"].fillna(True).astype(bool)
+    long = long.assign(error_q=long["energy"].abs().where(ended), floor=0.0, solver=long["name"], astray=False)
     drawn = (OWN_EXPLICIT, "Gauss12", IDA_C, PROJECTED, TRAPEZOIDAL, KEEPING, IRK)
     long = long[long["solver"].isin(drawn) & ((long["solver"] != KEEPING) | long["h"].notna())]
     title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
