@@ -265,12 +265,12 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     """Cost over error by three measures on both mechanisms; violation and energy over time."""
     names = list(dict.fromkeys(rows["case"]))
     made, axes = plt.subplots(len(names), 3, figsize=(10.5, 3.0 * len(names)), sharex="row", layout="constrained")
-    controlled = rows[(rows["group"] == "controlled") & (rows["tableau"] == SUN.name) & rows["error_q"].notna()]
+    controlled = rows[(rows["group"] == "controlled") & (rows["tableau"] == SUN.name)]
     for name, line in zip(names, np.atleast_2d(axes), strict=True):
         for (text, what), panel in zip(COSTS.items(), line, strict=True):
             for variant in VARIANTS:
                 along = controlled[(controlled["case"] == name) & (controlled["solver"] == variant)]
-                along = along[along["error_q"] > along["floor"]].sort_values("tol")
+                along = figures.with_gaps(along)
                 panel.plot(along["error_q"].astype(float), along[what].astype(float), **_look(variant))
             label = "CPU time (s)" if what == TIME else text
             panel.set(xscale="log", yscale="log", ylabel=label, xlabel="largest position error (m, rad)")

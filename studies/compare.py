@@ -89,7 +89,7 @@ def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Se
         published = check_published(case.problem, case.reference, case.t_end)
         findings |= {"source": case.reference.source, "published": published}
     output.save_findings(findings)
-    lines = figures.cheapest_lines(rows, errors)
+    lines = figures.lines_of(rows, errors)
     if lines:
         plot = figures.work_precision(rows, lines, f"{case.name}, {number(case.t_end)} s")
         figures.save(plot, output, "compare")

@@ -26,7 +26,6 @@ MEASURES = {
     "violation_q": "largest violation of positions, |C|",
     "violation_v": "largest violation of velocities",
 }
-SETTINGS = ("h", "err_out", "tol")
 COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 OPENS = "four-bar, 10 s (work_precision)"
@@ -71,7 +70,7 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
     rows = pd.concat(parts, ignore_index=True)
     # rows of cost against size have no setting, and no error to compare
-    return rows[rows[[name for name in SETTINGS if name in rows]].notna().any(axis=1)].reset_index(drop=True), stamps
+    return rows[rows[[name for name in tables.SETTINGS if name in rows]].notna().any(axis=1)].reset_index(drop=True), stamps
 
 
 def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from studies.tables import setting, unfinished
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
+DRAWN = (OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
@@ -153,12 +154,12 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
 
 def cost_figure(rows: pd.DataFrame) -> Figure:
     """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
-    long = rows[(rows["case"] == SWITCHING) & (rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
-    long = long.assign(error_q=long["energy"].abs(), floor=0.0, solver=long["name"])
-    drawn = (OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)
-    long = long[long["solver"].isin(drawn) & ((long["solver"] != KEEPING) | long["h"].notna())]
+    long = rows[rows["case"] == SWITCHING]
+    ended = (long["status"] == "REACHED_END") & ~long["lost"].fillna(True).astype(bool)
+    long = long.assign(error_q=long["energy"].abs().where(ended), floor=0.0, solver=long["name"], astray=False)
+    long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
     title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
-    figure = figures.work_precision(long, drawn, title, "largest energy error over the run (J)")
+    figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")
     calm = long[long["verdict"].isin(CALM)]
     for axes, what in zip(figure.axes, ("call_s", "n_evaluations"), strict=True):
         ring: dict[str, Any] = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 0.8}

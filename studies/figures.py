@@ -1,7 +1,10 @@
 """One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
 
+import zlib
 from collections.abc import Iterable, Sequence
+from functools import cache
 from io import BytesIO
+from itertools import product
 from typing import Any
 
 import matplotlib as mpl
@@ -9,15 +12,20 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
 from studies.store import Output
-from studies.tables import time_for
+from studies.tables import DECADE, SETTINGS, time_for, used
 
-MOST_LINES = 7
+MOST_LINES = 9
+FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
+MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA"), ("SciPy", ""))  # family, how names begin
 ERROR = "largest position error over the run (m, rad)"
+LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: not run, or failed"
 
 mpl.rcParams.update(
     {
@@ -40,7 +48,7 @@ mpl.rcParams.update(
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
-VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default and of Taylor alone
+VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default, and of Taylor and others
 
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "DOP853 (two-loop)": (RED, "o"),
@@ -51,14 +59,14 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Taylor, compiled": (MAGENTA, "*"),
     "Adams, compiled": (BLACK, "*"),
     "DOP853, compiled": (RED, "*"),
-    "TRBDF2": (GREEN, "v"),
-    "ESDIRK4": (BROWN, "v"),
+    "TRBDF2": (SKY, "v"),
+    "ESDIRK4": (GREY, "v"),
     "Gauss12": (BLUE, "s"),
     "Gauss6": (SKY, "D"),
     "SunRadau5": (PINK, "v"),
     "RadauIIA5": (ORANGE, "^"),
     "RadauIIA9": (BROWN, "^"),
-    "RadauIIA13": (PINK, "^"),
+    "RadauIIA13": (MAGENTA, "^"),
     "RadauIIA5, by differences": (GREY, "^"),
     "Gauss6, Newton": (SKY, "X"),
     "BDF": (GREEN, "P"),
@@ -80,16 +88,16 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "CVODES, CasADi": (BLUE, "d"),
     "collocation, CasADi": (GREY, "d"),
     "IDA from C, stabilised": (BLACK, ">"),
-    "IDA from C, q and v tested": (GREEN, ">"),
+    "IDA from C, q and v tested": (BLACK, "<"),
     "IDA from C, order 2, positions tested": (BLUE, ">"),
     "IDA, stabilised": (GREY, "<"),
     "IDA, index1": (SKY, "<"),
     "LSODA, index 1": (BROWN, "p"),
-    "DOP853, index 1": (SKY, "*"),
+    "DOP853, index 1": (PINK, "*"),
     "DOP853, projected": (ORANGE, "*"),
     "DOP853, Baumgarte 10": (GREEN, "s"),
-    "GSTIFF stand-in, order 1": (GREY, "1"),
-    "GSTIFF stand-in, order 2": (PINK, "2"),
+    "GSTIFF stand-in, order 1": (VIOLET, "1"),
+    "GSTIFF stand-in, order 2": (MAGENTA, "2"),
     "GSTIFF stand-in, order 3": (GREEN, "3"),
     "GSTIFF stand-in, order 4": (ORANGE, "4"),
     "GSTIFF stand-in, order 5": (BLUE, "+"),
@@ -108,13 +116,35 @@ SAME = {  # a tableau looks like the preset that is made of it
     "Radau IIA(3)": "RadauIIA5",
     "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
 }
-_REST = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY)
+COLORS = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY, BROWN, VIOLET, MAGENTA, BLACK, YELLOW)
+MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
+
+
+@cache
+def looks() -> dict[str, tuple[str, str]]:
+    """Colour and marker of all solvers that are known: of those without an entry above, the next that are free."""
+    free = [pair for pair in _pairs() if pair not in STYLES.values()]
+    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES), free, strict=False))
+
+
+def _pairs() -> list[tuple[str, str]]:
+    return [(color, marker) for marker, color in product(MARKERS, COLORS)]
+
+
+def _look_of(solver: str) -> tuple[str, str]:
+    """That of a solver; of one that nobody knows, by its name, one that nobody has."""
+    known = looks()
+    if (name := SAME.get(solver, solver)) in known:
+        return known[name]
+    free = [pair for pair in _pairs() if pair not in known.values()]
+    return free[zlib.crc32(name.encode()) % len(free)]
 
 
 def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, object]:
     """Colour, marker and line of a solver, the same in all figures; an open marker where the constraints drift."""
-    color, marker = STYLES.get(SAME.get(solver, solver), (_REST[sum(solver.encode()) % len(_REST)], "o"))
-    made: dict[str, object] = {"color": color, "marker": marker, "linestyle": "-" if family == "two-loop" else "--"}
+    color, marker = _look_of(solver)
+    line: dict[str, object] = {"linestyle": "-", "linewidth": 1.7} if family == "two-loop" else {"linestyle": "--"}
+    made = line | {"color": color, "marker": marker}
     return made if keeps_constraints else made | {"markerfacecolor": "white"}
 
 
@@ -157,33 +187,74 @@ def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOS
     return [solver for solver in dict.fromkeys(rows["solver"]) if solver in best]
 
 
+def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
+    """The solvers that a figure of a case shows, of those with errors that can be told.
+
+    The default, compiled too, and the paper's procedure; the cheapest of the main rivals that got anywhere; of ours the
+    cheapest others, as many as there is room for.
+    """
+    seen = rows[_told(rows)]
+    first = [name for name in FIRST if (seen["solver"] == name).any()][:most]
+    rivals: list[str] = []
+    for family, begins in MAIN_RIVALS:
+        own = seen[(seen["family"] == family) & seen["solver"].str.startswith(begins)]
+        if not own.empty:
+            best = own.loc[own["error_q"].astype(float).idxmin(), "solver"]
+            rivals += cheapest_lines(rows[rows["solver"].isin(own["solver"])], targets, 1) or [best]
+    ours = seen[(seen["family"] == "two-loop") & ~seen["solver"].isin(first)]["solver"]
+    room = max(0, most - len(first) - len(rivals))
+    return [*first, *cheapest_lines(rows[rows["solver"].isin(ours)], targets, room), *rivals]
+
+
+def _told(rows: pd.DataFrame) -> pd.Series:
+    """Whether the reference resolves the error of a run, and the run has not lost the motion."""
+    resolved = rows["error_q"].astype(float) > rows["floor"].astype(float)
+    return resolved & ~rows["astray"].isin((True, "True")) if "astray" in rows else resolved
+
+
+def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
+    """The runs of one solver from its loosest setting on, with an empty row wherever no line is to be drawn.
+
+    As in `tables`, nothing is told between runs of errors more than a decade apart or of different methods, nor across
+    a run that failed. Runs whose errors cannot be told are left out.
+    """
+    settings = runs[[name for name in SETTINGS if name in runs]].astype(float)
+    setting = settings.bfill(axis=1).iloc[:, 0] if settings.shape[1] else pd.Series(np.nan, runs.index)
+    runs = runs.assign(error_q=runs["error_q"].astype(float).where(_told(runs)))
+    runs = runs.iloc[np.lexsort((-runs["error_q"], -setting))].reset_index(drop=True)
+    size = np.log(runs["error_q"])
+    methods = pd.Series([used(run) for _, run in runs.iterrows()])
+    apart = (size.diff().abs() > np.log(DECADE)) | (methods != methods.shift(fill_value=methods.get(0)))
+    return runs.reindex(sorted([*runs.index, *(runs.index[apart] - 0.5)]))
+
+
 def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR) -> Figure:
     """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
 
-    `error` says what the column error_q is. Errors that the reference does not resolve are not drawn.
+    `error` says what the column error_q is. Lines have the gaps of `with_gaps`.
 
     Raises
     ------
     ValueError
-        If there are more than seven lines.
+        If there are more than nine lines.
     """
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.8), sharex=True, layout="constrained")
     for solver in solvers:
-        runs = rows[(rows["solver"] == solver) & rows["error_q"].notna()].sort_values("error_q")
-        runs = runs[runs["error_q"] > runs["floor"]]
-        if runs.empty:
+        runs = with_gaps(rows[rows["solver"] == solver])
+        known = runs[runs["error_q"].notna()]
+        if known.empty:
             continue
-        called = "P" if runs["called_from"].iloc[0] == "Python" else "c"
-        one = look(runs.iloc[0]) | {"label": f"{solver} [{called}]"}
-        times = runs["call_s"].astype(float)
+        called = "P" if known["called_from"].iloc[0] == "Python" else "c"
+        one = look(known.iloc[0]) | {"label": f"{solver} [{called}]"}
+        errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
         spread = [times - runs["call_q1"].astype(float), runs["call_q3"].astype(float) - times]
-        left.errorbar(runs["error_q"].astype(float), times, yerr=spread, elinewidth=0.8, **one)
-        counted = runs[runs["n_evaluations"].notna()]
-        right.plot(counted["error_q"].astype(float), counted["n_evaluations"].astype(float), **one)
+        left.errorbar(errors, times, yerr=spread, elinewidth=0.8, **one)
+        if known["n_evaluations"].notna().any():
+            right.plot(errors, runs["n_evaluations"].astype(float), **one)
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
-    legend(figure, [left], "filled: keeps constraints\n[c] compiled, [P] Python")
+    legend(figure, [left], f"{LEGEND}\nleft out: motion lost\n[c] compiled, [P] Python")
     figure.suptitle(title, fontsize=10)
     return figure

@@ -20,7 +20,7 @@ from references.cvode_c import solve_cvode_c
 from references.ida import solve_ida
 from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
-from studies import study
+from studies import figures, honesty_picture, study
 from studies.cli import StudyError
 from studies.render import render, table
 from studies.sharp_forces import T_END
@@ -52,6 +52,13 @@ UNASKED = "wrong, never asked"
 SHORT = {HANG: "**hang**", SILENT: "**silent**", UNASKED: "**unasked**", SAID: "said", RIGHT: "right", NOT_RUN: "–"}
 ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
 UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
+
+PARTS = {  # of the bars of the figure
+    "right": (RIGHT,),
+    "said so": (SAID,),
+    "wrong, force never asked": (UNASKED,),
+    "wrong and silent, or hanging": (SILENT, HANG),
+}
 
 Call = Callable[[Trap], Result]
 
@@ -273,16 +280,24 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
         all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
     rows, forces, inputs = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT))
     found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(pd.concat([rows, forces]))}
+    found["totals"] = totals(pd.concat([rows, forces]))
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO}
+
+
+def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Outcomes of each solver on the traps that it was run on, ours first."""
+    ran = rows[rows["outcome"] != NOT_RUN]
+    counts = [{"solver": str(name)} | counts_of(own) for name, own in ran.groupby("solver", sort=False)]
+    return sorted(counts, key=lambda line: not line["solver"].endswith("(two-loop)"))
 
 
 def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
     ran = rows[rows["outcome"] != NOT_RUN]
     ours = ran["solver"].str.endswith("(two-loop)")
-    solvers = [{"solver": str(name)} | counts_of(own) for name, own in ran.groupby("solver", sort=False)]
-    found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "solvers": solvers, "families": []}
+    found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": []}
+    found["solvers"] = totals(rows)
     for family, own in ran.groupby("trap", sort=False):
         mine = own["solver"].str.endswith("(two-loop)")
         line = {"family": str(family), "ours": counts_of(own[mine]), "others": counts_of(own[~mine])}
@@ -328,9 +343,7 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     found["missed_by_all"] = [
         str(trap) for trap, own in ran.groupby("trap", sort=False) if own["outcome"].isin((SILENT, HANG)).all()
     ]
-    found["counts"] = {
-        name: {what: int((rows[rows["solver"] == name]["outcome"] == what).sum()) for what in ORDER} for name in names
-    }
+    found["counts"] = {name: counts_of(rows[rows["solver"] == name]) for name in names}
     found["unasked"] = int((rows["outcome"] == UNASKED).sum())
     bad = rows[rows["outcome"].isin((SILENT, HANG))]
     for which in (True, False):
@@ -353,9 +366,10 @@ def outcomes(found: dict[str, Any], without: set[str]) -> str:
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings and report."""
+    """Write findings, figure and report."""
     found = findings_of(rows)
     output.save_findings(found)
+    figures.save(honesty_picture.picture(found["totals"], PARTS), output, "honesty")
     alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
     ready = {"cells": outcomes(found, alike), "input": outcomes(found["input"], set())}
     of_force = (SILENT, SAID, RIGHT)

@@ -143,15 +143,17 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 def _draw(panel: Axes, rows: Iterable[pd.Series | None], series: Series, curve: str, t: Array, **more: Any) -> None:
     for k, row in enumerate(row for row in rows if row is not None and key(row, curve) in series):
-        panel.plot(t, series[key(row, curve)], markevery=(3 * k % 10, 10), **(figures.look(row) | more))
+        panel.plot(t, series[key(row, curve)], **({"markevery": (3 * k % 10, 10)} | figures.look(row) | more))
 
 
 def _motion(panel: Axes, rows: pd.DataFrame, series: Series, curve: str, step: float) -> None:
-    """The true motion, and the curves that are visibly off."""
+    """The true motion, both two-loop procedures, and of the stand-in the curves that are visibly off."""
     t = GRIDS[curve] + (rows["t_end"].iloc[0] if curve == "last" else 0.0)
     truth = four_bar.cases(False)[0].reference.states(t)[0][Y3]
-    panel.plot(t, truth, color="black", lw=3.0, alpha=0.3, label="true motion")
-    entries = [find(rows, IRK), find(rows, NEWMARK), *(find(rows, gear(order), step) for order in (1, 2, 3, 5))]
+    panel.plot(t, truth, color="black", lw=6.0, alpha=0.2, label="true motion")
+    for row, width, first in ((find(rows, IRK), 3.0, 10), (find(rows, NEWMARK), 1.2, 30)):  # one lies upon the other
+        _draw(panel, [row], series, curve, t, linewidth=width, markevery=(first, 40))
+    entries = [find(rows, gear(order), step) for order in (1, 2, 3, 5)]
     error = "error_y3" if curve == "last" else "error_y3_short"
     off = [row for row in entries if row is not None and not row[error] <= VISIBLE]
     _draw(panel, off, series, curve, t, marker="")

@@ -228,23 +228,16 @@ def _standing(found: dict[str, Any]) -> str:
     return {"behind": f"**{text}**", "undecided": f"({text})"}.get(found["verdict"], text)
 
 
-def picture(rows: pd.DataFrame, most: int = 9) -> Figure:
-    """The README's picture: what a call takes over error on the four-bar: default, cheapest of ours, others."""
-    rows = rows[(rows["case"] == HEADLINE) & rows["error_q"].notna()]
-    own = rows["family"] == "two-loop"
-    chosen = [name for name in (headline.DEFAULT, headline.OWN_CODE) if name in set(rows["solver"])]
-    chosen += [name for name in figures.cheapest_lines(rows[own], SHOWN, most // 3) if name not in chosen]
-    chosen += figures.cheapest_lines(rows[~own], SHOWN, most - most // 3)
+def picture(rows: pd.DataFrame) -> Figure:
+    """The README's picture: what a call takes over error on the four-bar: default, cheapest of ours, main rivals."""
+    rows = rows[rows["case"] == HEADLINE]
     figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
-    for solver in chosen:
-        line = rows[rows["solver"] == solver].sort_values("error_q")
-        line = line[line["error_q"] > line["floor"]]
-        if len(line):
-            look = figures.look(line.iloc[0]) | ({"linewidth": 2.2} if line["family"].iloc[0] == "two-loop" else {})
-            axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
+    for solver in figures.lines_of(rows, SHOWN):
+        line = figures.with_gaps(rows[rows["solver"] == solver])
+        look = figures.look(line[line["error_q"].notna()].iloc[0])
+        axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
     axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time of the call (ms)")
-    axes.invert_xaxis()
-    figures.legend(figure, [axes], "thick: twoloop; filled:\nkeeps the constraints")
+    figures.legend(figure, [axes], figures.LEGEND)
     figure.suptitle("Four-bar linkage, 10 s: what an accuracy costs", fontsize=10)
     return figure
 
@@ -268,7 +261,7 @@ def heat_map(found: dict[str, Any]) -> Figure:
         axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
-        axes.set_title(name)
+        axes.set(title=name, xlabel="error at the end (m, rad)")
     figure.suptitle("Time of the fastest rival over ours (blue: ours ahead; in brackets: undecided)", fontsize=10)
-    figure.colorbar(image, ax=panels)
+    figure.colorbar(image, ax=panels, label="ratio")
     return figure

@@ -13,7 +13,7 @@ from studies.render import number, power
 
 Array = NDArray[np.float64]
 
-SETTINGS = ("tol", "h", "err_out")
+SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
 DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
 NEAR = 2.0  # settings that differ by less are nearly the same
 LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
@@ -82,7 +82,7 @@ def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, 
     near = not end and 1.0 / NEAR <= settings[n_good] / settings[n_good - 1] <= NEAR
     if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
         return None
-    if not joined or _used(runs.iloc[n_good - 1]) != _used(runs.iloc[n_good]):
+    if not joined or used(runs.iloc[n_good - 1]) != used(runs.iloc[n_good]):
         return n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])
     return n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
@@ -95,7 +95,7 @@ def _loosest(rows: pd.DataFrame) -> float:
     return best if (settings[~good] > best).any() else LOOSEST
 
 
-def _used(run: pd.Series) -> str:
+def used(run: pd.Series) -> str:
     """The method that a solver took which chooses; a file has nothing where there is none."""
     return run["used"] if isinstance(run.get("used"), str) else ""
 

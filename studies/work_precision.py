@@ -241,7 +241,7 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
     """Write all figures."""
     for case in findings["cases"]:
         own = medians[medians["case"] == case["name"]]
-        lines = figures.cheapest_lines(own, ERRORS)
+        lines = figures.lines_of(own, ERRORS)
         plot = figures.work_precision(own, lines, f"{case['name']}, {number(case['t_end'])} s")
         figures.save(plot, output, case["figure"].removesuffix(".png"))
     figures.save(rivals.picture(everywhere), output, "work_precision")

@@ -35,11 +35,8 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def drawn(runs_: pd.DataFrame) -> list[str]:
-    """The cheapest lines at the targets, the paper's procedure among them wherever its error can be told."""
-    seen = runs_[runs_["error_q"] > runs_["floor"]]["solver"].unique()
-    comparable = runs_[runs_["solver"].isin(seen) & ~runs_["solver"].isin((EXUDYN, DIFFERENCES))]
-    lines = figures.cheapest_lines(comparable, TARGETS, figures.MOST_LINES - 1)
-    return [PAPER, *lines] if PAPER in seen and PAPER not in lines else lines
+    """The lines of the figure: not Exudyn's, whose cable is another, nor those by differences."""
+    return figures.lines_of(runs_[~runs_["solver"].isin((EXUDYN, DIFFERENCES))], TARGETS)
 
 
 def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:

@@ -1,0 +1,191 @@
+"""Figures: a look of its own for each solver, the same everywhere; which lines are drawn, and where they have gaps."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.colors import to_hex
+
+from studies import energy, figures, honesty, honesty_picture, motion, rivals, step_size, table3, violation
+from studies.motion import GRIDS
+from studies.solvers import CATALOGUE, GEAR_ORDERS, IRK, IRK_LINE, NEWMARK, gear
+from studies.study import key
+
+NEW = (  # of rivals that no table of styles knows, as a study may bring them
+    *("IDA from C, q and v tested", "CVODE from C, BDF, projected", "CVODES, CasADi", "heyoka, minimal coordinates"),
+    *("CVODE from C, minimal coordinates", "Exudyn, GeneralizedAlpha 0.6", "Exudyn, GeneralizedAlpha 1", "nobody's"),
+)
+FAMILY = {"heyoka": "heyoka", "CVODE from C, Adams": "SUNDIALS", "CVODE, Adams": "SUNDIALS", "LSODA, index 1": "SciPy"}
+FAMILY |= {"IDA from C, stabilised": "SUNDIALS", "DOP853, index 1": "SciPy", "Dopri8, diffrax": "diffrax"}
+ERRORS = (1e-2, 1e-3, 1e-4)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def pair(solver):
+    look = figures.style(solver)
+    return look["color"], look["marker"]
+
+
+def rows(**seconds):
+    """Medians on the four-bar: of each solver three runs a decade of error apart, the time that of the loosest."""
+    common = {"case": "four-bar", "called_from": "compiled", "keeps_constraints": True, "status": "REACHED_END"}
+    common |= {"floor": 1e-14, "violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "astray": False}
+    made = []
+    for solver, time in seconds.items():
+        for k, error in enumerate(ERRORS):
+            line = {"solver": solver, "family": FAMILY.get(solver, "two-loop"), "tol": error, "error_q": error}
+            cost = time * 2.0**k
+            line |= {"call_s": cost, "call_q1": cost, "call_q3": cost, "times": (cost,) * 5, "n_evaluations": 9.0}
+            made.append(common | line)
+    return pd.DataFrame(made)
+
+
+def drawn(axes):
+    """Colour and marker of each labelled line."""
+    found = {}
+    for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+        line = handle[0] if isinstance(handle, tuple) else handle
+        found[label.rsplit(" [", 1)[0]] = to_hex(line.get_color()).upper(), line.get_marker()
+    return found
+
+
+def test_no_two_solvers_look_alike():
+    names = dict.fromkeys((*figures.STYLES, *CATALOGUE, *NEW))
+    names.pop(IRK_LINE)  # the paper's procedure along another setting
+    alike = [pairs for pairs in itertools.combinations(names, 2) if pair(pairs[0]) == pair(pairs[1])]
+    assert alike == [] and pair(IRK) == pair(IRK_LINE)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        (energy.SUN, energy.GAUSS, energy.RADAU, energy.NEWMARK),
+        energy.DRAWN,
+        table3.DRAWN,
+        violation.DRAWN,
+        violation.OVER_TIME,
+        motion.LISTED[:7],
+        step_size.PAPER,
+    ],
+)
+def test_solvers_that_are_always_drawn_together_do_not_look_alike(names):
+    assert len({pair(name) for name in names}) == len(names)
+
+
+def test_curves_without_markers_differ_in_colour():
+    names = (IRK, NEWMARK, *(gear(order) for order in (1, 2, 3, 5)))
+    assert len({pair(name)[0] for name in names}) == len(names)
+
+
+def test_a_solver_looks_the_same_in_all_figures_and_no_two_in_one_look_alike():
+    names = ("auto", "auto, compiled", "Adams", "heyoka", "CVODE from C, Adams", "LSODA, index 1", *NEW[:3])
+    made = rows(**dict.fromkeys(names, 1.0))
+    panels = [*figures.work_precision(made, names, "").axes, *rivals.picture(made).axes]
+    found = [drawn(panel) for panel in panels]
+    assert found[0].keys() == found[1].keys() == set(names) and len(found[2]) >= 5
+    for looks in found:
+        assert len(set(looks.values())) == len(looks)
+        assert looks == {name: (pair(name)[0].upper(), pair(name)[1]) for name in looks}
+
+
+def test_default_the_papers_procedure_and_the_main_rivals_are_drawn_however_slow():
+    own = {f"Gauss{k}": 0.1 * k for k in range(4, 18, 2)}
+    slow = {"heyoka": 90.0, "CVODE from C, Adams": 80.0, "IDA from C, stabilised": 70.0, "LSODA, index 1": 60.0}
+    slow |= {"DOP853, index 1": 95.0, "CVODE, Adams": 99.0, "Dopri8, diffrax": 50.0}
+    made = rows(**own, **slow, **{"auto": 40.0, "auto, compiled": 30.0, IRK_LINE: 20.0})
+    first = ["auto", "auto, compiled", IRK_LINE]
+    four = ["heyoka", "CVODE from C, Adams", "IDA from C, stabilised", "LSODA, index 1"]
+    assert figures.lines_of(made, ERRORS) == [*first, "Gauss4", "Gauss6", *four]
+    assert figures.lines_of(made[made["solver"] != "auto"], ERRORS)[:3] == [*first[1:], "Gauss4"]
+    # a rival that gets to no error that is compared is drawn all the same, one that gets nowhere is not
+    made.loc[made["solver"] == "heyoka", "error_q"] = [3.0, 2.0, np.nan]
+    made.loc[made["solver"].str.startswith("IDA"), ["error_q", "status"]] = [np.nan, "TIME_LIMIT"]
+    assert figures.lines_of(made, ERRORS)[-3:] == ["heyoka", "CVODE from C, Adams", "LSODA, index 1"]
+
+
+def gaps(runs):
+    """Pairs of errors between which a line is drawn."""
+    errors = figures.with_gaps(runs)["error_q"].tolist()
+    return [ends for ends in itertools.pairwise(errors) if not np.isnan(ends).any()]
+
+
+def test_a_line_has_a_gap_where_nothing_was_run_and_where_a_run_failed():
+    made = rows(auto=1.0)
+    assert gaps(made.iloc[::-1]) == [(1e-2, 1e-3), (1e-3, 1e-4)]
+    failed = made.assign(error_q=[1e-2, np.nan, 5e-3])
+    assert gaps(failed) == []  # less than a decade apart, but the run between failed
+    assert gaps(made.assign(error_q=[1e-2, 9e-4, 8e-4])) == [(9e-4, 8e-4)]
+    assert gaps(made.assign(used=["Newton", "explicit", "explicit"])) == [(1e-3, 1e-4)]
+    assert gaps(made.assign(used=np.nan)) == [(1e-2, 1e-3), (1e-3, 1e-4)]  # as a file has it
+    assert gaps(made.assign(floor=5e-4)) == [(1e-2, 1e-3)] and gaps(made.assign(astray=[True, False, False])) == [
+        (1e-3, 1e-4)
+    ]
+    assert figures.with_gaps(made[:0]).empty  # a quick run has not all solvers of a figure
+    steps = made.assign(tol=1e-5, err_out=[1e-3, 1e-7, 1e-5], error_q=[1e-2, np.nan, 5e-3])
+    assert gaps(steps) == [(1e-2, 5e-3)]  # in the order of the setting that varies
+
+
+def test_the_lines_of_a_figure_have_these_gaps():
+    made = rows(auto=1.0, heyoka=2.0)
+    made.loc[1, ["error_q", "status"]] = [np.nan, "FAILED"]
+    for axes in (*figures.work_precision(made, ["auto"], "").axes, *rivals.picture(made).axes):
+        (line,) = (each for each in axes.lines if to_hex(each.get_color()).upper() == figures.VIOLET)
+        x = np.asarray(line.get_xdata(), dtype=float)
+        assert np.isnan(x).tolist() == [False, True, True, False] or np.isnan(x).tolist() == [False, True, False]
+
+
+def test_errors_grow_to_the_right_in_all_figures():
+    made = rows(auto=1.0, heyoka=2.0)
+    for axes in (*figures.work_precision(made, ["auto"], "").axes, *rivals.picture(made).axes):
+        assert axes.get_xscale() == axes.get_yscale() == "log" and not axes.xaxis_inverted()
+        assert "(" in axes.get_xlabel() and axes.get_ylabel()
+    assert {"auto", "heyoka"} <= drawn(rivals.picture(made).axes[0]).keys()
+
+
+def test_the_motion_is_drawn_with_both_two_loop_procedures():
+    about = {"family": "two-loop", "keeps_constraints": True, "case": "four-bar", "t_end": 100.0}
+    about |= {"error_y3": 1e-3, "error_y3_short": 1e-6, "group": "line-up"}
+    made = [about | {"solver": name} for name in (IRK, NEWMARK)]
+    stand_in = about | {"family": "stand-in", "group": "GSTIFF stand-in", "h": motion.MIDDLE, "error_y3_short": 1.0}
+    made += [stand_in | {"solver": gear(order), "error_y3": float(order < 3)} for order in GEAR_ORDERS]
+    made = pd.DataFrame(made)
+    series = {key(row, name): grid for _, row in made.iterrows() for name, grid in GRIDS.items()}
+    (axes,) = motion.motion_figure(made, series, "last", (motion.MIDDLE,)).axes
+    assert list(drawn(axes)) == ["true motion", IRK, NEWMARK, gear(1), gear(2)]
+    assert axes.get_xlabel() == "t (s)" and axes.get_ylabel() == "y3 (m)"
+
+
+def test_the_bars_of_honesty_are_the_shares_of_the_outcomes():
+    outcomes = {"LSODA, index 1": [honesty.SILENT, honesty.HANG, honesty.SAID, honesty.NOT_RUN]}
+    outcomes |= {"auto (two-loop)": [honesty.RIGHT] * 3 + [honesty.UNASKED]}
+    made = pd.DataFrame([{"solver": name, "outcome": what} for name, each in outcomes.items() for what in each])
+    totals = honesty.totals(made)
+    assert [(line["solver"], line["n"]) for line in totals] == [("auto (two-loop)", 4), ("LSODA, index 1", 3)]
+    (axes,) = honesty_picture.picture(totals, honesty.PARTS).axes
+    shares = [[bar.get_width() for bar in bars] for bars in axes.containers]
+    assert np.allclose(shares, [[75.0, 0.0], [0.0, 100.0 / 3.0], [25.0, 0.0], [0.0, 200.0 / 3.0]])
+    assert np.allclose(np.sum(shares, axis=0), 100.0)
+    assert {text.get_text() for text in axes.texts} == {"", "1", "2", "ours", "others"}
+
+
+def test_the_cells_of_table_3_are_drawn_as_ratios():
+    made = [
+        {"group": group, "err_in": e_in, "err_out": e_out, "call_s": (paper or 9.0) / 10.0, "lost": False}
+        for group in table3.FAMILIES
+        for e_in, line in zip(table3.TOLERANCES, table3.printed(group), strict=True)
+        for e_out, paper in zip(table3.TOLERANCES, line, strict=True)
+    ]
+    made[5] |= {"call_s": 10.0 * made[5]["call_s"]}
+    made[6] |= {"lost": True}
+    first, second = table3.picture(pd.DataFrame(made)).axes
+    told = [[text.get_text() for text in axes.texts] for axes in (first, second)]
+    assert told[0] == ["10"] * 5 + ["1.0", "★"] + ["10"] * 9
+    assert told[1] == ["★", "10", "10", "10"] * 4
+    assert first.get_xlabel() == "err_out" and first.get_ylabel() == "err_in"
