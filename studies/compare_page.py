@@ -70,7 +70,8 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
     rows = pd.concat(parts, ignore_index=True)
     # rows of cost against size have no setting, and no error to compare
-    return rows[rows[[name for name in tables.SETTINGS if name in rows]].notna().any(axis=1)].reset_index(drop=True), stamps
+    settings = [name for name in tables.SETTINGS if name in rows]
+    return rows[rows[settings].notna().any(axis=1)].reset_index(drop=True), stamps
 
 
 def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
