@@ -48,7 +48,6 @@ DECADE = 10.0  # in error: between runs farther apart no cost is told
 MARGIN = 1.2  # times the cost: dearer; less is no difference
 KEPT = 1e-12  # m; what is violated no more is kept
 GROWS = 2.0  # times the violation of the first tenth of a run in its last
-NOISE = 1.05  # times the cost: no more than this against it, and a verdict on all errors stands
 SAME_TOLERANCE = HALVES[8]  # 1e-5, the paper's, at which step lengths are compared
 
 COLORS = dict(
@@ -168,9 +167,9 @@ def verdict(span: list[float] | None) -> str:
         return "unknown"
     if span[0] >= 1.0 / MARGIN and span[2] <= MARGIN:
         return "equal"
-    if span[0] >= 1.0 / NOISE:
+    if span[0] >= 1.0:
         return "cheaper"
-    return "dearer" if span[2] <= NOISE else "mixed"
+    return "dearer" if span[2] <= 1.0 else "mixed"
 
 
 def _longest(rows: pd.DataFrame, case: str, variant: str) -> float | None:
@@ -214,7 +213,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "told": told,
         "drawn": {variant: _at_drawn_step(fixed, variant) for variant in VARIANTS},
         "drawn_step": _drawn(fixed),
-        "noise": NOISE,
         "frozen_reaches_none": not any(
             np.isfinite(_costs(controlled, name, FROZEN, told[name])["evaluations"]).any() for name in names
         ),

@@ -1,10 +1,11 @@
 """What a run is measured by, for any mechanism: errors, violations at three levels, energy, multipliers.
 
-Sampling is the same for all solvers: none lands on the sampling instants, each takes its own steps. The deviation from
-the reference is taken at the steps' ends, and the deviation, not the motion, is interpolated to the common instants: by
-cubics in the deviations of q and v for positions, linearly for velocities. A solver with long steps is thus not charged
-with an interpolation that it did not do. IDA alone tells its states at the common instants, by its own interpolant of
-the order of its method, because storing every step would cost it more than the integration.
+No solver lands on the sampling instants; each takes its own steps. Of solvers that tell their steps (twoloop, SciPy,
+solve_dae, Exudyn) the deviation from the reference is taken at the steps' ends, and the deviation, not the motion, is
+interpolated to the common instants: by cubics in the deviations of q and v for positions, linearly for velocities.
+heyoka, CVODE, IDA, CasADi and diffrax tell their states at the common instants, by their own interpolants of about the
+order of their methods, because storing every step would cost them more than the integration, or cannot be asked for:
+what these interpolants add to the error is counted as theirs.
 
 Measured once (four-bar, 10 s; SunRadau5, Gauss12, DOP853 and BDF of twoloop at 1e-5 and 1e-9): this error is 0.999 to
 1.015 of the largest at the steps' own ends. Landing on 1000 instants instead multiplies the evaluations by 1.06 to 5.6

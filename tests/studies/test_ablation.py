@@ -137,8 +137,10 @@ def test_no_cost_is_told_across_a_gap_or_beyond_the_runs():
     [
         (None, "unknown"),
         ([1.3, 1.4, 2.0], "cheaper"),
-        ([0.99, 1.4, 2.0], "cheaper"),
-        ([0.3, 0.6, 1.01], "dearer"),
+        ([1.0, 1.4, 2.0], "cheaper"),
+        ([0.99, 1.4, 2.0], "mixed"),
+        ([0.3, 0.6, 1.0], "dearer"),
+        ([0.3, 0.6, 1.01], "mixed"),
         ([0.9, 1.0, 1.1], "equal"),
         ([0.9, 1.0, 1.3], "mixed"),
         ([0.5, 0.8, 1.1], "mixed"),
