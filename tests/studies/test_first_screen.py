@@ -193,7 +193,8 @@ def test_a_price_that_is_missing_says_why():
     ("changed", "verdict"),
     [
         ({"status": "RAISED", "error_q": None}, "unasked"),  # our adapter refuses
-        ({"status": "TIME_LIMIT", "error_q": None}, "alone"),
+        ({"status": "TIME_LIMIT", "error_q": None}, "unasked"),  # our limit
+        ({"status": "SOLVER_FAILED", "error_q": None}, "alone"),
         ({"error_q": 0.1, "tol": tables.TIGHTEST}, "alone"),
         ({"error_q": 0.1, "tol": 1e-3}, "unasked"),
     ],
@@ -257,7 +258,7 @@ def test_the_screen_has_sixty_lines_at_most(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("verdict", "said"), [("alone", "no other gets there)"), ("unasked", "or was asked for as much)")]
+    ("verdict", "said"), [("alone", "no other gets there)"), ("unasked", "that was asked, but not all were, or not to their end)")]
 )
 def test_no_other_gets_there_is_said_where_one_was_asked(verdict, said):
     table = rows({name: line for name, line in SOLVERS.items() if line[0] == "two-loop"}, case="crane")

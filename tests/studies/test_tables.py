@@ -79,7 +79,7 @@ def test_a_cell_that_is_not_reached_says_why():
     tightest = made.assign(tol=tables.TIGHTEST)
     assert tables.work_precision(tightest, [1e-5])[0][2] == "least error 1e-4" and tables.missed(tightest, 1e-5)
     limited = pd.concat([made, rows(("a", np.nan, 60.0)).assign(status="TIME_LIMIT", tol=1e-7)])
-    assert tables.work_precision(limited, [1e-5])[0][2] == "least error 1e-4, then time limit"
+    assert tables.work_precision(limited, [1e-5])[0][2] == "least error 1e-4, then our limit"
     nothing = rows(("x", np.nan, np.nan)).assign(status="NOT_APPLICABLE", message="needs a model of its own")
     assert tables.work_precision(nothing, [1e-5])[0][2] == "not applicable"
     assert tables.failures(nothing) == [["x", "all", "not applicable", "needs a model of its own"]]
