@@ -17,7 +17,8 @@ SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, 
 DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
 NEAR = 2.0  # settings that differ by less are nearly the same
 LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
-RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # of the bootstrap
+RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, and the percentiles that count of these
+LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
 FEWEST = 3  # repetitions that an interval asks for
@@ -161,9 +162,10 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
     Returns
     -------
     dict
-        ratio; interval, that of 95 % by the bootstrap over the repetitions, or None; verdict: "ahead" or "behind"
-        where the interval leaves out 1, else "undecided"; "alone" where no other gets there, "missed" where own does
-        not and another does, "none" where neither does.
+        ratio; interval, its range over the repetitions drawn again, which is the scatter of these few and no
+        confidence interval, or None; verdict: "ahead" where all of the range is above LEAST, "behind" where it is
+        below 1 / LEAST, else "undecided"; "alone" where no other gets there, "missed" where own does not and another
+        does, "none" where neither does.
     """
     if not own or not others:
         verdict = "alone" if own else "missed" if others else "none"
@@ -176,7 +178,7 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
         strict=True,
     )
     low, high = (float(x) for x in np.percentile(drawn[1] / drawn[0], INTERVAL))
-    verdict = "ahead" if low > 1.0 else "behind" if high < 1.0 else "undecided"
+    verdict = "ahead" if low > LEAST else "behind" if high < 1.0 / LEAST else "undecided"
     return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
 
 

@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from studies import headline, index, tables, work_precision
+from studies import headline, index, rivals, tables, work_precision
 from studies.render import render
 from tests.studies.test_index import case, energy
 from tests.studies.test_tables import rows
@@ -15,7 +15,10 @@ def runs(*lines):
     """Rows of (tolerance, error or None, status) of a rival."""
     made = rows(*(("rival", error, 0.1) for _, error, _ in lines))
     return made.assign(
-        tol=[tol for tol, *_ in lines], status=[status for *_, status in lines], family="theirs", times=[(0.1,) * 5] * len(lines)
+        tol=[tol for tol, *_ in lines],
+        status=[status for *_, status in lines],
+        family="theirs",
+        times=[(0.1,) * 5] * len(lines),
     )
 
 
@@ -97,3 +100,22 @@ def test_of_energies_none_is_said_to_be_alone_as_none_was_asked_to_the_end():
     found["long"]["at"][0]["no_drift"]["others"] = found["long"]["at"][0]["drift"]["others"] = None
     text = render("advice", {}, {}, advice=index.advice(index.classes({"energy": found})), cases=[], default="auto")
     assert "no other gets there that was asked, but not all were" in text
+
+
+def test_how_many_rivals_could_be_put_is_counted():
+    """Refusals, by our adapters or for want of a package, are not counted; a run that failed is."""
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=1e-3)
+    there = [runs((1e-3, None, status)).assign(solver=f"rival {status}") for status in (END, LIMIT, FAILED)]
+    refused = [
+        runs((1e-3, None, status)).assign(solver=f"rival {k}") for k, status in enumerate(("RAISED", "NOT_AVAILABLE"))
+    ]
+    some = pd.concat([ours, *there, *refused]).assign(case="hoist")
+    alone = ours.assign(case="robot")
+    every = pd.concat([ours, *there, *(own.assign(status=FAILED) for own in refused)]).assign(case="crane")
+    found = rivals.put(pd.concat([some, alone, every], ignore_index=True))
+    assert found == {"n": 5, "least": 0, "all": 1, "mechanisms": 3, "counts": tables.LEAST}
+    assert rivals.put(every)["least"] == 5
+    text = render("against", {}, {}, put=found, names="heyoka")
+    assert text.startswith("those of 5 rivals") and "all on 1 of 3 mechanisms, 0 where they are fewest (heyoka)" in text
+    assert text.endswith("Ahead and behind are by 5 % at least\n")
+    assert render("against", {}, {}, put=rivals.put(every), names="heyoka").startswith("all 5 rivals")

@@ -121,7 +121,8 @@ def beam(differences_s, paper_s=4.5):
 
 def screen(tmp_path, cases=(), dominated=(), standings=None, **others):
     found = {"cases": list(cases), "dominated": list(dominated), "limit": 2.0, "default": "SunRadau5"}
-    found |= {"rivals": {"standings": standings}} if standings else {}
+    put = {"n": 21, "least": 8, "all": 3, "mechanisms": 23, "counts": 1.05}
+    found |= {"rivals": {"standings": standings, "put": put}} if standings else {}
     for path in tmp_path.glob("*.json"):
         path.unlink()
     if cases:
