@@ -1,9 +1,10 @@
 """Rows of many solvers on many mechanisms in bounded time: each from its loosest setting on, until more is of no use.
 
-A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit, has failed at
-two tolerances running, or has taken more than `FAR` times as long as the fastest so far for no smaller an error, at two
-settings running. Where two of its errors lie more than a decade apart it is asked between them, so that nothing need be
-interpolated over more, and beyond its ends where these leave accuracies out. A part of `studies.work_precision`.
+A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit at two settings
+running (a loose one may take longer than the next), has failed at two tolerances running, or has taken more than `FAR`
+times as long as the fastest so far for no smaller an error, at two settings running. Where two of its errors lie more
+than a decade apart it is asked between them, so that nothing need be interpolated over more, and beyond its ends, be
+they tolerances or steps, where these leave accuracies out. A part of `studies.work_precision`.
 """
 
 import itertools
@@ -21,7 +22,9 @@ FAR = 20.0
 RUNNING = 2
 ROUNDS = 4  # of asking between settings
 CLOSE = 5.0  # times the time of the fastest: what costs more is not asked between its settings
-ENDING = (*NOTHING_RUN, "RAISED", "TIME_LIMIT")
+ENDING = (*NOTHING_RUN, "RAISED")
+FEWEST_STEPS, MOST_STEPS = 10, 10**6  # of a solver of fixed steps, beyond its grid
+COARSER = 10.0**0.5  # of steps where a tolerance changes by a decade
 
 Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
 
@@ -30,15 +33,16 @@ class _Progress:
     """How one solver has done on one mechanism so far."""
 
     def __init__(self) -> None:
-        self.ended, self.failed, self.far = False, 0, 0
+        self.ended, self.failed, self.far, self.stopped = False, 0, 0, 0
 
     def judge(self, row: Row, fastest: float | None, all_asked: bool, tolerances: bool) -> None:
         """Take a first repetition into account; `fastest`: the least time so far for no larger an error."""
         self.failed = self.failed + 1 if row["error_q"] is None else 0
+        self.stopped = self.stopped + 1 if row["status"] == "TIME_LIMIT" else 0
         far = fastest is not None and (row["call_s"] or 0.0) > FAR * fastest
         self.far = self.far + 1 if far and row["error_q"] is not None else 0
         hopeless = (tolerances and self.failed >= RUNNING) or (self.far >= RUNNING and not all_asked)
-        self.ended = row["status"] in ENDING or hopeless
+        self.ended = row["status"] in ENDING or self.stopped >= RUNNING or hopeless
 
 
 def collect(
@@ -123,14 +127,42 @@ def between(
     for loose, tight in itertools.pairwise(made):
         apart, inside = error[loose] / error[tight], any(error[tight] < each < error[loose] for each in errors)
         if inside and apart > DECADE and loose / tight > NEAR and (close[loose] or close[tight]):
-            asked.append(float(f"{np.sqrt(loose * tight):.2g}"))
-    if own[0].solver.setting == "tol":
-        first, last = made[0], made[-1]
-        if first == max(rows) and error[first] < max(errors) / DECADE and first < LOOSEST and close[first]:
-            asked.append(min(LOOSEST, DECADE * first))
-        if last == min(rows) and error[last] > min(errors) and last > TIGHTEST and close[last]:
-            asked.append(max(TIGHTEST, last / DECADE))
-    return [replace(own[0], value=value) for value in asked if value not in rows]
+            asked.append(float(np.sqrt(loose * tight)))
+    asked += _beyond(own[0], made, error, close, sorted(rows), errors)
+    tidy = [_tidy(own[0], value) for value in asked]
+    return [replace(own[0], value=value) for value in dict.fromkeys(tidy) if value not in rows]
+
+
+def _tidy(run: Run, value: float) -> float:
+    """The nearest tolerance of two digits, or the nearest step of which the motion takes a whole number."""
+    return float(f"{value:.2g}") if run.solver.setting == "tol" else run.case.t_end / round(run.case.t_end / value)
+
+
+def _beyond(
+    run: Run,
+    made: Sequence[float],
+    error: Mapping[float, float],
+    close: Mapping[float, bool],
+    tried: Sequence[float],
+    errors: Sequence[float],
+) -> list[float]:
+    """Settings looser and tighter than those that a solver ended with (`made`, loose to tight) where these are close.
+
+    Steps so long that it failed are no end: between these and the longest that it ended with it is asked, too.
+    """
+    first, last, asked = made[0], made[-1], []
+    loosest, tightest, decade = LOOSEST, TIGHTEST, DECADE
+    if run.solver.setting != "tol":
+        loosest, tightest, decade = run.case.t_end / FEWEST_STEPS, run.case.t_end / MOST_STEPS, COARSER
+    if error[first] < max(errors) / DECADE and close[first]:
+        failed = [value for value in tried if value > first]
+        if not failed and first < loosest:
+            asked.append(min(loosest, decade * first))
+        elif run.solver.setting != "tol" and failed and failed[0] / first > NEAR:
+            asked.append(float(np.sqrt(first * failed[0])))
+    if last == tried[0] and error[last] > min(errors) and last > tightest and close[last]:
+        asked.append(max(tightest, last / decade))
+    return asked
 
 
 def _again(run: Run, repeat: int, kept: KeptRows) -> bool:

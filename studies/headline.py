@@ -37,9 +37,9 @@ def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 
 
 def asked(rivals: pd.DataFrame, error: float) -> bool:
-    """Whether any rival was put to a case (a refusal is our adapter's) and misses an error with all that it can."""
+    """Whether some rival was put to a case (a refusal is our adapter's), and each of these to the end of what it can."""
     put = rivals[~rivals["status"].isin((*NOTHING_RUN, "RAISED"))]
-    return any(tables.missed(own, error) for _, own in put.groupby("solver"))
+    return len(put) > 0 and all(tables.missed(own, error) for _, own in put.groupby("solver"))
 
 
 def _told(costs: tables.Costs) -> dict[str, Any]:

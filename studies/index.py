@@ -74,14 +74,15 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
 def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[str, Any]:
     reached = [line for line in at if line["ours"] and "ida" in line]
     over = [line["ida"]["call_s"] / line["ours"]["call_s"] for line in reached if line["ida"]]
-    missed = [line["accuracy"] for line in reached if line["ida_missed"]]
+    missed = [line for line in reached if line["ida_missed"]]
     made = {"class": label, "name": case["name"], "t_end": case["t_end"], "at": at, "picks": picks(at)}
-    return made | {"ida_over": over, "ida_misses": missed, "without_drift": []}
+    made |= {"ida_over": over, "ida_misses": [line["accuracy"] for line in missed], "without_drift": []}
+    return made | {"ida_tightest": max((line["ida_tightest"] for line in missed), default=None)}
 
 
 def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     """The line of a largest position error."""
-    told = {key: at[key] for key in ("ida", "ida_missed", "standing")}
+    told = {key: at[key] for key in ("ida", "ida_missed", "ida_tightest", "standing")}
     line: dict[str, Any] = {"accuracy": power(at["error"]), **told, **dict.fromkeys(WHOSE)}
     for which in (which for which in WHOSE if at[which]):
         line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
@@ -112,8 +113,9 @@ def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             pick["accuracies"].append(line["accuracy"])
             pick["call_s"].append(best["call_s"])
             pick["over"] += [other["call_s"] / best["call_s"]] if other else []
-            # of no other time is known: none gets there only if one was asked for as much
-            alone = line.get("standing") is None or line["standing"][BEST]["verdict"] == "alone"
+            # of no other time is known: none gets there only if all were asked to their end, which for energies none is
+            standing = line["standing"]
+            alone = standing is not None and standing[BEST]["verdict"] == "alone"
             pick["asked"] = pick["asked"] and (other is not None or alone)
     return list(made.values())
 

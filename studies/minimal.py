@@ -24,7 +24,9 @@ RIVAL = "fastest rival"
 ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 WRONG, ASKED = 0.1, 1e-3  # a run that ends with this error, though it was asked for at least so much, is wrong
-TIME_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes the limit is not asked on
+TIME_LIMIT = (
+    10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes the limit twice running is not asked on
+)
 
 
 def runs(quick: bool) -> list[Run]:

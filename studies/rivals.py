@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
 from studies import adaptive, figures, headline, tables
-from studies.bench import REPEATS, Run, warm_up
+from studies.bench import NOTHING_RUN, REPEATS, Run, warm_up
 from studies.cases.four_bar import SECOND
 from studies.cli import StudyError
 from studies.end_states import case_of, row_of
@@ -41,9 +41,9 @@ GEOMETRIES: dict[str, Callable[[], Problem]] = {
 }
 QUICK = ("four-bar", "knife edge")
 QUICK_SOLVERS = (headline.DEFAULT, headline.OWN_CODE, TAYLOR, "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
-TOLERANCES = (1e-1, 1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
-BUILT = (1e-1, 1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
-STEPS = (100, 300, 1000)  # of those of fixed steps
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
+BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
+STEPS = (100, 300, 1000, 3000, 10_000)  # of those of fixed steps
 QUICK_TOLERANCES = (1e-3, 1e-5)
 TIMED = 0.01  # s; a shorter run is called until it has used so much
 TIME_LIMIT = 1.0  # s of CPU of a run
@@ -104,7 +104,7 @@ def runs(quick: bool) -> list[Run]:
 
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
-    """Rows of all runs that are of use; on the four-bars every solver is asked for all accuracies."""
+    """Rows of all runs that are of use; on the four-bars however far behind a solver is."""
     quick = all(run.repeats == 1 for run in todo)
     return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
 
@@ -164,8 +164,18 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
+    found["put"] = put(rows)
     found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
     return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
+
+
+def put(rows: pd.DataFrame) -> dict[str, Any]:
+    """How many of the rivals our adapters could put to the mechanisms, and the ratio from which a lead counts."""
+    others = rows[rows["family"] != "two-loop"]
+    there = others[~others["status"].isin((*NOTHING_RUN, "RAISED"))].groupby("case")["solver"].nunique()
+    there, n = there.reindex(rows["case"].unique(), fill_value=0), int(others["solver"].nunique())
+    found = {"n": n, "least": int(there.min()), "all": int((there == n).sum()), "mechanisms": len(there)}
+    return found | {"counts": tables.LEAST}
 
 
 def _four_bar(name: str, rows: pd.DataFrame) -> dict[str, Any]:

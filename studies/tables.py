@@ -17,7 +17,10 @@ SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, 
 DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
 NEAR = 2.0  # settings that differ by less are nearly the same
 LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
-RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # of the bootstrap
+RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, and the percentiles that count of these
+LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
+LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
+CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
 FEWEST = 3  # repetitions that an interval asks for
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
@@ -159,9 +162,10 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
     Returns
     -------
     dict
-        ratio; interval, that of 95 % by the bootstrap over the repetitions, or None; verdict: "ahead" or "behind"
-        where the interval leaves out 1, else "undecided"; "alone" where no other gets there, "missed" where own does
-        not and another does, "none" where neither does.
+        ratio; interval, its range over the repetitions drawn again, which is the scatter of these few and no
+        confidence interval, or None; verdict: "ahead" where all of the range is above LEAST, "behind" where it is
+        below 1 / LEAST, else "undecided"; "alone" where no other gets there, "missed" where own does not and another
+        does, "none" where neither does.
     """
     if not own or not others:
         verdict = "alone" if own else "missed" if others else "none"
@@ -174,7 +178,7 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
         strict=True,
     )
     low, high = (float(x) for x in np.percentile(drawn[1] / drawn[0], INTERVAL))
-    verdict = "ahead" if low > 1.0 else "behind" if high < 1.0 else "undecided"
+    verdict = "ahead" if low > LEAST else "behind" if high < 1.0 / LEAST else "undecided"
     return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
 
 
@@ -222,12 +226,31 @@ def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
 
 
 def missed(rows: pd.DataFrame, target: float) -> bool:
-    """Whether one solver was asked for all that it can on a case and has not reached an error."""
-    if (rows["error_q"].astype(float) <= target).any():
+    """Whether one solver was asked for all that it can on a case and has not reached an error.
+
+    That is: at its tightest tolerance, or until it failed by itself. Where it was stopped by a limit of ours, of time
+    or of steps, at a setting finer than the last that ended, it was not asked.
+    """
+    errors, settings = rows["error_q"].astype(float), setting_of(rows)
+    if (errors <= target).any():
         return False
-    settings = setting_of(rows)
+    last = settings[errors.notna().to_numpy()].min(initial=np.inf)
+    if (stopped_by_us(rows) & ~(settings > last)).any():
+        return False
     finest = rows.iloc[int(np.nanargmin(settings))] if np.isfinite(settings).any() else rows.iloc[-1]
-    return bool(pd.isna(finest["error_q"]) or setting_of(rows).min() <= TIGHTEST * (1.0 + 1e-9))
+    return bool(pd.isna(finest["error_q"]) or settings.min() <= TIGHTEST * (1.0 + 1e-9))
+
+
+def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:
+    """Which runs a limit of ours ended: the time of a run, or the most steps that an adapter allows."""
+    said = rows["message"].fillna("") if "message" in rows else pd.Series("", rows.index)
+    return (rows["status"].isin(LIMITED) | said.str.contains(CAPPED)).to_numpy(bool)
+
+
+def tightest(rows: pd.DataFrame) -> float:
+    """The finest setting of one solver on a case at which a run was made that no limit of ours ended; NaN: none was."""
+    made = ~stopped_by_us(rows) & ~rows["status"].isin(NOTHING_RUN).to_numpy()
+    return float(setting_of(rows)[made].min()) if made.any() else float("nan")
 
 
 def why_not(rows: pd.DataFrame, target: float) -> str:
@@ -236,11 +259,11 @@ def why_not(rows: pd.DataFrame, target: float) -> str:
     if reached.empty:
         first = rows["status"].iloc[0]
         return first.lower().replace("_", " ")
-    if not missed(rows, target):
+    finer = setting_of(rows) < setting_of(reached).min()
+    stopped = bool((stopped_by_us(rows) & finer).any()) and bool((reached["error_q"] > target).all())
+    if not stopped and not missed(rows, target):
         return "not asked"
-    best = float(reached["error_q"].min())
-    stopped = bool((rows["status"] == "TIME_LIMIT").any())
-    return f"least error {number(best)}" + (", then time limit" if stopped else "")
+    return f"least error {number(float(reached['error_q'].min()))}" + (", then our limit" if stopped else "")
 
 
 def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = ()) -> list[list[str]]:

@@ -52,6 +52,7 @@ ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 DOMINATED = 2.0  # a solver that costs this many times as much as another at every error is not to be used
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
 STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
+IDA = ("IDA from C", "IDA, ")  # how its lines begin; CVODE is of the same family, and IDAS is CasADi's
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
@@ -81,12 +82,13 @@ def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     ranked = tables.ranking(rows, error)
     found: dict[str, Any] = {"error": error, "ida": None, "default_over": None, "before_default": {}}
     found["standing"] = headline.of_error(rows, error)
-    ida = [own for _, own in rows[rows["solver"].str.startswith("IDA")].groupby("solver")]
+    ida = [own for _, own in rows[rows["solver"].str.startswith(IDA)].groupby("solver")]
     found["ida_missed"] = bool(ida) and all(tables.missed(own, error) for own in ida)
+    found["ida_tightest"] = max((tables.tightest(own) for own in ida), default=None)
     found |= tables.of_both(ranked)
     if ranked.empty:
         return found
-    found["ida"] = tables.best(ranked[ranked["family"] == "SUNDIALS"])
+    found["ida"] = tables.best(ranked[ranked["solver"].str.startswith(IDA)])
     default = ranked[ranked["solver"] == DEFAULT]["call_s"]
     if not default.empty:
         own, cheaper = ranked["family"] == "two-loop", ranked["call_s"] < default.iloc[0]

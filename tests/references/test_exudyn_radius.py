@@ -60,8 +60,16 @@ def test_every_model_runs_with_another_radius(name):
     assert np.abs(result.q[:, 0] - PROBLEMS[name].q0).max() < 1e-12
 
 
-def test_the_radii_are_among_the_rivals():
-    assert {f"Exudyn, GeneralizedAlpha {radius:g}" for radius in RADII} <= set(RIVALS)
+def test_what_its_author_would_take_is_among_the_rivals_and_what_fails_by_its_own_words_is_not():
+    names = {f"Exudyn, GeneralizedAlpha {radius:g}" for radius in RADII}
+    assert names <= set(CATALOGUE) and names & set(RIVALS) == {"Exudyn, GeneralizedAlpha 0.6"}
+    assert {"Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"} <= set(RIVALS)
+
+
+def test_any_number_of_steps_can_be_asked_for():
+    """It takes a multiple of what is stored."""
+    result = CATALOGUE["Exudyn, TrapezoidalIndex2"].run(Case("four-bar", four_bar(), 0.1), 0.1 / 10_007, 0)
+    assert result.success and result.t[-1] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("name", ["DOPRI5", "ODE23"])

@@ -39,7 +39,7 @@ def first(rows, solver):
 
 
 @pytest.mark.parametrize("status", adaptive.ENDING)
-def test_nothing_is_asked_after_a_refusal_or_the_limit(status):
+def test_nothing_is_asked_after_a_refusal(status):
     assert len(made(("a", lambda value: (status, None, None)))) == 1
 
 
@@ -118,3 +118,43 @@ def test_what_is_far_behind_is_not_asked_between_its_settings():
     fast = lambda value: ("REACHED_END", 1e-3 * value, 1e-3)  # noqa: E731
     slow = asked(lambda value: ("REACHED_END", value, 6e-3), fast=fast)
     assert len(slow) == 3
+
+
+def limited(values):
+    return lambda value: ("TIME_LIMIT", None, 1.0) if value in values else good(0.1)(value)
+
+
+def test_a_limit_at_a_loose_setting_moves_to_the_next_and_two_running_end_it():
+    assert first(made(("a", limited(VALUES[:1]))), "a") == len(VALUES)
+    assert first(made(("a", limited(VALUES[1:3]))), "a") == 3
+
+
+def asked_steps(make, errors=(1e-3, 1e-5, 1e-7), start=(300, 1000), **others):
+    """Numbers of steps that a solver of fixed steps was asked for, given make(n) -> status, error, seconds."""
+    case, makers = Case("crane", None, 10.0), {"a": make, **others}
+    solvers = [Solver(name, "any", "compiled", True, "h", None) for name in sorted(makers, reverse=True)]
+    todo = [Run(case, solver, case.t_end / n) for solver in solvers for n in start]
+
+    def row(run, repeat, built):
+        status, error, seconds = makers[run.solver.name](run.case.t_end / run.value)
+        return {"solver": run.solver.name, "case": "crane", "h": run.value, "status": status, "error_q": error} | {
+            "call_s": seconds
+        }
+
+    rows = adaptive.collect(todo, Kept(), row, errors=errors)
+    numbers = sorted({10.0 / h for h in rows[rows["solver"] == "a"]["h"]})
+    assert [round(n) for n in numbers] == pytest.approx(numbers)  # the motion takes a whole number of each
+    return [round(n) for n in numbers]
+
+
+def test_fixed_steps_are_asked_for_beyond_both_ends():
+    second_order = lambda n: ("REACHED_END", 1.0 / n**2, 1e-6 * n)  # noqa: E731
+    numbers = asked_steps(second_order)
+    assert 1.0 / numbers[0] ** 2 > 1e-4 and 1.0 / numbers[-1] ** 2 <= 1e-7
+    fast = lambda n: ("REACHED_END", 1e-3 / n**2, 1e-8 * n)  # noqa: E731
+    assert asked_steps(second_order, fast=fast) == [300, 1000]  # far behind: not asked on
+
+
+def test_between_steps_that_fail_and_those_that_do_not_the_longest_is_sought():
+    numbers = asked_steps(lambda n: ("SOLVER_FAILED", None, 0.1) if n < 500 else ("REACHED_END", 1.0 / n**2, 1e-6 * n))
+    assert [n for n in numbers if 300 < n < 1000] == [548]

@@ -72,6 +72,7 @@ BEST = {"solver": "ours", "call_s": 0.1, "call_q1": 0.1, "call_q3": 0.1, "n_eval
 BEST |= {"called_from": "compiled", "violation_q": 1e-15, "energy": -1e-3}
 THEIRS = BEST | {"solver": "theirs", "call_s": 0.2, "keeps": False, "called_from": "Python", "n_evaluations": 1e4}
 NOTHING = {"ours": None, "others": None, "ida": None, "default_over": None, "ida_missed": False, "standing": None}
+NOTHING |= {"ida_tightest": None}
 
 
 def standing(call_s=0.1, verdict="ahead"):
@@ -82,7 +83,7 @@ def standing(call_s=0.1, verdict="ahead"):
 def at_error(error=1e-4, **changed):
     ida = BEST | {"call_s": 0.3}
     found = {"error": error, "ours": BEST, "others": THEIRS, "ida": ida, "default_over": 2.0}
-    return found | {"ida_missed": False, "standing": standing()} | changed
+    return found | {"ida_missed": False, "ida_tightest": 1e-13, "standing": standing()} | changed
 
 
 def case(**changed):
@@ -120,7 +121,8 @@ def beam(differences_s, paper_s=4.5):
 
 def screen(tmp_path, cases=(), dominated=(), standings=None, **others):
     found = {"cases": list(cases), "dominated": list(dominated), "limit": 2.0, "default": "SunRadau5"}
-    found |= {"rivals": {"standings": standings}} if standings else {}
+    put = {"n": 21, "least": 8, "all": 3, "mechanisms": 23, "counts": 1.05}
+    found |= {"rivals": {"standings": standings, "put": put}} if standings else {}
     for path in tmp_path.glob("*.json"):
         path.unlink()
     if cases:
@@ -235,6 +237,7 @@ def test_solvers_beaten_everywhere_are_listed_worst_first(tmp_path):
 def test_picks_are_joined_where_the_solver_is_the_same():
     prices = ((2, 0.1), (4, 0.4), (6, 0.1))
     lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"call_s": cpu}, "others": THEIRS} for k, cpu in prices]
+    lines = [line | {"standing": standing()} for line in lines]
     found = index.picks(lines)
     assert [(pick["solver"], pick["accuracies"]) for pick in found] == [
         ("ours", ["1e-2", "1e-6"]),

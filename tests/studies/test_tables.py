@@ -79,7 +79,7 @@ def test_a_cell_that_is_not_reached_says_why():
     tightest = made.assign(tol=tables.TIGHTEST)
     assert tables.work_precision(tightest, [1e-5])[0][2] == "least error 1e-4" and tables.missed(tightest, 1e-5)
     limited = pd.concat([made, rows(("a", np.nan, 60.0)).assign(status="TIME_LIMIT", tol=1e-7)])
-    assert tables.work_precision(limited, [1e-5])[0][2] == "least error 1e-4, then time limit"
+    assert tables.work_precision(limited, [1e-5])[0][2] == "least error 1e-4, then our limit"
     nothing = rows(("x", np.nan, np.nan)).assign(status="NOT_APPLICABLE", message="needs a model of its own")
     assert tables.work_precision(nothing, [1e-5])[0][2] == "not applicable"
     assert tables.failures(nothing) == [["x", "all", "not applicable", "needs a model of its own"]]
@@ -100,17 +100,23 @@ def repeated(ours, others):
         ([1.0, 1.1, 0.9, 1.0, 1.05], [2.0, 2.2, 1.9, 2.0, 2.1], "ahead"),
         ([2.0, 2.2, 1.9, 2.0, 2.1], [1.0, 1.1, 0.9, 1.0, 1.05], "behind"),
         ([1.0, 3.0, 0.9, 2.0, 1.2], [1.1, 0.8, 2.5, 1.0, 2.9], "undecided"),
+        ([1.0] * 5, [1.01] * 5, "undecided"),  # a lead of 1 % is none, however well it repeats
+        ([1.01] * 5, [1.0] * 5, "undecided"),
+        ([1.0] * 5, [1.06] * 5, "ahead"),
+        ([1.06] * 5, [1.0] * 5, "behind"),
         ([1.0], [5.0], "undecided"),  # one repetition decides nothing
         ([1.0, 1.1, 0.9, 1.0, 1.05], [1.0, 1.1, 0.9, 1.0, 1.05], "undecided"),
     ],
 )
-def test_a_pair_is_decided_where_the_interval_of_the_ratio_leaves_out_one(ours, others, verdict):
+def test_a_pair_is_decided_where_all_of_the_range_of_the_ratio_is_a_least_effect_from_one(ours, others, verdict):
     costs = tables.costs_at(repeated(ours, others), 1e-3)
     found = tables.compared({"auto": costs["auto"]}, {"heyoka": costs["heyoka"]})
     assert found["verdict"] == verdict and found["ratio"] == pytest.approx(np.median(others) / np.median(ours))
     if len(ours) > 1:
         low, high = found["interval"]
-        assert low <= found["ratio"] <= high and (verdict == "undecided") == (low <= 1.0 <= high)
+        assert low <= found["ratio"] <= high and (verdict == "undecided") == (
+            low <= tables.LEAST and high >= 1.0 / tables.LEAST
+        )
     else:
         assert found["interval"] is None
     again = tables.compared({"auto": costs["auto"]}, {"heyoka": costs["heyoka"]})

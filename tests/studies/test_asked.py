@@ -1,0 +1,121 @@
+"""Who was asked for what: no miss is made of our limits, nobody is alone before all were asked, IDA is not CVODE."""
+
+import pandas as pd
+import pytest
+
+from studies import headline, index, rivals, tables, work_precision
+from studies.render import render
+from tests.studies.test_index import case, energy
+from tests.studies.test_tables import rows
+
+ERROR = 1e-6
+
+
+def runs(*lines):
+    """Rows of (tolerance, error or None, status) of a rival."""
+    made = rows(*(("rival", error, 0.1) for _, error, _ in lines))
+    return made.assign(
+        tol=[tol for tol, *_ in lines],
+        status=[status for *_, status in lines],
+        family="theirs",
+        times=[(0.1,) * 5] * len(lines),
+    )
+
+
+END, LIMIT, FAILED = "REACHED_END", "TIME_LIMIT", "SOLVER_FAILED"
+
+
+@pytest.mark.parametrize(
+    ("lines", "missed"),
+    [
+        ([(1e-3, 1e-3, END), (1e-5, None, LIMIT)], False),  # stopped by us
+        ([(1e-3, 1e-3, END), (1e-5, None, LIMIT), (1e-7, None, FAILED)], False),
+        ([(1e-3, None, LIMIT)], False),
+        ([(1e-3, None, LIMIT), (1e-5, 1e-3, END), (tables.TIGHTEST, 1e-4, END)], True),  # only a loose run was stopped
+        ([(1e-3, 1e-3, END), (1e-5, None, FAILED)], True),
+        ([(1e-3, 1e-3, END), (1e-5, 1e-4, END)], False),  # not asked for more
+        ([(1e-3, 1e-3, END), (1e-5, 1e-7, END), (1e-7, None, FAILED)], False),  # it gets there
+    ],
+)
+def test_a_solver_misses_what_it_was_asked_for_to_its_end(lines, missed):
+    assert tables.missed(runs(*lines), ERROR) is missed
+
+
+@pytest.mark.parametrize("message", ["100000 steps were not enough. Raise most_steps", "CV_TOO_MUCH_WORK at t = 1"])
+def test_the_most_steps_that_an_adapter_allows_are_a_limit_of_ours(message):
+    made = runs((1e-3, 1e-3, END), (1e-5, None, FAILED))
+    assert tables.missed(made, ERROR)
+    made.loc[1, "message"] = message
+    assert not tables.missed(made, ERROR)
+    assert tables.tightest(made) == 1e-3
+
+
+def standing_beside(*rivals):
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=tables.LOOSEST, times=[(0.1,) * 5])
+    named = [own.assign(solver=f"rival {k}") for k, own in enumerate(rivals)]
+    return headline.of_error(pd.concat([ours, *named], ignore_index=True), ERROR)["auto"]["verdict"]
+
+
+def test_ours_is_alone_only_if_all_that_were_put_were_asked_to_their_end():
+    to_the_end, ended = runs((tables.TIGHTEST, 1e-4, END)), runs((1e-3, 1e-3, END))
+    refused = runs((1e-3, None, "RAISED"))
+    assert standing_beside(to_the_end) == standing_beside(to_the_end, refused) == "alone"
+    assert standing_beside(to_the_end, ended) == standing_beside(refused) == "unasked"
+    assert standing_beside(to_the_end, runs((1e-3, None, LIMIT))) == "unasked"
+
+
+def test_ida_is_neither_cvode_nor_casadis_idas():
+    made = [
+        ("auto", "two-loop", 1.0),
+        ("CVODE from C, Adams", "SUNDIALS", 1.5),
+        ("CVODE, Adams", "SUNDIALS", 2.0),
+        ("IDAS, CasADi", "CasADi", 2.5),
+        ("IDA from C, stabilised", "SUNDIALS", 8.0),
+        ("IDA, stabilised", "SUNDIALS", 9.0),
+    ]
+    table = rows(*((name, 1e-7, time) for name, _, time in made)).assign(family=[family for _, family, _ in made])
+    table = table.assign(tol=tables.LOOSEST, times=[(time,) * 5 for *_, time in made])
+    found = work_precision.class_of(table, ERROR)
+    assert found["ida"]["solver"] == "IDA from C, stabilised" and found["others"]["solver"] == "CVODE from C, Adams"
+    (entry,) = index.classes({"work_precision": {"cases": [case(at=[found])]}})
+    assert entry["ida_over"] == [8.0]
+    # IDA misses what CVODE and IDAS reach
+    idas = table["solver"].str.startswith("IDA") & ~table["solver"].str.startswith("IDAS")
+    table.loc[idas, ["error_q", "tol"]] = [1e-3, tables.TIGHTEST]
+    found = work_precision.class_of(table, ERROR)
+    assert found["ida"] is None and found["ida_missed"]
+
+
+def test_the_sentence_on_ida_names_the_tightest_tolerance_that_was_run():
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=tables.LOOSEST, times=[(0.1,) * 5])
+    ida = runs((1e-3, 1e-3, END), (1e-5, None, FAILED)).assign(solver="IDA from C, stabilised", family="SUNDIALS")
+    found = work_precision.class_of(pd.concat([ours, ida], ignore_index=True), ERROR)
+    entries = index.classes({"work_precision": {"cases": [case(at=[found])]}})
+    text = render("advice", {}, {}, advice=index.advice(entries), cases=[], default="auto")
+    assert "IDA does not reach 1e-6, asked for tolerances down to 1e-5." in text
+
+
+def test_of_energies_none_is_said_to_be_alone_as_none_was_asked_to_the_end():
+    found = energy()
+    found["long"]["at"][0]["no_drift"]["others"] = found["long"]["at"][0]["drift"]["others"] = None
+    text = render("advice", {}, {}, advice=index.advice(index.classes({"energy": found})), cases=[], default="auto")
+    assert "no other gets there that was asked, but not all were" in text
+
+
+def test_how_many_rivals_could_be_put_is_counted():
+    """Refusals, by our adapters or for want of a package, are not counted; a run that failed is."""
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=1e-3)
+    there = [runs((1e-3, None, status)).assign(solver=f"rival {status}") for status in (END, LIMIT, FAILED)]
+    refused = [
+        runs((1e-3, None, status)).assign(solver=f"rival {k}") for k, status in enumerate(("RAISED", "NOT_AVAILABLE"))
+    ]
+    some = pd.concat([ours, *there, *refused]).assign(case="hoist")
+    alone = ours.assign(case="robot")
+    every = pd.concat([ours, *there, *(own.assign(status=FAILED) for own in refused)]).assign(case="crane")
+    found = rivals.put(pd.concat([some, alone, every], ignore_index=True))
+    assert found == {"n": 5, "least": 0, "all": 1, "mechanisms": 3, "counts": tables.LEAST}
+    assert rivals.put(every)["least"] == 5
+    text = render("against", {}, {}, put=found, names="heyoka")
+    assert text.startswith("those of 5 rivals") and "all on 1 of 3 mechanisms, 0 where they are fewest (heyoka)" in text
+    assert text.endswith("Ahead and behind are by 5 % at least\n")
+    assert render("against", {}, {}, put=rivals.put(every), names="heyoka").startswith("all 5 rivals")
