@@ -4,7 +4,8 @@ A solver is asked for no more accuracy on a mechanism once it cannot run it, has
 running (a loose one may take longer than the next), has failed at two tolerances running, or has taken more than `FAR`
 times as long as the fastest so far for no smaller an error, at two settings running. Where two of its errors lie more
 than a decade apart it is asked between them, so that nothing need be interpolated over more, and beyond its ends, be
-they tolerances or steps, where these leave accuracies out. A part of `studies.work_precision`.
+they tolerances or steps, where these leave accuracies out. What takes `OUTCLASSED` times as long as another of its side
+is not repeated. A part of `studies.work_precision`.
 """
 
 import itertools
@@ -21,6 +22,7 @@ from studies.tables import DECADE, LOOSEST, NEAR, TIGHTEST
 FAR = 20.0
 RUNNING = 2
 ROUNDS = 4  # of asking between settings
+OUTCLASSED = 10.0  # times the least time of its side: such a run decides nothing, and is made once
 CLOSE = 5.0  # times the time of the fastest: what costs more is not asked between its settings
 ENDING = (*NOTHING_RUN, "RAISED")
 FEWEST_STEPS, MOST_STEPS = 10, 10**6  # of a solver of fixed steps, beyond its grid
@@ -95,9 +97,10 @@ def collect(
         for run in more:
             first(run)
         todo += more
+    again = _repeated(todo, kept)
     for repeat in range(1, max((run.repeats for run in todo), default=0)):
-        for run in todo:
-            if _again(run, repeat, kept) and run.key(repeat) not in kept:
+        for run in again:
+            if repeat < run.repeats and run.key(repeat) not in kept:
                 kept.add(run.key(repeat), make(run, repeat, built))
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
@@ -165,8 +168,21 @@ def _beyond(
     return asked
 
 
-def _again(run: Run, repeat: int, kept: KeptRows) -> bool:
-    """Whether a run is repeated: one that was made and ended."""
-    if repeat >= run.repeats or run.key(0) not in kept:
-        return False
-    return kept[run.key(0)]["error_q"] is not None
+def _repeated(todo: Sequence[Run], kept: KeptRows) -> list[Run]:
+    """The runs that are repeated: those that were made and ended, and whose times may decide who is the fastest.
+
+    These are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error.
+    """
+    sides: dict[tuple[str, bool], list[tuple[float, float, Run]]] = {}
+    for run in todo:
+        if run.key(0) in kept and (row := kept[run.key(0)])["error_q"] is not None:
+            side = run.case.name, run.solver.family == "two-loop"
+            sides.setdefault(side, []).append((row["error_q"], row["call_s"] or 0.0, run))
+    found = set()
+    for ended in sides.values():
+        least = np.inf
+        for _, seconds, run in sorted(ended, key=lambda each: each[:2]):
+            least = min(least, seconds)
+            if seconds <= OUTCLASSED * least:
+                found.add(run.key(0))
+    return [run for run in todo if run.key(0) in found]

@@ -235,6 +235,7 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
         "fewer": fewer,
         "far": adaptive.FAR,
         "running": adaptive.RUNNING,
+        "outclassed": adaptive.OUTCLASSED,
         "limit": rivals.TIME_LIMIT,
     }
 

@@ -62,6 +62,13 @@ def test_an_error_that_nothing_else_reaches_is_not_far_behind():
     assert first(made(("a", lambda value: ("REACHED_END", 1.0, 0.01)), better), "b") == 5
 
 
+def test_what_is_outclassed_on_its_own_side_is_made_once():
+    rows = made(("a", good(0.1)), ("b", good(0.9)), ("c", good(1.5)), repeats=3)
+    assert rows.groupby("solver").size().to_dict() == {"a": 15, "b": 15, "c": 5}
+    finer = ("c", lambda value: ("REACHED_END", 1e-3 * value**4, 1.5))
+    assert len(made(("a", good(0.1)), finer, repeats=3)) == 30
+
+
 def test_failed_runs_are_made_once_and_slow_ones_as_often_as_all():
     def make(value):
         return ("SOLVER_FAILED", None, 0.1) if value == VALUES[1] else ("REACHED_END", value, 0.9)
