@@ -37,7 +37,7 @@ def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 
 
 def asked(rivals: pd.DataFrame, error: float) -> bool:
-    """Whether some rival was put to a case (a refusal is our adapter's), and each of these to the end of what it can."""
+    """Whether rivals were put to a case (a refusal is our adapter's), and all of these to the end of what they can."""
     put = rivals[~rivals["status"].isin((*NOTHING_RUN, "RAISED"))]
     return len(put) > 0 and all(tables.missed(own, error) for _, own in put.groupby("solver"))
 

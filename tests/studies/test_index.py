@@ -107,6 +107,7 @@ def energy(**changed):
         "case": "switching",
         "t_end": 1e4,
         "kinetic": 20.0,
+        "equal": 0.1,
         "at": at,
         "alternatives": [long_run("LSODA", 1.0, False)],
     }
@@ -237,14 +238,30 @@ def test_solvers_beaten_everywhere_are_listed_worst_first(tmp_path):
 def test_picks_are_joined_where_the_solver_is_the_same():
     prices = ((2, 0.1), (4, 0.4), (6, 0.1))
     lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"call_s": cpu}, "others": THEIRS} for k, cpu in prices]
-    lines = [line | {"standing": standing()} for line in lines]
+    lines = [line | {"standing": standing(), "undecided": line["accuracy"] == "1e-6"} for line in lines]
     found = index.picks(lines)
     assert [(pick["solver"], pick["accuracies"]) for pick in found] == [
         ("ours", ["1e-2", "1e-6"]),
         ("theirs", ["1e-4"]),
     ]
+    assert found[0]["undecided"] == ["1e-6"] and found[1]["undecided"] == []
     assert found[0]["over"] == pytest.approx([2.0, 2.0]) and found[1]["over"] == pytest.approx([2.0])
     assert index.picks([{"accuracy": "1e-2", "ours": None, "others": None}]) == []
+
+
+def test_what_is_not_told_apart_is_nobodys_win(tmp_path):
+    near = at_error(standing=standing(verdict="undecided"))
+    made = entries([case(at=[at_error(error=1e-2), near])])
+    assert index.overall(made) == [{"solver": "ours", "n": 1}]
+    text = screen(tmp_path, [case(at=[at_error(error=1e-2), near])])
+    assert "Cheapest of all: `ours` at 1 of the 2 errors; undecided at 1." in text
+    assert "(undecided: 1e-4) |" in text
+    close = energy()
+    close["long"]["at"][0]["drift"]["others"] = long_run("LSODA", 1.9, calm=False)  # of one run each, beside 2.0
+    assert (
+        index.overall(entries([], energy=close)) == []
+        and entries([], energy=energy())[0]["at"][0]["undecided"] is False
+    )
 
 
 def test_classes_come_in_their_order_and_the_long_one_from_the_energy():
