@@ -60,7 +60,7 @@ def _long(known: Sequence[Case], rows: pd.DataFrame) -> dict[str, Any] | None:
 
 
 def _stiff(case: Case, rows: pd.DataFrame) -> dict[str, Any]:
-    """The time of IDA driven from C, the better of its settings, over that of the best of ours; None: not both have one.
+    """The time of IDA driven from C, the better of its settings, over that of the best of ours; None: one has none.
 
     Ahead of it is ours where it gets to every error, and IDA takes longer or was asked to its end and does not.
     """

@@ -253,7 +253,7 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 def ready(findings: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
     geometries = [geometry["case"] for geometry in findings["rivals"]["four_bar"]]
-    first = ["solver", "first call (s)", "least", "most", "later call (ms)", "pays from run"]
+    first = ["solver", "built by", "first call (s)", "least", "most", "later call (ms)", "pays from run"]
     profile = ["worst", "ours", "steps × ns", "rival", "steps × ns", "evaluation (ns)", "without", "in the way"]
     return {
         "goals": table(["rival", "wanted", *geometries], rivals.goal_lines(findings["rivals"])),
