@@ -1,8 +1,8 @@
 """The first call on a mechanism: nothing built, caches cold, a process of its own; from which run building pays.
 
 A part of `studies.work_precision`. The process has an empty folder of caches, but for the kernels of twoloop, which are
-compiled once an installation. It loads the packages by a run on another mechanism; CPU time is that from the start until
-the end of the call that a user writes, with that of compilers.
+compiled once an installation. It loads the packages by a run on another mechanism. CPU time, with that of
+compilers, is from the start until the end of the call that a user writes.
 """
 
 import json

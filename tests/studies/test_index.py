@@ -289,7 +289,7 @@ KEPT = {"ours_keep": True, "irk_grows": False, "ours": [1e-15, 1e-15, 0.0], "t_e
 LOST = long_run("Sun", 1.0) | {"calm": False, "verdict": "lost"}
 STEPS = {"holds": True, "longer": True, "irk": {"share_time": 0.99}, "long": 0.02, "ratios": [170.0, 270.0]}
 VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a"], "only_others": [], "none_right": ["b", "c"], "not_put": ["d"]}
-VALID |= {"n_wrong": {"ours": 1, "others": 57}}
+VALID |= {"n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
 TRAPS = {"n_traps": 15, "ours_bad": [{}], "others_bad": [{}, {}], "missed_by_all": [], "unasked": 0}
 OPPOSITES = {
     "claims": [claims("holds"), claims("holds in part"), claims("not run")],
@@ -311,8 +311,8 @@ def test_each_promise_has_its_opposite(study, tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "right on 17, ours only on 1 that were put to others (and on 1 that our adapters refuse to put" in text
-    assert "1 of ours, 57 of others" in text
+    assert "right on 17, ours only on 1 beside all others that our adapters could put (and on 1 that they" in text
+    assert "1 of 500 of ours, 57 of 300 of others" in text
     assert "1 of ours, 2 of others" in screen(tmp_path, honesty=TRAPS)
     text = screen(tmp_path, robustness={"n_linkages": 300, "long": [{}, {}], "silent": [{}]})
     assert "300 random linkages by 2 of our methods" in text and "1 runs are" in text
