@@ -67,7 +67,7 @@ def _stiff(case: Case, rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"case": case.name, "errors": list(BEAM_ERRORS), "ratios": []}
     found |= {"ours_miss": [], "ida_misses": [], "ida_unasked": []}
     of_case = rows[rows["case"] == case.name]
-    settings = [each for _, each in of_case[of_case["solver"].str.startswith(FROM_C)].groupby("solver")]
+    settings = [each for _, each in tables.put(of_case[of_case["solver"].str.startswith(FROM_C)]).groupby("solver")]
     for error in BEAM_ERRORS:
         ranked = tables.ranking(of_case, error)
         own = ranked if ranked.empty else ranked[ranked["family"] == "two-loop"]

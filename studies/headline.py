@@ -11,7 +11,6 @@ from typing import Any
 import pandas as pd
 
 from studies import tables
-from studies.bench import NOTHING_RUN
 from studies.solvers import COMPILED, DEFAULT, HEYOKA
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
@@ -38,7 +37,7 @@ def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 
 def asked(rivals: pd.DataFrame, error: float) -> bool:
     """Whether rivals were put to a case (a refusal is our adapter's), and all of these to the end of what they can."""
-    put = rivals[~rivals["status"].isin((*NOTHING_RUN, "RAISED"))]
+    put = tables.put(rivals)
     return len(put) > 0 and all(tables.missed(own, error) for _, own in put.groupby("solver"))
 
 
@@ -108,7 +107,7 @@ def _priced(runs: pd.DataFrame, error: float) -> dict[str, Any]:
         line = runs[runs["solver"] == best[1]].iloc[0]
         told = {"keeps": bool(line["keeps_constraints"]), "from_python": bool(line["called_from"] == "Python")}
         return {"solver": best[1], "call_s": float(best[0]), "why": None} | told
-    put = runs[~runs["status"].isin((*NOTHING_RUN, "RAISED"))]
+    put = tables.put(runs)
     missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
     why = "not run" if put.empty else "not reached" if missed else "not asked"
     return {"solver": None, "call_s": None, "why": why, "keeps": True, "from_python": False}

@@ -79,6 +79,9 @@ def test_ida_is_neither_cvode_nor_casadis_idas():
     assert found["ida"]["solver"] == "IDA from C, stabilised" and found["others"]["solver"] == "CVODE from C, Adams"
     (entry,) = index.classes({"work_precision": {"cases": [case(at=[found])]}})
     assert entry["ida_over"] == [8.0]
+    refused = table.assign(status="NOT_APPLICABLE", error_q=None, call_s=None)
+    found = work_precision.class_of(pd.concat([table[:1], refused[4:]]), ERROR)
+    assert not found["ida_missed"] and found["ida_tightest"] is None
     # IDA misses what CVODE and IDAS reach
     idas = table["solver"].str.startswith("IDA") & ~table["solver"].str.startswith("IDAS")
     table.loc[idas, ["error_q", "tol"]] = [1e-3, tables.TIGHTEST]
