@@ -233,8 +233,8 @@ def put(rows: pd.DataFrame) -> pd.DataFrame:
 def missed(rows: pd.DataFrame, target: float) -> bool:
     """Whether one solver, which was put to a case, was asked for all that it can and has not reached an error.
 
-    That is: at its tightest tolerance, or until it failed by itself. Where it was stopped by a limit of ours, of time
-    or of steps, at a setting finer than the last that ended, it was not asked.
+    That is: at its tightest tolerance, or until it failed by itself where a looser one had ended. Where it was stopped
+    by a limit of ours, of time or of steps, at a setting finer than the last that ended, it was not asked.
     """
     errors, settings = rows["error_q"].astype(float), setting_of(rows)
     if (errors <= target).any():
@@ -242,8 +242,8 @@ def missed(rows: pd.DataFrame, target: float) -> bool:
     last = settings[errors.notna().to_numpy()].min(initial=np.inf)
     if (stopped_by_us(rows) & ~(settings > last)).any():
         return False
-    finest = rows.iloc[int(np.nanargmin(settings))] if np.isfinite(settings).any() else rows.iloc[-1]
-    return bool(pd.isna(finest["error_q"]) or settings.min() <= TIGHTEST * (1.0 + 1e-9))
+    finest = float(np.nanmin(settings, initial=np.inf))
+    return bool(finest < last < np.inf or finest <= TIGHTEST * (1.0 + 1e-9))
 
 
 def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:

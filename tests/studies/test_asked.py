@@ -31,6 +31,8 @@ END, LIMIT, FAILED = "REACHED_END", "TIME_LIMIT", "SOLVER_FAILED"
         ([(1e-3, 1e-3, END), (1e-5, None, LIMIT)], False),  # stopped by us
         ([(1e-3, 1e-3, END), (1e-5, None, LIMIT), (1e-7, None, FAILED)], False),
         ([(1e-3, None, LIMIT)], False),
+        ([(1e-3, None, FAILED), (1e-5, None, FAILED)], False),  # tighter ones may do better
+        ([(1e-3, None, FAILED), (tables.TIGHTEST, None, FAILED)], True),
         ([(1e-3, None, LIMIT), (1e-5, 1e-3, END), (tables.TIGHTEST, 1e-4, END)], True),  # only a loose run was stopped
         ([(1e-3, 1e-3, END), (1e-5, None, FAILED)], True),
         ([(1e-3, 1e-3, END), (1e-5, 1e-4, END)], False),  # not asked for more

@@ -198,7 +198,7 @@ def test_a_price_that_is_missing_says_why():
     [
         ({"status": "RAISED", "error_q": None}, "unasked"),  # our adapter refuses
         ({"status": "TIME_LIMIT", "error_q": None}, "unasked"),  # our limit
-        ({"status": "SOLVER_FAILED", "error_q": None}, "alone"),
+        ({"status": "SOLVER_FAILED", "error_q": None, "tol": tables.TIGHTEST}, "alone"),
         ({"error_q": 0.1, "tol": tables.TIGHTEST}, "alone"),
         ({"error_q": 0.1, "tol": 1e-3}, "unasked"),
     ],
