@@ -121,6 +121,8 @@ def test_how_many_rivals_could_be_put_is_counted():
     assert found == {"n": 5, "least": 0, "all": 1, "mechanisms": 3, "counts": tables.LEAST}
     assert rivals.put(every)["least"] == 5
     text = render("against", {}, {}, put=found, names="heyoka")
-    assert text.startswith("those of 5 rivals") and "all on 1 of 3 mechanisms, 0 where they are fewest (heyoka)" in text
+    assert (
+        text.startswith("those of 5 rivals (heyoka; ") and "all on 1 of 3 mechanisms, 0 where they are fewest." in text
+    )
     assert text.endswith("Ahead and behind are by 5 % at least\n")
     assert render("against", {}, {}, put=rivals.put(every), names="heyoka").startswith("all 5 rivals")
