@@ -51,18 +51,25 @@ def _only(costs: tables.Costs, name: str) -> tables.Costs:
     return {name: costs[name]} if name in costs else {}
 
 
-def counted(found: Iterable[Mapping[str, Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:
     """Of many pairs of mechanism and error, in how many each of the three is ahead, behind, undecided, alone, missing.
 
-    n are the pairs that any of ours or of others reaches.
+    `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
+    unbeaten the mechanisms, of n_mechanisms, at no error of which it is behind or missing where others get to.
     """
-    pairs = [each for each in found if any(standing["verdict"] != "none" for standing in each.values())]
+    mechanisms = [list(own) for own in found]
+    pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
     made = []
     for name in (DEFAULT, OWN_CODE, BEST):
         verdicts = [each[name]["verdict"] for each in pairs]
         line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
+        by_mechanism = [{each[name]["verdict"] for each in own} for own in mechanisms]
+        line["unbeaten"] = sum(not each & {"behind", "missed"} and each != {"none"} for each in by_mechanism)
+        line["n_mechanisms"] = len(mechanisms)
         # "none" counts, too: the one in question does not get there, another of ours does
-        made.append({"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line.values())})
+        made.append(
+            {"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line[verdict] for verdict in STANDINGS)}
+        )
     return made
 
 

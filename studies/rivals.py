@@ -152,7 +152,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
     behind = [at for at in every if at["verdict"] == "behind"]
     found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
-    found["standings"] = headline.counted(at["standing"] for each in made for at in each["at"])
+    found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
     rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
     found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}

@@ -135,9 +135,11 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "that our adapters could put: all on 1 of 2 ",
         f"mechanisms, {n_put} where they are fewest. ",
         "Ahead and behind are by 5 % at least:",
-        count("auto") + f"{2 * N}, undecided in 0; in 0 no rival gets there.",
-        count("auto, compiled") + f"{N}, undecided in 0; in 0 no rival gets there.",
-        count(None) + f"{N}, undecided in 0; in 0 no rival gets there.",
+        count("auto")
+        + f"{2 * N}, undecided in 0; in 0 no rival gets there; on 0 of 2 mechanisms it is nowhere behind.",
+        count("auto, compiled")
+        + f"{N}, undecided in 0; in 0 no rival gets there; on 1 of 2 mechanisms it is nowhere behind.",
+        count(None) + f"{N}, undecided in 0; in 0 no rival gets there; on 1 of 2 mechanisms it is nowhere behind.",
         "takes 15 to 48 times the time of the cheapest of them, for 1e-2, 1e-4 and 1e-6 (",
         "wrong with success and no warning are 1 of 67 runs of the default, 2 of 63 of the compiled default, ",
         "3 of 65 of our other methods and 4 of 67 of other projects' solvers",
@@ -209,7 +211,7 @@ def test_ours_alone_is_said_only_where_others_were_asked(changed, verdict):
     table = pd.concat([rows(mine), rows({"heyoka": SOLVERS["heyoka"]}, **changed)], ignore_index=True)
     found = headline.of_error(table, 1e-4)
     assert {standing["verdict"] for standing in found.values()} == {verdict}
-    line = headline.counted([found])[0]
+    line = headline.counted([[found]])[0]
     assert (line["alone"], line["unasked"], line["missed"]) == (int(verdict == "alone"), int(verdict == "unasked"), 0)
     made = rivals.findings_of(table)
     assert made["alone"] == [FOUR_BAR] and made["not_put"] == ([FOUR_BAR] if verdict == "unasked" else [])

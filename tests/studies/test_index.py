@@ -365,7 +365,16 @@ def test_each_of_default_compiled_default_and_best_stands_in_the_table_by_its_ve
 
 
 def test_the_counts_of_the_headline_stand_first_on_both_screens(tmp_path):
-    counts = {"ahead": 51, "behind": 123, "undecided": 20, "alone": 4, "missed": 2, "n": 200}
+    counts = {
+        "ahead": 51,
+        "behind": 123,
+        "undecided": 20,
+        "alone": 4,
+        "missed": 2,
+        "n": 200,
+        "unbeaten": 4,
+        "n_mechanisms": 23,
+    }
     standings = [counts | {"name": name} for name in ("auto", "auto, compiled", "best of ours")]
     standings[2] |= {"ahead": 158, "behind": 1, "missed": 0}
     said = (
