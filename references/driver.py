@@ -1,6 +1,7 @@
 """What the adapters of all solvers share: checks of their arguments, and a limit on the time of a run."""
 
 import math
+import os
 import time
 from collections.abc import Iterable
 from typing import Any, Self
@@ -15,6 +16,11 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 
+def cpu_time() -> float:
+    """CPU time of this process and of the compilers that it called, s."""
+    return time.process_time() + sum(os.times()[2:4])
+
+
 class UserCall:
     """The CPU time of the call that a user of a solver writes, by the clock of the process.
 
@@ -26,10 +32,14 @@ class UserCall:
     ----------
     seconds : float or None
         Of the last call that was marked.
+    ended : float or None
+        `cpu_time` at the end of the first that was marked since this was None: what was built before it is in it, and
+        nothing of a second run for the output.
     """
 
     def __init__(self) -> None:
         self.seconds: float | None = None
+        self.ended: float | None = None
         self._began = 0.0
 
     def __enter__(self) -> Self:
@@ -38,6 +48,7 @@ class UserCall:
 
     def __exit__(self, *_: object) -> None:
         self.seconds = time.process_time() - self._began
+        self.ended = cpu_time() if self.ended is None else self.ended
 
 
 user_call = UserCall()  # one: a process makes one run at a time

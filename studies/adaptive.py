@@ -1,11 +1,11 @@
 """Rows of many solvers on many mechanisms in bounded time: each from its loosest setting on, until more is of no use.
 
 A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit at two settings
-running (a loose one may take longer than the next), has failed at two tolerances running, or has taken more than `FAR`
-times as long as the fastest so far for no smaller an error, at two settings running. Where two of its errors lie more
-than a decade apart it is asked between them, so that nothing need be interpolated over more, and beyond its ends, be
-they tolerances or steps, where these leave accuracies out. What takes `OUTCLASSED` times as long as another of its side
-is not repeated. A part of `studies.work_precision`.
+running (a loose one may take longer than the next), has failed at two tolerances running after one that ended, or has
+taken more than `FAR` times as long as the fastest so far for no smaller an error, at two settings running. Where two of
+its errors lie more than a decade apart it is asked between them, so that nothing need be interpolated over more, and
+beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes `OUTCLASSED`
+times as long as another of its side is not repeated. A part of `studies.work_precision`.
 """
 
 import itertools
@@ -35,11 +35,12 @@ class _Progress:
     """How one solver has done on one mechanism so far."""
 
     def __init__(self) -> None:
-        self.ended, self.failed, self.far, self.stopped = False, 0, 0, 0
+        self.ended, self.reached, self.failed, self.far, self.stopped = False, False, 0, 0, 0
 
     def judge(self, row: Row, fastest: float | None, all_asked: bool, tolerances: bool) -> None:
         """Take a first repetition into account; `fastest`: the least time so far for no larger an error."""
-        self.failed = self.failed + 1 if row["error_q"] is None else 0
+        self.reached = self.reached or row["error_q"] is not None
+        self.failed = self.failed + 1 if row["error_q"] is None and self.reached else 0
         self.stopped = self.stopped + 1 if row["status"] == "TIME_LIMIT" else 0
         far = fastest is not None and (row["call_s"] or 0.0) > FAR * fastest
         self.far = self.far + 1 if far and row["error_q"] is not None else 0

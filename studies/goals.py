@@ -60,16 +60,27 @@ def _long(known: Sequence[Case], rows: pd.DataFrame) -> dict[str, Any] | None:
 
 
 def _stiff(case: Case, rows: pd.DataFrame) -> dict[str, Any]:
-    """The time of IDA driven from C, the better of its settings, over that of the best of ours; None: it misses it."""
+    """The time of IDA driven from C, the better of its settings, over that of the best of ours; None: one has none.
+
+    Ahead of it is ours where it gets to every error, and IDA takes longer or was asked to its end and does not.
+    """
     found: dict[str, Any] = {"case": case.name, "errors": list(BEAM_ERRORS), "ratios": []}
+    found |= {"ours_miss": [], "ida_misses": [], "ida_unasked": []}
+    of_case = rows[rows["case"] == case.name]
+    settings = [each for _, each in tables.put(of_case[of_case["solver"].str.startswith(FROM_C)]).groupby("solver")]
     for error in BEAM_ERRORS:
-        ranked = tables.ranking(rows[rows["case"] == case.name], error)
+        ranked = tables.ranking(of_case, error)
         own = ranked if ranked.empty else ranked[ranked["family"] == "two-loop"]
         ida = ranked if ranked.empty else ranked[ranked["solver"].str.startswith(FROM_C)]
         told = len(own) > 0 and len(ida) > 0
         found["ratios"].append(float(ida["call_s"].iloc[0] / own["call_s"].iloc[0]) if told else None)
+        found["ours_miss"] += [] if len(own) else [error]
+        if not len(ida):
+            missed = bool(settings) and all(tables.missed(each, error) for each in settings)
+            found["ida_misses" if missed else "ida_unasked"].append(error)
     compared = [ratio for ratio in found["ratios"] if ratio is not None]
-    return found | {"compared": compared, "ahead": bool(compared) and min(compared) > 1.0}
+    lost = bool(found["ours_miss"]) or any(ratio <= tables.LEAST for ratio in compared)
+    return found | {"lost": lost, "ahead": not lost and not found["ida_unasked"]}
 
 
 def _violation(rows: pd.DataFrame) -> dict[str, Any] | None:

@@ -11,7 +11,6 @@ from typing import Any
 import pandas as pd
 
 from studies import tables
-from studies.bench import NOTHING_RUN
 from studies.solvers import COMPILED, DEFAULT, HEYOKA
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
@@ -37,8 +36,8 @@ def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 
 
 def asked(rivals: pd.DataFrame, error: float) -> bool:
-    """Whether some rival was put to a case (a refusal is our adapter's), and each of these to the end of what it can."""
-    put = rivals[~rivals["status"].isin((*NOTHING_RUN, "RAISED"))]
+    """Whether rivals were put to a case (a refusal is our adapter's), and all of these to the end of what they can."""
+    put = tables.put(rivals)
     return len(put) > 0 and all(tables.missed(own, error) for _, own in put.groupby("solver"))
 
 
@@ -52,18 +51,25 @@ def _only(costs: tables.Costs, name: str) -> tables.Costs:
     return {name: costs[name]} if name in costs else {}
 
 
-def counted(found: Iterable[Mapping[str, Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:
     """Of many pairs of mechanism and error, in how many each of the three is ahead, behind, undecided, alone, missing.
 
-    n are the pairs that any of ours or of others reaches.
+    `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
+    unbeaten the mechanisms, of n_mechanisms, at no error of which it is behind or missing where others get to.
     """
-    pairs = [each for each in found if any(standing["verdict"] != "none" for standing in each.values())]
+    mechanisms = [list(own) for own in found]
+    pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
     made = []
     for name in (DEFAULT, OWN_CODE, BEST):
         verdicts = [each[name]["verdict"] for each in pairs]
         line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
+        by_mechanism = [{each[name]["verdict"] for each in own} for own in mechanisms]
+        line["unbeaten"] = sum(not each & {"behind", "missed"} and each != {"none"} for each in by_mechanism)
+        line["n_mechanisms"] = len(mechanisms)
         # "none" counts, too: the one in question does not get there, another of ours does
-        made.append({"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line.values())})
+        made.append(
+            {"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line[verdict] for verdict in STANDINGS)}
+        )
     return made
 
 
@@ -108,7 +114,7 @@ def _priced(runs: pd.DataFrame, error: float) -> dict[str, Any]:
         line = runs[runs["solver"] == best[1]].iloc[0]
         told = {"keeps": bool(line["keeps_constraints"]), "from_python": bool(line["called_from"] == "Python")}
         return {"solver": best[1], "call_s": float(best[0]), "why": None} | told
-    put = runs[~runs["status"].isin((*NOTHING_RUN, "RAISED"))]
+    put = tables.put(runs)
     missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
     why = "not run" if put.empty else "not reached" if missed else "not asked"
     return {"solver": None, "call_s": None, "why": why, "keeps": True, "from_python": False}

@@ -66,8 +66,8 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     if "energy" in found:
         long = found["energy"]["long"]
         case = {"name": f"four-bar, {long['case']}", "t_end": long["t_end"]}
-        made.append(_entry(LONG, case, [_at_energy(at, "no_drift", "drift") for at in long["at"]]))
-        made[-1]["without_drift"] = picks([_at_energy(at, "no_drift") for at in long["at"]])
+        made.append(_entry(LONG, case, [_at_energy(at, long["equal"], "no_drift", "drift") for at in long["at"]]))
+        made[-1]["without_drift"] = picks([_at_energy(at, long["equal"], "no_drift") for at in long["at"]])
     return made
 
 
@@ -84,20 +84,25 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     """The line of a largest position error."""
     told = {key: at[key] for key in ("ida", "ida_missed", "ida_tightest", "standing")}
     line: dict[str, Any] = {"accuracy": power(at["error"]), **told, **dict.fromkeys(WHOSE)}
+    line["undecided"] = at["standing"] is not None and at["standing"][BEST]["verdict"] == "undecided"
     for which in (which for which in WHOSE if at[which]):
         line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
     return line
 
 
-def _at_energy(at: dict[str, Any], *kinds: str) -> dict[str, Any]:
-    """The line of a largest energy error, from runs with a drift, without, or both."""
+def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
+    """The line of a largest energy error, from runs with a drift, without, or both.
+
+    These are made once: times that differ by less than a share `equal` are not told apart.
+    """
     line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
     for which in WHOSE:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:
             best = min(runs, key=lambda run: float(run["call_s"]))
             line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": best["drifts"]}
-    return line
+    costs = sorted(line[which]["call_s"] for which in WHOSE if line[which])
+    return line | {"undecided": len(costs) > 1 and costs[0] > (1.0 - equal) * costs[1]}
 
 
 def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -109,9 +114,11 @@ def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             which = min(runs)[1]
             best, other = line[which], line["others" if which == "ours" else "ours"]
             new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours", "asked": True}
+            new["undecided"] = []
             pick = made.setdefault(best["solver"], new | {"accuracies": [], "call_s": [], "over": []})
             pick["accuracies"].append(line["accuracy"])
             pick["call_s"].append(best["call_s"])
+            pick["undecided"] += [line["accuracy"]] if line["undecided"] else []
             pick["over"] += [other["call_s"] / best["call_s"]] if other else []
             # of no other time is known: none gets there only if all were asked to their end, which for energies none is
             standing = line["standing"]
@@ -130,11 +137,14 @@ def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 
 
 def overall(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Solvers that are the cheapest of all at any error of any entry, and at how many; the most frequent first."""
+    """Solvers that are the cheapest of all at any error of any entry, and at how many; the most frequent first.
+
+    Errors at which ours and others are not told apart count for nobody.
+    """
     chosen: Counter[str] = Counter()
     for pick in (pick for entry in entries for pick in entry["picks"]):
-        chosen[pick["solver"]] += len(pick["accuracies"])
-    return [{"solver": solver, "n": n} for solver, n in chosen.most_common()]
+        chosen[pick["solver"]] += len(pick["accuracies"]) - len(pick["undecided"])
+    return [{"solver": solver, "n": n} for solver, n in chosen.most_common() if n]
 
 
 def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
@@ -169,6 +179,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     more = {"studies": studies, "energy_figure": figure, "times": per_evaluation(entries), "overall": overall(entries)}
     told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
     more["drifting"] = any(best["drifts"] for best in told)
+    more["n_undecided"] = sum(at["undecided"] for entry in entries for at in entry["at"])
     more["n_errors"] = sum(len(entry["at"]) for entry in entries)
     more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
     more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 
 from references.four_bar_minimal import MinimalFourBar
 from references.many_at_once import by_diffrax, by_heyoka
+from studies import tables
+from studies.bench import REPEATS
 from twoloop import Result, solve_dae, sweep
 from twoloop.mechanisms import Problem
 
@@ -17,7 +20,9 @@ Array = NDArray[np.float64]
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
 
 GROUP = "many"
-TOLERANCES = (1e-6, 1e-9)
+TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1e-6, 1e-9)
+ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
+FLOOR = 1e-11  # to which the equation in one coordinate is known
 SWEEP, SINGLE, HEYOKA, DIFFRAX = (
     "twoloop.sweep, one thread",
     "solve_dae, one by one",
@@ -65,41 +70,58 @@ def ways(make: Callable[..., Problem], given: Sequence[dict[str, Any]], t_end: f
 
 
 def rows_of(
-    make: Callable[..., Problem], given: Sequence[dict[str, Any]], t_end: float, names: Sequence[str]
+    make: Callable[..., Problem], given: Sequence[dict[str, Any]], t_end: float, names: Sequence[str], quick: bool
 ) -> Iterator[dict[str, Any]]:
-    """A row for each way and tolerance: CPU time of the second call by a run, of the first, errors at the end."""
+    """A row for each way, tolerance and repetition: CPU time by a run, that of the first call, errors at the end.
+
+    The calls after the first are repeated in turn, so that a slow minute of the machine falls on all alike.
+    """
     known = [MinimalFourBar.from_parameters(make(**one).parameters) for one in given]
     true = np.array([each.states(np.array([t_end]))[0][:, 0] for each in known])
+    made = ways(make, given, t_end)
+    solves: dict[str, Solve] = {}
     for name in names:
         try:
-            solve = ways(make, given, t_end)[name]()
+            solves[name] = made[name]()
         except ImportError as why:
             yield {"group": GROUP, "way": name, "message": f"not installed: {why}"}
-            continue
-        for tol in TOLERANCES:
-            seconds, ends = [], true
-            for _ in range(2):
-                began = time.process_time()
-                ends = solve(tol)
-                seconds.append(time.process_time() - began)
+    for tol in QUICK_TOLERANCES if quick else TOLERANCES:
+        first = {name: _timed(solve, tol)[0] for name, solve in solves.items()}
+        for repeat, (name, solve) in product(range(1 if quick else REPEATS), solves.items()):
+            spent, ends = _timed(solve, tol)
             errors = np.abs(ends - true).max(axis=1)
-            row = {"group": GROUP, "way": name, "tol": tol, "n_runs": len(given), "first_s": seconds[0]}
-            row |= {"run_s": seconds[1] / len(given), "n_failed": int(np.isnan(errors).sum())}
+            row = {"group": GROUP, "way": name, "tol": tol, "repeat": repeat, "n_runs": len(given)}
+            row |= {"first_s": first[name], "run_s": spent / len(given), "n_failed": int(np.isnan(errors).sum())}
             good = errors[~np.isnan(errors)]
             yield row | (
                 {"error_median": float(np.median(good)), "error_worst": float(good.max())} if good.size else {}
             )
 
 
+def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
+    began = time.process_time()
+    ends = solve(tol)
+    return time.process_time() - began, ends
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any] | None:
-    """The ways that ran, and the cheapest of all at the tightest tolerance over our sweep; None where none was run."""
+    """The ways that ran, and at equal error ours beside the others; None where no sweep was run.
+
+    The error of a way is the largest of its runs, at a tolerance at which none failed.
+    """
     made = rows[rows["group"] == GROUP]
-    names = ("way", "tol", "n_runs", "run_s", "first_s", "error_median", "error_worst", "n_failed")
-    lines = [{name: row[name] for name in names} for _, row in made.iterrows() if pd.notna(row["tol"])]
-    last = [line for line in lines if line["tol"] == min(TOLERANCES) and line["n_failed"] == 0]
-    swept = [line for line in last if line["way"] == SWEEP]
-    if not swept:
+    if "tol" not in made or SWEEP not in set(made["way"]):
         return None
-    best = min(last, key=lambda line: line["run_s"])
-    found = {"lines": lines, "n": int(best["n_runs"]), "tol": best["tol"], "best": best["way"]}
-    return found | {"ours": best["way"] in (SWEEP, SINGLE), "over": swept[0]["run_s"] / best["run_s"]}
+    made = made[made["tol"].notna()]  # of packages that are there
+    made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=FLOOR)
+    made = made.assign(solver=made["way"], status="REACHED_END").sort_values(["way", "tol", "repeat"])
+    medians = tables.medians(made)
+    names = ("way", "tol", "call_s", "first_s", "error_median", "error_worst", "n_failed")
+    own, at = medians["way"].isin((SWEEP, SINGLE)), []
+    for error in ERRORS:
+        ours, others = tables.costs_at(medians[own], error), tables.costs_at(medians[~own], error, doubt=True)
+        cheapest = [min(side, key=lambda name: side[name][0], default=None) for side in (ours, others)]
+        at.append({"error": error, "ours": cheapest[0], "rival": cheapest[1], **tables.compared(ours, others)})
+    order = {way: k for k, way in enumerate((SWEEP, SINGLE, HEYOKA, DIFFRAX))}
+    lines = sorted(medians[list(names)].to_dict("records"), key=lambda line: (order[line["way"]], -line["tol"]))
+    return {"lines": lines, "n": int(made["n_runs"].iloc[0]), "repeats": int(medians["repeats"].max()), "at": at}

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from references.four_bar_minimal import MinimalFourBar
 from studies import adaptive, figures, headline, tables
-from studies.bench import NOTHING_RUN, REPEATS, Run, warm_up
+from studies.bench import REPEATS, Run, warm_up
 from studies.cases.four_bar import SECOND
 from studies.cli import StudyError
 from studies.end_states import case_of, row_of
@@ -152,7 +152,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
     behind = [at for at in every if at["verdict"] == "behind"]
     found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
-    found["standings"] = headline.counted(at["standing"] for each in made for at in each["at"])
+    found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
     rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
     found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
@@ -172,7 +172,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 def put(rows: pd.DataFrame) -> dict[str, Any]:
     """How many of the rivals our adapters could put to the mechanisms, and the ratio from which a lead counts."""
     others = rows[rows["family"] != "two-loop"]
-    there = others[~others["status"].isin((*NOTHING_RUN, "RAISED"))].groupby("case")["solver"].nunique()
+    there = tables.put(others).groupby("case")["solver"].nunique()
     there, n = there.reindex(rows["case"].unique(), fill_value=0), int(others["solver"].nunique())
     found = {"n": n, "least": int(there.min()), "all": int((there == n).sum()), "mechanisms": len(there)}
     return found | {"counts": tables.LEAST}

@@ -110,7 +110,7 @@ def make(output: Output) -> pd.DataFrame:
     several = many_runs.assembled(linkage, drawn(N_RUNS if not quick else N_QUICK), N_MANY_QUICK if quick else N_MANY)
     # diffrax takes ten seconds to compile: not for a quick run
     names = (many_runs.SWEEP, many_runs.SINGLE, many_runs.HEYOKA, *(() if quick else (many_runs.DIFFRAX,)))
-    parts.append(pd.DataFrame(many_runs.rows_of(linkage, several, SPAN[1], names)))
+    parts.append(pd.DataFrame(many_runs.rows_of(linkage, several, SPAN[1], names, quick)))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -173,7 +173,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     cells = [(row["parallel"], int(row["workers"]), row["wall"]) for _, row in scaling.iterrows()]
     ready = {"scaling": table(["workers are", "number", "wall-clock time (s)"], cells)}
     many = found["many"]["lines"] if found["many"] else []
-    lines = [(e["way"], e["tol"], 1e3 * e["run_s"], e["first_s"], e["error_median"], e["error_worst"]) for e in many]
+    lines = [(e["way"], e["tol"], 1e3 * e["call_s"], e["first_s"], e["error_median"], e["error_worst"]) for e in many]
     names = ["way", "tolerance", "CPU time a run (ms)", "first call (s)", "median error", "largest error"]
     ready["many"] = table(names, lines)
     text = render("sweep_linkages", found, ready, stamp=line, quick=output.call.quick)

@@ -225,11 +225,16 @@ def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
     return {"ours": best(ranked[own]), "others": best(ranked[~own])}
 
 
-def missed(rows: pd.DataFrame, target: float) -> bool:
-    """Whether one solver was asked for all that it can on a case and has not reached an error.
+def put(rows: pd.DataFrame) -> pd.DataFrame:
+    """Those rows for which a solver was started: a refusal is our adapter's, and says nothing of the solver."""
+    return rows[~rows["status"].isin((*NOTHING_RUN, "RAISED"))]
 
-    That is: at its tightest tolerance, or until it failed by itself. Where it was stopped by a limit of ours, of time
-    or of steps, at a setting finer than the last that ended, it was not asked.
+
+def missed(rows: pd.DataFrame, target: float) -> bool:
+    """Whether one solver, which was put to a case, was asked for all that it can and has not reached an error.
+
+    That is: at its tightest tolerance, or until it failed by itself where a looser one had ended. Where it was stopped
+    by a limit of ours, of time or of steps, at a setting finer than the last that ended, it was not asked.
     """
     errors, settings = rows["error_q"].astype(float), setting_of(rows)
     if (errors <= target).any():
@@ -237,8 +242,8 @@ def missed(rows: pd.DataFrame, target: float) -> bool:
     last = settings[errors.notna().to_numpy()].min(initial=np.inf)
     if (stopped_by_us(rows) & ~(settings > last)).any():
         return False
-    finest = rows.iloc[int(np.nanargmin(settings))] if np.isfinite(settings).any() else rows.iloc[-1]
-    return bool(pd.isna(finest["error_q"]) or settings.min() <= TIGHTEST * (1.0 + 1e-9))
+    finest = float(np.nanmin(settings, initial=np.inf))
+    return bool(finest < last < np.inf or finest <= TIGHTEST * (1.0 + 1e-9))
 
 
 def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:
@@ -249,8 +254,8 @@ def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:
 
 def tightest(rows: pd.DataFrame) -> float:
     """The finest setting of one solver on a case at which a run was made that no limit of ours ended; NaN: none was."""
-    made = ~stopped_by_us(rows) & ~rows["status"].isin(NOTHING_RUN).to_numpy()
-    return float(setting_of(rows)[made].min()) if made.any() else float("nan")
+    made = put(rows[~stopped_by_us(rows)])
+    return float(setting_of(made).min()) if len(made) else float("nan")
 
 
 def why_not(rows: pd.DataFrame, target: float) -> str:

@@ -201,7 +201,8 @@ def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
         some = tight[own & tight["digits_q"].notna()]
         best = some.loc[some["digits_q"].astype(float).idxmax()] if len(some) else None
         found[which] = None if best is None else {"solver": best["solver"], "digits": float(best["digits_q"])}
-        found[f"{which}_ran"] = bool((tight[own]["outcome"] != "not run").any())
+        put = tight[own & (tight["outcome"] != "not run")]
+        found[f"{which}_put"], found[f"{which}_stopped"] = len(put), bool((put["status"] == "TIME_LIMIT").any())
         found[f"{which}_right"] = tight[own & (tight["outcome"] == "right")]["solver"].tolist()
     return found
 
@@ -261,8 +262,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ]
     found["only_others"] = [line["case"] for line in problems if line["others_right"] and not line["ours_right"]]
     alone = [line for line in problems if line["ours_right"] and not line["others_right"]]
-    found["only_ours"] = [line["case"] for line in alone if line["others_ran"]]
-    found["not_put"] = [line["case"] for line in alone if not line["others_ran"]]
+    # alone is ours where others were put to it and none of these was ended by our limit of time
+    asked = [line["case"] for line in alone if line["others_put"] and not line["others_stopped"]]
+    found["only_ours"] = [{"case": line["case"], "put": line["others_put"]} for line in alone if line["case"] in asked]
+    found["not_put"] = [line["case"] for line in alone if line["case"] not in asked]
+    found["n_others"] = int(rows[rows["family"] != "two-loop"]["solver"].nunique())
     singular = [problem.name for problem in (make() for make in MAKE) if "singular" in problem.tags]
     found["none_right_singular"] = all(
         line["case"] in singular for line in problems if not line["ours_right"] and not line["others_right"]
@@ -291,6 +295,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["n_inexact"] = {"ours": int(inexact.sum()), "others": int((~inexact).sum())}
     found["exact"] = EXACT
     found["n_wrong"] = {"ours": len(ours), "others": len(found["wrong"]) - len(ours)}
+    ended = rows[rows["outcome"].isin(("right", "inexact", "wrong"))]["family"] == "two-loop"
+    found["n_ended"] = {"ours": int(ended.sum()), "others": int((~ended).sum())}  # runs that report success
     return found | {"time_limit": TIME_LIMIT}
 
 

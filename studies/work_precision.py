@@ -82,9 +82,9 @@ def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     ranked = tables.ranking(rows, error)
     found: dict[str, Any] = {"error": error, "ida": None, "default_over": None, "before_default": {}}
     found["standing"] = headline.of_error(rows, error)
-    ida = [own for _, own in rows[rows["solver"].str.startswith(IDA)].groupby("solver")]
+    ida = [own for _, own in tables.put(rows[rows["solver"].str.startswith(IDA)]).groupby("solver")]
     found["ida_missed"] = bool(ida) and all(tables.missed(own, error) for own in ida)
-    found["ida_tightest"] = max((tables.tightest(own) for own in ida), default=None)
+    found["ida_tightest"] = max((t for t in map(tables.tightest, ida) if t == t), default=None)
     found |= tables.of_both(ranked)
     if ranked.empty:
         return found
@@ -254,7 +254,7 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 def ready(findings: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
     geometries = [geometry["case"] for geometry in findings["rivals"]["four_bar"]]
-    first = ["solver", "first call (s)", "least", "most", "later call (ms)", "pays from run"]
+    first = ["solver", "built by", "first call (s)", "least", "most", "later call (ms)", "pays from run"]
     profile = ["worst", "ours", "steps × ns", "rival", "steps × ns", "evaluation (ns)", "without", "in the way"]
     return {
         "goals": table(["rival", "wanted", *geometries], rivals.goal_lines(findings["rivals"])),

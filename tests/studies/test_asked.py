@@ -31,6 +31,8 @@ END, LIMIT, FAILED = "REACHED_END", "TIME_LIMIT", "SOLVER_FAILED"
         ([(1e-3, 1e-3, END), (1e-5, None, LIMIT)], False),  # stopped by us
         ([(1e-3, 1e-3, END), (1e-5, None, LIMIT), (1e-7, None, FAILED)], False),
         ([(1e-3, None, LIMIT)], False),
+        ([(1e-3, None, FAILED), (1e-5, None, FAILED)], False),  # tighter ones may do better
+        ([(1e-3, None, FAILED), (tables.TIGHTEST, None, FAILED)], True),
         ([(1e-3, None, LIMIT), (1e-5, 1e-3, END), (tables.TIGHTEST, 1e-4, END)], True),  # only a loose run was stopped
         ([(1e-3, 1e-3, END), (1e-5, None, FAILED)], True),
         ([(1e-3, 1e-3, END), (1e-5, 1e-4, END)], False),  # not asked for more
@@ -79,6 +81,9 @@ def test_ida_is_neither_cvode_nor_casadis_idas():
     assert found["ida"]["solver"] == "IDA from C, stabilised" and found["others"]["solver"] == "CVODE from C, Adams"
     (entry,) = index.classes({"work_precision": {"cases": [case(at=[found])]}})
     assert entry["ida_over"] == [8.0]
+    refused = table.assign(status="NOT_APPLICABLE", error_q=None, call_s=None)
+    found = work_precision.class_of(pd.concat([table[:1], refused[4:]]), ERROR)
+    assert not found["ida_missed"] and found["ida_tightest"] is None
     # IDA misses what CVODE and IDAS reach
     idas = table["solver"].str.startswith("IDA") & ~table["solver"].str.startswith("IDAS")
     table.loc[idas, ["error_q", "tol"]] = [1e-3, tables.TIGHTEST]
@@ -116,6 +121,8 @@ def test_how_many_rivals_could_be_put_is_counted():
     assert found == {"n": 5, "least": 0, "all": 1, "mechanisms": 3, "counts": tables.LEAST}
     assert rivals.put(every)["least"] == 5
     text = render("against", {}, {}, put=found, names="heyoka")
-    assert text.startswith("those of 5 rivals") and "all on 1 of 3 mechanisms, 0 where they are fewest (heyoka)" in text
+    assert (
+        text.startswith("those of 5 rivals (heyoka; ") and "all on 1 of 3 mechanisms, 0 where they are fewest." in text
+    )
     assert text.endswith("Ahead and behind are by 5 % at least\n")
     assert render("against", {}, {}, put=rivals.put(every), names="heyoka").startswith("all 5 rivals")

@@ -1,9 +1,15 @@
 """The first call, and from which run building pays, from rows made by hand."""
 
+from contextlib import nullcontext
+from dataclasses import replace
+
 import pandas as pd
 import pytest
 
+from references import driver
+from references.driver import user_call
 from studies import first_calls
+from studies.solvers import CATALOGUE
 
 
 def rows(*lines):
@@ -41,10 +47,31 @@ def test_a_line_a_solver_and_never_where_its_calls_are_no_cheaper():
     assert found["auto, compiled"]["pays"] == [11.0] and found["auto, compiled"]["n"] == 1
     assert found["heyoka"]["never"] == 1 and found["auto"]["pays"] == [] and found["auto"]["never"] == 0
     lines = list(first_calls.lines(list(found.values())))
-    assert lines[1] == ["`auto, compiled`", 1.0, 1.0, 1.0, 100.0, "11"] and lines[2][-1] == "never on 1"
+    assert lines[1] == ["`auto, compiled`", "ours, LLVM", 1.0, 1.0, 1.0, 100.0, "11"] and lines[2][-1] == "never on 1"
 
 
 @pytest.mark.slow
 def test_the_first_call_builds_where_the_next_finds_all_built():
     row = first_calls.in_process("four-bar", "auto, compiled")
     assert row["status"] == "REACHED_END" and row["first_call_s"] > 3.0 * row["call_s"]
+
+
+@pytest.mark.parametrize(("marks", "spent"), [(True, 7.0), (False, 107.0)])
+def test_the_first_call_ends_where_that_of_a_user_ends(marks, spent, monkeypatch):
+    """A second run for the output, which builds once more, is ours; an adapter that marks nothing is timed whole."""
+    ours, clock = CATALOGUE["DOP853 (two-loop)"], [0.0]
+
+    def run(case, value, repeat):
+        clock[0] += 5.0  # builds
+        with user_call if marks else nullcontext():
+            clock[0] += 2.0
+        clock[0] += 60.0  # builds for the output
+        with user_call if marks else nullcontext():
+            clock[0] += 40.0
+        return ours.run(case, value, repeat)
+
+    for module in (driver, first_calls):
+        monkeypatch.setattr(module, "cpu_time", lambda: clock[0])
+    monkeypatch.setitem(CATALOGUE, "twice", replace(ours, name="twice", run=run))
+    row = first_calls.times_of("knife edge", "twice")
+    assert row["status"] == "REACHED_END" and row["first_call_s"] == spent

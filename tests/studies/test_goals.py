@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from studies import behind, goals, rivals
+from studies import behind, goals, rivals, tables
 from studies.bench import Case
 from tests.studies.test_rivals import Kept, compared, rows
 
@@ -37,17 +37,35 @@ def test_the_long_motion_is_judged_at_its_full_length_only():
     assert goals.findings_of([long], table[1:], table)["long"]["call_s"] is None
 
 
-@pytest.mark.parametrize(("ida", "ahead"), [(1.5, True), (0.9, False)])
-def test_the_stiff_beam_is_compared_with_ida_from_c(ida, ahead):
+ERRORS = goals.BEAM_ERRORS
+REACHED, LOOSE = 0.5 * ERRORS[2], 0.5 * ERRORS[1]  # errors of all three, and of two of these
+
+
+@pytest.mark.parametrize(
+    ("ours", "ida", "tol", "ahead", "lost"),
+    [
+        ((REACHED, 1.0), (REACHED, 1.5), 0.1, True, False),
+        ((REACHED, 1.0), (REACHED, 0.9), 0.1, False, True),
+        ((REACHED, 1.0), (REACHED, 1.02), 0.1, False, True),  # not by so much that it counts
+        ((LOOSE, 1.0), (REACHED, 1.5), 0.1, False, True),  # ahead at two of three, and the third is missed
+        ((REACHED, 1.0), (LOOSE, 1.5), 0.1, False, False),  # IDA was not asked for the third
+        ((REACHED, 1.0), (LOOSE, 1.5), tables.TIGHTEST, True, False),  # it was
+    ],
+)
+def test_the_stiff_beam_is_compared_with_ida_from_c_at_every_error(ours, ida, tol, ahead, lost):
     case = Case("beam", None, 2.0, tags=("stiff", "vibrations irrelevant"))
     table = rows(
-        ("TRBDF2", "two-loop", "compiled", 1e-3, 1.0),
-        ("IDA from C, stabilised", "SUNDIALS", "compiled", 1e-3, 3.0),
-        ("IDA from C, order 2, positions tested", "SUNDIALS", "compiled", 1e-3, ida),
+        ("TRBDF2", "two-loop", "compiled", *ours),
+        ("IDA from C, stabilised", "SUNDIALS", "compiled", ida[0], 3.0),
+        ("IDA from C, order 2, positions tested", "SUNDIALS", "compiled", *ida),
+        ("CVODE from C, BDF", "SUNDIALS", "compiled", REACHED, 0.1),
         case="beam",
     )
-    (found,) = goals.findings_of([case], table, table)["stiff"]
-    assert found["ratios"] == [ida, ida, None] and found["ahead"] is ahead
+    table.loc[1:2, "tol"] = tol
+    loose = table.loc[1:2].assign(error_q=ERRORS[0], tol=tables.LOOSEST)  # what it costs to miss is told
+    (found,) = goals.findings_of([case], pd.concat([table, loose], ignore_index=True), table)["stiff"]
+    assert (found["ahead"], found["lost"]) == (ahead, lost)
+    assert found["ours_miss"] == ([ERRORS[2]] if ours[0] == LOOSE else [])
 
 
 def test_violations_are_those_of_ours_on_the_four_bars():

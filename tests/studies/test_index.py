@@ -107,6 +107,7 @@ def energy(**changed):
         "case": "switching",
         "t_end": 1e4,
         "kinetic": 20.0,
+        "equal": 0.1,
         "at": at,
         "alternatives": [long_run("LSODA", 1.0, False)],
     }
@@ -237,14 +238,30 @@ def test_solvers_beaten_everywhere_are_listed_worst_first(tmp_path):
 def test_picks_are_joined_where_the_solver_is_the_same():
     prices = ((2, 0.1), (4, 0.4), (6, 0.1))
     lines = [{"accuracy": f"1e-{k}", "ours": BEST | {"call_s": cpu}, "others": THEIRS} for k, cpu in prices]
-    lines = [line | {"standing": standing()} for line in lines]
+    lines = [line | {"standing": standing(), "undecided": line["accuracy"] == "1e-6"} for line in lines]
     found = index.picks(lines)
     assert [(pick["solver"], pick["accuracies"]) for pick in found] == [
         ("ours", ["1e-2", "1e-6"]),
         ("theirs", ["1e-4"]),
     ]
+    assert found[0]["undecided"] == ["1e-6"] and found[1]["undecided"] == []
     assert found[0]["over"] == pytest.approx([2.0, 2.0]) and found[1]["over"] == pytest.approx([2.0])
     assert index.picks([{"accuracy": "1e-2", "ours": None, "others": None}]) == []
+
+
+def test_what_is_not_told_apart_is_nobodys_win(tmp_path):
+    near = at_error(standing=standing(verdict="undecided"))
+    made = entries([case(at=[at_error(error=1e-2), near])])
+    assert index.overall(made) == [{"solver": "ours", "n": 1}]
+    text = screen(tmp_path, [case(at=[at_error(error=1e-2), near])])
+    assert "Cheapest of all: `ours` at 1 of the 2 errors; undecided at 1." in text
+    assert "(undecided: 1e-4) |" in text
+    close = energy()
+    close["long"]["at"][0]["drift"]["others"] = long_run("LSODA", 1.9, calm=False)  # of one run each, beside 2.0
+    assert (
+        index.overall(entries([], energy=close)) == []
+        and entries([], energy=energy())[0]["at"][0]["undecided"] is False
+    )
 
 
 def test_classes_come_in_their_order_and_the_long_one_from_the_energy():
@@ -272,7 +289,7 @@ KEPT = {"ours_keep": True, "irk_grows": False, "ours": [1e-15, 1e-15, 0.0], "t_e
 LOST = long_run("Sun", 1.0) | {"calm": False, "verdict": "lost"}
 STEPS = {"holds": True, "longer": True, "irk": {"share_time": 0.99}, "long": 0.02, "ratios": [170.0, 270.0]}
 VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a"], "only_others": [], "none_right": ["b", "c"], "not_put": ["d"]}
-VALID |= {"n_wrong": {"ours": 1, "others": 57}}
+VALID |= {"n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
 TRAPS = {"n_traps": 15, "ours_bad": [{}], "others_bad": [{}, {}], "missed_by_all": [], "unasked": 0}
 OPPOSITES = {
     "claims": [claims("holds"), claims("holds in part"), claims("not run")],
@@ -294,8 +311,8 @@ def test_each_promise_has_its_opposite(study, tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "right on 17, ours only on 1 that were put to others (and on 1 that our adapters refuse to put" in text
-    assert "1 of ours, 57 of others" in text
+    assert "right on 17, ours only on 1 beside all others that our adapters could put (and on 1 that they" in text
+    assert "1 of 500 of ours, 57 of 300 of others" in text
     assert "1 of ours, 2 of others" in screen(tmp_path, honesty=TRAPS)
     text = screen(tmp_path, robustness={"n_linkages": 300, "long": [{}, {}], "silent": [{}]})
     assert "300 random linkages by 2 of our methods" in text and "1 runs are" in text
@@ -348,7 +365,16 @@ def test_each_of_default_compiled_default_and_best_stands_in_the_table_by_its_ve
 
 
 def test_the_counts_of_the_headline_stand_first_on_both_screens(tmp_path):
-    counts = {"ahead": 51, "behind": 123, "undecided": 20, "alone": 4, "missed": 2, "n": 200}
+    counts = {
+        "ahead": 51,
+        "behind": 123,
+        "undecided": 20,
+        "alone": 4,
+        "missed": 2,
+        "n": 200,
+        "unbeaten": 4,
+        "n_mechanisms": 23,
+    }
     standings = [counts | {"name": name} for name in ("auto", "auto, compiled", "best of ours")]
     standings[2] |= {"ahead": 158, "behind": 1, "missed": 0}
     said = (

@@ -59,8 +59,9 @@ def test_the_headline_names_default_compiled_default_and_best_in_this_order():
         "- **The best of our methods**, chosen when all had run,",
     ]
     counts = [[int(word) for word in re.findall(r"\b\d+\b", line)] for line in text.splitlines() if line]
-    assert counts[0] == [0, 3 * n, n, n, n]  # ahead of pairs, behind, undecided, alone
-    assert counts[1] == [0, 3 * n, n, n, n] and counts[2][0] >= n
+    # ahead of pairs, behind, undecided, alone; on mechanisms nowhere behind
+    assert counts[0] == [0, 3 * n, n, n, n, 2, 3]
+    assert counts[1] == [0, 3 * n, n, n, n, 2, 3] and counts[2][0] >= n
 
 
 def test_the_goals_are_of_each_kind_of_rival():
@@ -234,15 +235,19 @@ def test_sentences_follow_the_rows(own, said, not_said):
 
 def test_sentences_of_the_goals_follow_the_findings():
     long = {"case": "four-bar", "t_end": 100.0, "error": 1e-6, "limit": 0.01, "solver": "Adams", "call_s": 0.009}
-    beam = {"case": "beam", "errors": [1e-2], "ratios": [1.5], "compared": [1.5], "ahead": True}
+    beam = {"case": "beam", "errors": [1e-2], "ratios": [1.5], "lost": False, "ahead": True}
+    beam |= {"ours_miss": [], "ida_misses": [], "ida_unasked": []}
     default = {"solver": "auto", "compiled": False, "limit": 1.3, "n": 5, "n_unreached": 0, "n_within": 5}
     default["worst"] = {"case": "crank", "error": 1e-3, "over": 1.2, "best": "Adams"}
     made = {"long": long, "stiff": [beam], "violation": {"limit": 1e-12, "largest": 1e-15}, "default": [default]}
     text = stated(1.0, goals=made)
     assert text.count("**Reached**") == 5 and "**Missed**" not in text and "crank" not in text
-    worse = {"long": long | {"call_s": 0.011}, "stiff": [beam | {"ahead": False}]}
+    worse = {"long": long | {"call_s": 0.011}, "stiff": [beam | {"ahead": False, "lost": True, "ours_miss": [1e-4]}]}
     worse |= {"violation": {"limit": 1e-12, "largest": 1e-11}, "default": [default | {"n_within": 4}]}
     worse["default"][0]["worst"]["over"] = 1.4
     text = stated(1.0, goals=worse)
     assert text.count("**Missed**") == 4 and "up to 1.4 times (crank, 1e-3, beside `Adams`)" in text
+    assert "ours does not reach 1e-4, or was not asked." in text
+    asked_less = beam | {"ahead": False, "ida_unasked": [1e-4]}
+    assert "**Undecided**: ahead of IDA" in stated(1.0, goals=made | {"stiff": [asked_less]})
     assert "none of ours gets there" in stated(1.0, goals=made | {"long": long | {"call_s": None}})

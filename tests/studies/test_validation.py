@@ -111,7 +111,12 @@ def test_findings_turn_with_the_rows():
     found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))
     assert (found["not_put"], found["only_ours"]) == (["double pendulum"], [])
     found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
-    assert found["only_ours"] == ["double pendulum"]
+    assert found["only_ours"] == [{"case": "double pendulum", "put": 1}] and found["not_put"] == []
+    assert found["n_ended"] == {"ours": 16, "others": 8}
+    stopped = stopped | {"status": "TIME_LIMIT"}
+    found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=stopped))
+    assert (found["not_put"], found["only_ours"]) == (["double pendulum"], [])  # our limit is no miss of theirs
+    assert found["n_ended"] == {"ours": 16, "others": 4}
 
 
 def deceived_row(problem, solver, tolerance):

@@ -5,8 +5,10 @@ import json
 import pytest
 
 from studies.index import advice
+from studies.store import WHOLE_CALL
 from studies.takes import call, takes
 from studies.which_method import page, table
+from tests.studies.test_index import energy
 
 SOLVER = {"family": "two-loop", "right": 9, "wrong": 0, "said so": 1, "ratio": 0.1}
 VALIDATION = {"n": 4, "tight": 1e-10, "decades": 2}
@@ -71,13 +73,35 @@ def test_a_solver_is_asked_for_as_a_user_does(solver, asked):
 
 
 def test_the_table_has_a_row_for_each_class_with_the_cheapest():
-    loose = {"solver": "TRBDF2", "accuracies": ["1e-2", "1e-4"]}
-    tight = {"solver": "auto, compiled", "accuracies": ["1e-6"]}
+    loose = {"solver": "TRBDF2", "accuracies": ["1e-2", "1e-4"], "undecided": []}
+    tight = {"solver": "auto, compiled", "accuracies": ["1e-6"], "undecided": []}
     picked = [loose, tight]
     entries = [{"class": "stiff", "name": name, "picks": picked} for name in ("a beam", "another")]
     (row,) = takes({}, advice(entries))
     assert row["what"] == "stiff (a beam; another)"
     assert row["take"] == '`method="TRBDF2"` for errors of 1e-2 and 1e-4; `compiled=True` for errors of 1e-6'
+    entries[1]["picks"] = [loose | {"undecided": ["1e-4"]}, tight]
+    (row,) = takes({}, advice(entries))
+    assert row["take"].endswith("for errors of 1e-6 (undecided: 1e-4)")
+
+
+@pytest.mark.parametrize(
+    ("pays", "never", "said"),
+    [([3.0, 40.0], 1, "pays from run 3 to 40 on the mechanisms measured; on 1 of 5 it never does"), ([], 5, None)],
+)
+def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pays(pays, never, said):
+    line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
+    made = takes({"work_precision": {"first_calls": [{**line, "solver": "heyoka", "pays": [1.0]}, line]}}, [])
+    assert [row["take"] for row in made] == ([f"`compiled=True`, which {said}"] if said else [])
+
+
+def test_no_row_of_advice_stands_without_a_finding(tmp_path):
+    found = energy(n={"even": 3}, timed=WHOLE_CALL)
+    (tmp_path / "energy.json").write_text(json.dumps(found | {"n_calm": {"even": 3}}))
+    assert "| fixed steps, the energy without drift |" in table(tmp_path)
+    (tmp_path / "energy.json").write_text(json.dumps(found | {"n_calm": {"even": 2}}))
+    without = table(tmp_path)
+    assert not any(words in without for words in ("fixed steps", "Radau", "drag", "compiled=True"))
 
 
 def test_both_pages_have_the_same_table(tmp_path):
