@@ -42,7 +42,7 @@ def solve_cvode(
     Parameters
     ----------
     system : ConstrainedSystem
-        The problem, its mass positive definite. Its callbacks are compiled at the first run (a few seconds).
+        The problem. Its callbacks are compiled at the first run (a few seconds).
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)

@@ -15,7 +15,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
-from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
+from references.accelerations import OPTIONS, Equations, matrix_of, saddle_solve, schur_factors, times_inverse
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
@@ -339,17 +339,14 @@ def _projection(
     mass: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
 ) -> Callable[..., Any]:
     """(t, y, n_c, p, factors, known) -> success; y is projected in place, positions by Newton, then velocities."""
+    mass_at = matrix_of(mass)
 
     @njit(**OPTIONS)
     def project(t, y, m, p, factors, known):  # type: ignore[no-untyped-def]
         n = y.size // 2
         q, v = y[:n].copy(), y[n:].copy()
-        L, Cq, C = factors, np.zeros((m, n)), np.zeros(m)
-        if not known & CONSTANT:
-            L = np.zeros((n, n))
-            mass(t, q, p, L)
-            if not factor(L):
-                return False
+        Cq, C = np.zeros((m, n)), np.zeros(m)
+        L, definite = mass_at(t, q, p, factors, known)
         size = 1.0
         for j in range(n):
             size = max(size, abs(q[j]))
@@ -362,7 +359,7 @@ def _projection(
             C[:] = 0.0
             jacobian(t, q, p, Cq)
             constraint(t, q, p, C)
-            change = _least_change(L, known, Cq, C, q)
+            change = _least_change(L, definite, known, Cq, C, q)
             if change == np.inf:
                 return False
         Cq[:, :] = 0.0
@@ -372,7 +369,7 @@ def _projection(
         for i in range(m):
             for j in range(n):
                 C[i] += Cq[i, j] * v[j]
-        if _least_change(L, known, Cq, C, v) == np.inf:
+        if _least_change(L, definite, known, Cq, C, v) == np.inf:
             return False
         for j in range(n):
             y[j] = q[j]
@@ -383,18 +380,24 @@ def _projection(
 
 
 @njit(**OPTIONS)
-def _least_change(L, known, Cq, C, x):  # type: ignore[no-untyped-def]
-    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular."""
+def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
+    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular. C is lost.
+
+    Where M is not positive definite, x changes by the d of M d + C_q^T mu = 0 and C_q d = C, which is the same.
+    """
     m, n = Cq.shape
-    S, definite = schur_factors(L, known, Cq)
-    if not definite:
-        return np.inf
-    ldl_solve(S, C)
     change = np.zeros(n)
-    for i in range(m):
-        for j in range(n):
-            change[j] += Cq[i, j] * C[i]
-    times_inverse(L, known, change)
+    if definite:
+        S, good = schur_factors(L, known, Cq)
+        if not good:
+            return np.inf
+        ldl_solve(S, C)
+        for i in range(m):
+            for j in range(n):
+                change[j] += Cq[i, j] * C[i]
+        times_inverse(L, known, change)
+    elif not saddle_solve(L, Cq, change, C):
+        return np.inf
     largest = 0.0
     for j in range(n):
         x[j] -= change[j]

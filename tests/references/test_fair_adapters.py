@@ -8,6 +8,7 @@ from references.casadi_integrators import FLAGS, PLAIN, solve_collocation, solve
 from references.four_bar_minimal import trajectory
 from studies.bench import Case, Run, attempt
 from studies.solvers import CATALOGUE, RIVALS
+from studies.validation import MAKE
 from twoloop.mechanisms import four_bar, projection_pendulum
 from twoloop.result import Status
 
@@ -81,3 +82,27 @@ def test_diffrax_looks_at_the_clock_before_the_second_run_and_takes_many_steps()
     assert late.status is Status.SOLVER_FAILED and "time_limit" in late.message and late.t.size == 0
     result = diffrax_dopri8.solve_diffrax(*start(PENDULUM, 30.0), 1e-9, 1e-9)
     assert result.success and result.stats.n_accepted > 100
+
+
+# --- mass matrices that are singular without the constraints, as with Euler parameters
+
+BY_ACCELERATIONS = ("DOP853, index 1", "DOP853, projected", "LSODA, index 1", "Pr9, index 1", "CVODE, Adams")
+EULER = {"heavy top": (*BY_ACCELERATIONS, "Radau, index 1", "IDA from C, stabilised")}
+LARGE = ("spatial slider-crank", "spatial four-bar", "A05 governor")
+
+
+@pytest.mark.parametrize("name", ["heavy top", *(pytest.param(each, marks=pytest.mark.slow) for each in LARGE)])
+def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name):
+    problem = next(problem for problem in (make() for make in MAKE) if problem.name == name)
+    known = problem.reference
+    for solver in EULER.get(name, (*BY_ACCELERATIONS, "IDA from C, stabilised")):
+        errors = []
+        for tol in (1e-5, 1e-9):
+            case = Case(name, problem, known.t, n_instants=1, time_limit=60.0)
+            result, status, message, _ = attempt(Run(case, CATALOGUE[solver], tol), 0)
+            if status == "NOT_AVAILABLE":
+                break
+            assert status == "REACHED_END", (solver, message)
+            difference = np.abs(result.q[:, -1] - known.q)
+            errors.append(np.nanmax(difference))
+        assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
