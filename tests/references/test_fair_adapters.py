@@ -3,12 +3,19 @@
 import numpy as np
 import pytest
 
-from references import casadi_integrators, diffrax_dopri8
+from references import casadi_integrators, diffrax_dopri8, index1
 from references.casadi_integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
+from references.cvode import solve_cvode
+from references.cvode_c import solve_cvode_c
+from references.driver import TimeLimit, user_call
 from references.four_bar_minimal import trajectory
+from references.ida import solve_ida
+from references.ida_c import solve_ida_c
+from references.index1 import solve_index1
 from studies.bench import Case, Run, attempt
 from studies.solvers import CATALOGUE, RIVALS
 from studies.validation import MAKE
+from tests.problems import pendulum
 from twoloop.mechanisms import four_bar, projection_pendulum
 from twoloop.result import Status
 
@@ -106,3 +113,88 @@ def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name):
             difference = np.abs(result.q[:, -1] - known.q)
             errors.append(np.nanmax(difference))
         assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
+
+
+# --- output is nobody's in the time of a call
+
+TIMES = np.linspace(0.0, 2.0, 201)
+WITH_OUTPUT = {
+    "IDA from C": lambda *at, **more: solve_ida_c(*at, 1e-8, 1e-8, **more),
+    "IDA": lambda *at, **more: solve_ida(*at, "index1", 1e-8, 1e-8, **more),
+    "CVODE, Adams": lambda *at, **more: solve_cvode(*at, "Adams", 1e-8, 1e-8, **more),
+    "CVODE from C": lambda *at, **more: solve_cvode_c(*at, "Adams", 1e-8, 1e-8, **more),
+    "CVODE from C, BDF": lambda *at, **more: solve_cvode_c(*at, "BDF", 1e-8, 1e-8, **more),
+    "DOP853": lambda *at, **more: solve_index1(*at, "DOP853", 1e-8, 1e-8, **more),
+    "DOP853, projected": lambda *at, **more: solve_index1(*at, "DOP853", 1e-8, stabilisation="projection", **more),
+    "LSODA": lambda *at, **more: solve_index1(*at, "LSODA", 1e-8, 1e-8, **more),
+    "Radau": lambda *at, **more: solve_index1(*at, "Radau", 1e-6, 1e-6, **more),
+    "BDF": lambda *at, **more: solve_index1(*at, "BDF", 1e-6, 1e-6, **more),
+}
+
+
+@pytest.mark.parametrize("name", WITH_OUTPUT)
+def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
+    pytest.importorskip("sksundae")
+    solve = WITH_OUTPUT[name]
+    end, many = (solve(*start(PENDULUM, 2.0), t_eval=each) for each in ([2.0], TIMES))
+    assert end.success and many.success and np.array_equal(many.t, TIMES)
+    counts = [(each.stats.n_accepted, each.stats.n_evaluations, each.stats.n_factorizations) for each in (end, many)]
+    assert counts[0] == counts[1] and counts[0][1] > 10
+    # the second run takes the steps of the first: what is shown is the run that is timed
+    assert np.abs(end.q[:, -1] - many.q[:, -1]).max() < 1e-13
+    early = solve(*start(PENDULUM, 2.0), t_eval=[1.0])
+    assert np.abs(early.q[:, 0] - many.q[:, 100]).max() < 1e-13
+
+    late = solve(*start(PENDULUM, 2.0), t_eval=[0.0, 2.0], time_limit=1e-9)
+    assert late.status is Status.SOLVER_FAILED and late.t.tolist() in ([], [0.0])
+
+
+def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
+    made = []
+    before = index1.METHODS["DOP853"]
+
+    class Watched(before):
+        def dense_output(self):
+            made.append(user_call.so_far())
+            return super().dense_output()
+
+    monkeypatch.setitem(index1.METHODS, "DOP853", Watched)
+    assert solve_index1(*start(PENDULUM, 2.0), t_eval=TIMES).success
+    assert made and not any(made)  # outside of the user's call
+
+
+def test_a_run_past_its_limit_is_not_run_again_to_its_end():
+    for solve in (WITH_OUTPUT["DOP853"], WITH_OUTPUT["IDA from C"], WITH_OUTPUT["CVODE from C"]):
+        result = solve(*start(PENDULUM, 1e6), t_eval=[1e6], time_limit=0.01)
+        assert result.status is Status.SOLVER_FAILED and "time_limit" in result.message and result.t.size == 0
+
+
+# --- Jacobians
+
+
+def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
+    """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
+    at = start(PENDULUM, 5.0)
+    solvers = {
+        "Radau": lambda: solve_index1(*at, "Radau", 1e-7, 1e-7),
+        "BDF": lambda: solve_index1(*at, "BDF", 1e-7, 1e-7),
+        "CVODE": lambda: solve_cvode(*at, "BDF", 1e-7, 1e-7),
+    }
+    exact = {name: solve() for name, solve in solvers.items()}
+    monkeypatch.setattr(index1, "straight_line_jacobian", lambda *_: None)
+    differenced = {name: solve() for name, solve in solvers.items()}
+    for name in solvers:
+        assert exact[name].success and exact[name].stats.n_evaluations < differenced[name].stats.n_evaluations, name
+        assert np.abs(exact[name].q[:, -1] - differenced[name].q[:, -1]).max() < 1e-4
+
+
+def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
+    system, q, v = PENDULUM.system, PENDULUM.q0, PENDULUM.v0
+    y = np.concatenate([q, v])
+    plain = index1.RightHandSide(system, 0.0, q, 0.0)
+    jacobian, function = plain.jacobian(0.0, y), plain.function(TimeLimit(None))
+    differences = [(function(0.0, y + e) - function(0.0, y - e)) / 2e-6 for e in 1e-6 * np.eye(y.size)]
+    assert np.abs(jacobian(0.0, y) - np.transpose(differences)).max() < 1e-6 * np.abs(differences).max()
+    assert index1.RightHandSide(system, 0.0, q, 10.0).jacobian(0.0, y) is None  # of other equations
+    in_python = pendulum()
+    assert index1.RightHandSide(in_python, 0.0, np.array([1.0, 0.0]), 0.0).jacobian(0.0, np.eye(4)[0]) is None
