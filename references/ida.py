@@ -165,6 +165,29 @@ def compiled_residual(system: ConstrainedSystem, form: str) -> tuple[Callable[..
     return _compiled(form, *system.functions[:5], compiled_gamma(system), own_tangent(system))
 
 
+def compiled_rates(system: ConstrainedSystem) -> Callable[..., None]:
+    """(t, y, JJ, n_q, n_c, p) -> None: dF/dy' of the form "stabilised", which is M, C_q^T and ones, into zeros."""
+    f = system.functions
+    return _rates(f.mass, f.jacobian)
+
+
+@lru_cache(maxsize=64)
+def _rates(mass: Dispatcher, jacobian: Dispatcher) -> Callable[..., None]:
+    @njit(types.void(types.float64, _READ, _MATRIX, *_SIZES, _VECTOR), error_model="numpy")
+    def rates(t, y, JJ, n, m, p):  # type: ignore[no-untyped-def]
+        q, M, Cq = y[:n].copy(), np.zeros((n, n)), np.zeros((m, n))
+        mass(t, q, p, M)
+        jacobian(t, q, p, Cq)
+        for i in range(n):
+            JJ[i, i] = 1.0
+            for j in range(n):
+                JJ[n + i, n + j] = M[i, j]
+            for k in range(m):
+                JJ[n + i, 2 * n + k] = JJ[i, 2 * n + m + k] = Cq[k, i]
+
+    return rates  # type: ignore[no-any-return]
+
+
 def _callbacks(
     system: ConstrainedSystem, compiled: tuple[Callable[..., None], Callable[..., None]], limit: TimeLimit
 ) -> tuple[Any, Any]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from references import casadi_integrators, diffrax_dopri8, index1
+from references import casadi_integrators, diffrax_dopri8, fully_implicit, index1
 from references.casadi_integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
 from references.cvode import solve_cvode
 from references.cvode_c import solve_cvode_c
@@ -198,3 +198,28 @@ def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
     assert index1.RightHandSide(system, 0.0, q, 10.0).jacobian(0.0, y) is None  # of other equations
     in_python = pendulum()
     assert index1.RightHandSide(in_python, 0.0, np.array([1.0, 0.0]), 0.0).jacobian(0.0, np.eye(4)[0]) is None
+
+
+def test_solve_dae_differences_once_a_jacobian_and_is_told_the_rest():
+    system, q, v = PENDULUM.system, PENDULUM.q0 + 0.1, PENDULUM.v0 + 0.2
+    run = fully_implicit._Run(system, None, None)
+    y, yp = np.concatenate([q, v, np.zeros(2 * system.n_c)]), np.linspace(-1.0, 1.0, 2 * (system.n_q + system.n_c))
+    known, calls = [np.zeros((y.size, y.size)) for _ in range(2)], []
+    matrix = run._matrix
+    for cj, into in zip((0.0, 1.0), known, strict=True):
+        matrix(0.3, y, yp, cj, into, *run._sizes_and_p)
+    run._matrix = lambda *given: calls.append(given[3]) or matrix(*given)
+    by_y, by_yp = run.jacobians(0.3, y, yp)
+    assert calls == [0.0] and np.array_equal(by_y, known[0]) and np.count_nonzero(by_yp) > y.size / 2
+    assert np.abs(known[1] - known[0] - by_yp).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", ["Radau", "BDF"])
+def test_solve_dae_is_right_and_stops_in_time(method):
+    pytest.importorskip("solve_dae")
+    solve = fully_implicit.solve_fully_implicit
+    result = solve(*start(FOUR_BAR, 1.0), method, 1e-7, 1e-7)
+    assert result.success
+    assert np.abs(result.q[:, -1] - trajectory(FOUR_BAR.parameters, [1.0])[0][:, 0]).max() < 1e-4
+    late = solve(*start(FOUR_BAR, 1.0), method, 1e-7, 1e-7, time_limit=1e-9)
+    assert late.status is Status.SOLVER_FAILED and "time_limit" in late.message
