@@ -1,6 +1,7 @@
 """Accelerations and multipliers of any ConstrainedSystem, compiled from its callbacks: what several references need.
 
-Eq. (6), M a + C_q^T lam = Q and C_q a = Q_d, is solved by the Schur complement S = C_q M^-1 C_q^T. What is compiled are
+Eq. (6), M a + C_q^T lam = Q and C_q a = Q_d, is solved by the Schur complement S = C_q M^-1 C_q^T where M is positive
+definite, and else, as with Euler parameters, as it stands, by elimination with row exchanges. What is compiled are
 closures over the callbacks, one for each set of them: solvers call from Python, where each first-class function that
 is an argument, as in twoloop's kernels, costs tens of microseconds a call.
 """
@@ -25,7 +26,8 @@ Array = NDArray[np.float64]
 
 GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
 
-CONSTANT, DIAGONAL = 1, 2  # bits of what is known of the mass matrix
+CONSTANT, DIAGONAL, SADDLE = 1, 2, 4  # bits of what is known of the mass matrix; the last: it is not definite
+SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
@@ -77,7 +79,13 @@ class Equations:
             self.known |= DIAGONAL
         self.factors = np.ascontiguousarray(mass)
         if not factor(self.factors):
-            raise ValueError(f"mass of {system.name!r} must be positive definite; at t = {t0!r} it is not")
+            self.factors, self.known = np.ascontiguousarray(mass.copy()), self.known & CONSTANT | SADDLE
+            if not saddle_solve(self.factors, system.jacobian(t0, q0), np.zeros(system.n_q), np.zeros(system.n_c)):
+                raise ValueError(
+                    f"mass of {system.name!r} must be positive definite on the velocities that the constraints allow, "
+                    f"and the constraints independent, where it is not positive definite itself; at t = {t0!r} the "
+                    "matrix of eq. (6) is singular. Give the coordinates mass or constraints, or leave them out"
+                )
 
     def at_points(self, t: Array, states: Array, alpha: float = 0.0) -> tuple[Array, Array]:
         """Accelerations and multipliers at states (2 n_q, n_t), with Baumgarte's terms when alpha > 0."""
@@ -131,16 +139,13 @@ def _accelerations(
     gamma: Callable[..., None],
 ) -> Callable[..., Any]:
     """(t, q, v, alpha, p, factors, known, a, lam) -> success: eqs. (6)-(8), with Baumgarte's terms when alpha > 0."""
+    mass_at = matrix_of(mass)
 
     @njit(**OPTIONS)
     def accelerate(t, q, v, alpha, p, factors, known, a, lam):  # type: ignore[no-untyped-def]
         n, m = q.size, lam.size
-        L, Cq = factors, np.zeros((m, n))
-        if not known & CONSTANT:
-            L = np.zeros((n, n))
-            mass(t, q, p, L)
-            if not factor(L):
-                return False
+        Cq = np.zeros((m, n))
+        L, definite = mass_at(t, q, p, factors, known)
         jacobian(t, q, p, Cq)
         lam[:] = 0.0
         gamma(t, q, v, p, lam)
@@ -154,7 +159,9 @@ def _accelerations(
                 lam[i] -= 2.0 * alpha * Ct[i] + alpha * alpha * C[i]
         a[:] = 0.0
         force(t, q, v, p, a)
-        return _eliminate(L, known, Cq, a, lam)
+        if definite:
+            return _eliminate(L, known, Cq, a, lam)
+        return saddle_solve(L, Cq, a, lam)
 
     return accelerate  # type: ignore[no-any-return]
 
@@ -177,10 +184,81 @@ def _at_points(accelerate: Callable[..., Any]) -> Callable[..., Any]:
     return at_points  # type: ignore[no-any-return]
 
 
+@lru_cache(maxsize=64)
+def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
+    """(t, q, p, factors, known) -> the factors of M and True, or, where it is not positive definite, M and False."""
+
+    @njit(**OPTIONS)
+    def mass_at(t, q, p, factors, known):  # type: ignore[no-untyped-def]
+        definite = not known & SADDLE
+        if known & CONSTANT:
+            return factors, definite
+        M = np.zeros((q.size, q.size))
+        mass(t, q, p, M)
+        if definite and not factor(M):
+            definite = False
+            M[:, :] = 0.0
+            mass(t, q, p, M)
+        return M, definite
+
+    return mass_at  # type: ignore[no-any-return]
+
+
 @njit(**OPTIONS)
 def factor(A):  # type: ignore[no-untyped-def]
-    """`ldl_factor` as a function that Python and closures can call."""
-    return ldl_factor(A)
+    """`ldl_factor`, which holds rounding for definite, with pivots that have lost all of their digits refused."""
+    before = np.empty(A.shape[0])
+    for k in range(A.shape[0]):
+        before[k] = A[k, k]
+    good = ldl_factor(A)
+    for k in range(A.shape[0]):
+        good = good and A[k, k] * before[k] * SINGULAR < 1.0
+    return good
+
+
+@njit(**OPTIONS)
+def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
+    """Eq. (6) as it stands: a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers.
+
+    Returns False where the matrix is singular or has values that are not finite.
+    """
+    m, n = Cq.shape
+    size = n + m
+    K, scale = np.zeros((size, size + 1)), np.zeros(size)  # the last column: the right-hand side
+    for i in range(n):
+        K[i, size] = a[i]
+        for j in range(n):
+            K[i, j] = M[i, j]
+            scale[i] = max(scale[i], abs(M[i, j]))
+        for k in range(m):
+            K[n + k, size] = lam[k]
+            K[i, n + k] = K[n + k, i] = Cq[k, i]
+            scale[i] = max(scale[i], abs(Cq[k, i]))
+            scale[n + k] = max(scale[n + k], abs(Cq[k, i]))
+    for k in range(size):
+        pivot, largest = k, 0.0
+        for i in range(k, size):
+            if abs(K[i, k]) > largest * scale[i]:
+                pivot, largest = i, abs(K[i, k]) / scale[i]
+        if not SINGULAR < largest < np.inf:
+            return False
+        scale[pivot] = scale[k]
+        for j in range(k, size + 1):
+            moved = K[pivot, j]
+            K[pivot, j] = K[k, j]
+            K[k, j] = moved / K[k, k] if j > k else moved
+        for i in range(k + 1, size):
+            if K[i, k] != 0.0:
+                for j in range(k + 1, size + 1):
+                    K[i, j] -= K[i, k] * K[k, j]
+    for k in range(size - 1, -1, -1):
+        for j in range(k + 1, size):
+            K[k, size] -= K[k, j] * K[j, size]
+    for i in range(n):
+        a[i] = K[i, size]
+    for k in range(m):
+        lam[k] = K[n + k, size]
+    return True
 
 
 @njit(**OPTIONS)

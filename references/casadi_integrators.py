@@ -7,6 +7,7 @@ peers`, or the extra `peers`.
 """
 
 import shutil
+import subprocess
 import tempfile
 from contextlib import chdir
 from functools import lru_cache, partial
@@ -27,7 +28,13 @@ Array = NDArray[np.float64]
 
 PLUGINS = {"idas": "IDAS of CasADi", "cvodes": "CVODES of CasADi", "collocation": "CasADi's collocation"}
 SUNDIALS = ("idas", "cvodes")
-STEPS_A_RUN = 100_000  # at most, of IDAS and CVODES
+METHODS: dict[str, dict[str, str]] = {  # of CVODES, and how it is set up for each
+    "BDF": {},
+    "Adams": {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"},
+}
+STEPS_A_RUN = 10**7  # at most, of IDAS and CVODES, as of SUNDIALS driven from C
+FLAGS = ("-O3", "-march=native", "-ffast-math")  # for the compiler, where it takes all of them
+PLAIN = FLAGS[:1]
 LARGEST_COMPILED = 9  # coordinates; the compiler takes minutes for the exact Jacobian of large ones
 OUTPUTS = 1000  # of collocation, at most: CasADi divides its elements at every output
 DEGREE = 5  # of the Gauss collocation, so of order 10
@@ -49,8 +56,8 @@ def solve_idas(
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with IDAS of CasADi.
 
     What it was given: exact Jacobians, by CasADi's derivatives; accelerations eliminated symbolically; where there is a
-    C compiler `cc`, expressions compiled by it with -O3, which halves the time (up to `LARGEST_COMPILED` coordinates).
-    Else CasADi interprets them.
+    C compiler `cc`, expressions compiled by it with `FLAGS`, which halves the time (up to `LARGEST_COMPILED`
+    coordinates). Else CasADi interprets them.
 
     Parameters
     ----------
@@ -66,8 +73,8 @@ def solve_idas(
         Increasing times in t_span at which to store the solution, interpolated by IDAS, in a second run that is not
         timed. None: 1001 times, evenly.
     time_limit : float, optional
-        Wall-clock time that the integration may take, s. CasADi does not look at the clock: a run ends after
-        `most_steps` steps, and one that took longer than the limit is a failed one. None: no limit.
+        Wall-clock time that the integration may take, s. CasADi does not look at the clock, but lets exceptions of
+        signals through: a run ends after `most_steps` steps, and one that took longer is a failed one. None: no limit.
     most_steps : int
         Steps after which a run ends.
 
@@ -95,18 +102,22 @@ def solve_cvodes(
     rtol: float = 1e-8,
     atol: float = 1e-8,
     *,
+    method: str = "BDF",
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODES of CasADi.
 
-    What it was given: as `solve_idas`; BDF with Newton's iteration, which is how CasADi sets CVODES up.
+    What it was given: as `solve_idas`; BDF with Newton's iteration, as CasADi sets CVODES up, or Adams with fixed-point
+    iteration, as SUNDIALS advises where nothing is stiff.
 
     Parameters
     ----------
     system, t_span, q0, v0 : see `solve_idas`
     rtol, atol : float
         CVODES' tolerances.
+    method : {"BDF", "Adams"}
+        Orders up to 5, or up to 12.
     t_eval, time_limit : see `solve_idas`
 
     Returns
@@ -119,7 +130,9 @@ def solve_cvodes(
     TypeError, ValueError, RuntimeError
         As `solve_idas`.
     """
-    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, STEPS_A_RUN)
+    check_choice("method", method, METHODS)
+    more = METHODS[method]
+    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, STEPS_A_RUN, more)
 
 
 def solve_collocation(
@@ -133,7 +146,9 @@ def solve_collocation(
 ) -> Result:
     """Integrate a constrained mechanical system with CasADi's collocation: Gauss, `DEGREE` nodes, steps of one size.
 
-    What it was given: exact Jacobians; the degree that is cheapest on the four-bar from 1e-6 down.
+    What it was given: exact Jacobians; Gauss's points, with which the same steps have a fifth to a twelfth of the error
+    of CasADi's default, Radau's; the degree that is cheapest on the four-bar from 1e-6 down; the compiler, as
+    `solve_idas`.
 
     Parameters
     ----------
@@ -157,7 +172,7 @@ def solve_collocation(
     t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
     check_start(system, t0, q0, v0, derivatives=False)
     ends = t0 + (t1 - t0) * np.unique(np.linspace(0, n_steps, min(OUTPUTS, n_steps) + 1).astype(int)) / n_steps
-    options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps}
+    options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps, "collocation_scheme": "legendre"}
     return _solved(system, "collocation", t0, ends[1:], ends, q0, v0, options, time_limit)
 
 
@@ -172,6 +187,7 @@ def _by_sundials(
     t_eval: ArrayLike | None,
     time_limit: float | None,
     most_steps: int,
+    more: dict[str, str] | None = None,
 ) -> Result:
     check_tolerances(rtol, atol)
     t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
@@ -179,6 +195,7 @@ def _by_sundials(
     check_start(system, t0, q0, v0, derivatives=False)
     most_steps = check_size("most_steps", most_steps, 1)
     options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps}
+    options |= more or {}
     options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
     return _solved(system, plugin, t0, np.array([t1]), times, q0, v0, options, time_limit)
 
@@ -211,21 +228,21 @@ def _solved(
         counts = integrator.stats() if plugin in SUNDIALS else {}
         if limit.passed():
             failure = limit.message(name, t1, "take looser tolerances, or fewer steps")
-        if after.size != timed.size:
+        elif not np.array_equal(after, timed):
             states = np.array(made(after.tobytes())(x0=start)["xf"])
     except RuntimeError as error:  # the only sign of a failure; the run may have ended anywhere
         said = [line for line in str(error).splitlines() if line.strip()]
         failure = f"{name} failed: {said[-1]}. {ADVICE}"
-        after = after[:0]
-    if after.size < times.size and not failure:
+    if failure:
+        times, states = times[:0], states[:, :0]
+    elif after.size < times.size:
         states = np.column_stack([start, states])
-    kept = times if not failure else after
     statistics = Statistics(
         n_accepted=counts.get("nsteps", timed.size if plugin == "collocation" else None),
         n_evaluations=counts.get("nfevals"),
         cpu_time=cpu or 0.0,
     )
-    return ode_result(system, kept, states, failure, f"{name} reached the end, t = {t1:g}.", statistics)
+    return ode_result(system, times, states, failure, f"{name} reached the end, t = {t1:g}.", statistics)
 
 
 def _casadi() -> Any:
@@ -253,10 +270,18 @@ def _integrator(
     casadi, compiler = _casadi(), shutil.which("cc")
     arguments = ("motion", plugin, _equations(system, t0, q0, v0), t0, np.frombuffer(times).tolist())
     given = dict(options) | ({"rootfinder_options": ROOT} if plugin == "collocation" else {})
-    if plugin not in SUNDIALS or compiler is None or system.n_q > LARGEST_COMPILED:
+    if compiler is None or system.n_q > LARGEST_COMPILED:
         return casadi.integrator(*arguments, given)
     # CasADi writes for the compiler into the working folder, whatever it is told; it has loaded all when it returns
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
         jit: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_cleanup": False}
-        jit["jit_options"] = {"flags": ["-O3"], "cleanup": False}
+        jit["jit_options"] = {"flags": list(_flags(compiler)), "cleanup": False}
         return casadi.integrator(*arguments, given | jit)
+
+
+@lru_cache(maxsize=1)
+def _flags(compiler: str) -> tuple[str, ...]:
+    """FLAGS where the compiler takes them, else the plain ones."""
+    command = [compiler, *FLAGS, "-x", "c", "-fsyntax-only", "-"]
+    taken = subprocess.run(command, input=b"int x;\n", capture_output=True).returncode == 0
+    return FLAGS if taken else PLAIN

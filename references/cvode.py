@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.index1 import RightHandSide
-from references.ode import ADVICE, ode_result, output_times
+from references.ode import ADVICE, ode_result, output_times, states_at
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
 from twoloop.system import ConstrainedSystem
@@ -36,23 +36,24 @@ def solve_cvode(
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE of scikit-sundae.
 
-    What it was given: a right-hand side that numba compiled; asked for a few instants, because it keeps every step by
-    copying all before it.
+    What it was given: a right-hand side that numba compiled, and its analytic Jacobian as straight-line code, up to
+    `straight_line.MOST_OPERATIONS`, else differences; timed is the integration to the end, without output.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        The problem, its mass positive definite. Its callbacks are compiled at the first run (a few seconds).
+        The problem. Its callbacks are compiled at the first run (a few seconds).
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities.
     method : {"Adams", "BDF"}
-        Orders up to 12, or up to 5; both with Newton's iteration and dense differences, scikit-sundae's only one.
+        Orders up to 12, or up to 5; both with Newton's iteration, scikit-sundae's only one.
     rtol, atol : float
         CVODE's tolerances.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, interpolated by CVODE. None: 1001 times, evenly.
+        Increasing times in t_span at which to store the solution, interpolated by CVODE, in a second run of the same
+        steps that is not timed. None: 1001 times, evenly.
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at in every evaluation. None: no limit.
 
@@ -80,26 +81,32 @@ def solve_cvode(
         raise RuntimeError("scikit-sundae is not installed: pip install 'twoloop[references]'") from error
 
     equations, y0 = RightHandSide(system, t0, q0, 0.0), np.concatenate([q0, v0])
+    y0.setflags(write=False)  # as CVODE hands it over, so that what is compiled here is what it calls
     equations.warm(t0, y0, False)
-    limit = TimeLimit(time_limit)
-    derivative = equations.function(limit)
-
-    def right_hand_side(t: float, y: Array, rate: Array) -> None:
-        rate[:] = derivative(t, y)
-
-    # more than two times, or it returns its own steps; the ends are always among them
-    asked = np.unique(np.concatenate([[t0, 0.5 * (t0 + t1), t1], times]))
     options: dict[str, Any] = {"method": method, "rtol": float(rtol), "atol": float(atol), "max_num_steps": MOST_STEPS}
-    integrator = CVODE(right_hand_side, **options)
-    solution = None
+    jacobian = equations.jacobian(t0, y0)
+
+    def integrator(limit: TimeLimit) -> Any:
+        derivative = equations.function(limit)
+
+        def right_hand_side(t: float, y: Array, rate: Array) -> None:
+            rate[:] = derivative(t, y)
+
+        def jacfn(t: float, y: Array, rate: Array, JJ: Array) -> None:
+            JJ[:] = jacobian(t, y)  # type: ignore[misc]
+
+        return CVODE(right_hand_side, jacfn=None if jacobian is None else jacfn, **options)
+
+    limit = TimeLimit(time_limit)
+    timed, outcome = integrator(limit), None
     with user_call as clock, suppress(OutOfTimeError):
-        solution = integrator.solve(asked, y0)
+        timed.init_step(t0, y0)
+        outcome = timed.step(t1, tstop=t1)
     statistics = Statistics(n_evaluations=int(equations.counters[0]), cpu_time=clock.seconds or 0.0)
-    if solution is None:
+    if outcome is None:
         failure = limit.message("CVODE", t0, "take looser tolerances")
         return ode_result(system, times[:0], np.empty((y0.size, 0)), failure, "", statistics)
-    reached = float(solution.t[-1])
-    failure = "" if solution.success else f"CVODE failed after t = {reached:.10g}: {solution.message}. {ADVICE}"
-    kept = np.isin(solution.t, times)
+    failure = "" if outcome.success else f"CVODE failed after t = {outcome.t:.10g}: {outcome.message}. {ADVICE}"
+    shown = states_at(integrator(TimeLimit(None)), (t0, t1), times[times <= outcome.t], y0)
     end = f"CVODE, {method}, reached the end, t = {t1:g}."
-    return ode_result(system, solution.t[kept], solution.y[kept].T, failure, end, statistics)
+    return ode_result(system, shown.t, shown.y.T, failure, end, statistics)

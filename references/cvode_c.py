@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 METHODS = {"Adams": 1, "BDF": 2}  # CV_ADAMS and CV_BDF
 SMALLEST_STEP = 1e-12  # of the length of t_span
 STEPS_A_CALL = 100  # between two looks at the clock
-CV_NORMAL, CV_TSTOP_RETURN, CV_TOO_MUCH_WORK = 1, 1, -1
+CV_NORMAL, CV_ONE_STEP, CV_TSTOP_RETURN, CV_TOO_MUCH_WORK = 1, 2, 1, -1
 
 
 class Functions(NamedTuple):
@@ -118,7 +118,7 @@ def solve_cvode_c(
         name = flag_name("CVodeGetReturnFlagName", flag)
         failure = f"CVODE failed after t = {reached:.10g} with {name} ({flag}). {ADVICE}"
     kept = times[times <= reached]
-    rows = integrate(*arguments, kept, TimeLimit(None))[0]
+    rows = integrate(*arguments, kept, TimeLimit(None))[0] if kept.size else np.empty((0, start.size))
     end = f"CVODE, {method}, reached the end, t = {t1:g}."
     return ode_result(system, kept[: len(rows)], rows.T, failure, end, statistics)
 
@@ -177,7 +177,10 @@ def integrate(
     times: Array,
     limit: TimeLimit,
 ) -> tuple[Array, int, float, Statistics]:
-    """Rows y at the times before a failure, CVODE's last flag, the time that it reached, its counters."""
+    """Rows y at the times before a failure, CVODE's last flag, the time that it reached, its counters.
+
+    Without times it goes to the end, and that is timed; with times, which the same steps reach, it goes to the last.
+    """
     sundials, state, n = library(), start.copy(), start.size
     reached, flag = REAL(t0), 0
     rows: list[Array] = []
@@ -210,7 +213,9 @@ def integrate(
         # of one who keeps the memory; the second run, for the output, is ours
         with UserCall() if times.size else user_call as clock:
             check("CVodeReInit", sundials.CVodeReInit(memory, t0, y))
-            for stop in [*times.tolist(), t1]:
+            for k, stop in enumerate(times.tolist() if times.size else [t1]):
+                if times.size and stop > t0 and (k == 0 or times[k - 1] <= t0):
+                    sundials.CVode(memory, t1, y, place, CV_ONE_STEP)  # its length depends on where it is to go
                 if stop > t0 and flag != CV_TSTOP_RETURN:
                     for _ in itertools.count():
                         flag = sundials.CVode(memory, stop, y, place, CV_NORMAL)

@@ -22,7 +22,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LARGEST = 9  # coordinates; the compilation of more takes too long
-MOST_STEPS = 100_000
+MOST_STEPS = 10**7
 
 
 def solve_diffrax(
@@ -54,7 +54,7 @@ def solve_diffrax(
     rtol, atol : float
         Tolerances of q and v.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, by the method's interpolant (of order 7), in a second
+        Increasing times in t_span at which to store the solution, by the method's interpolant (of order 8), in a second
         run that is not timed. None: 1001 times, evenly.
     time_limit : float, optional
         Wall-clock time that the integration may take, s. Compiled code does not look at the clock: a run ends after
@@ -92,22 +92,21 @@ def solve_diffrax(
     limit = TimeLimit(time_limit)
     with user_call as clock:
         _, status, steps, rejected = solve(t0, t1, start, rtol, atol, end)
-    states = solve(t0, t1, start, rtol, atol, times)[0].T
-    failure = ""
-    if limit.passed():
-        failure = limit.message("diffrax", t1, "take looser tolerances")
-    elif status:
-        reason = f"{most_steps} steps were not enough" if steps + rejected >= most_steps else f"diffrax says: {status}"
-        failure = f"diffrax failed: {reason}. {ADVICE}"
-    if failure:
-        kept = np.isfinite(states).all(axis=0)
-        times, states = times[kept], states[:, kept]
     statistics = Statistics(
         n_accepted=steps,
         n_rejected_error=rejected,
         n_evaluations=13 * (steps + rejected),
         cpu_time=clock.seconds or 0.0,
     )
+    if limit.passed():
+        failure = limit.message("diffrax", t1, "take looser tolerances")
+        return ode_result(system, times[:0], np.empty((start.size, 0)), failure, "", statistics)
+    states, failure = solve(t0, t1, start, rtol, atol, times)[0].T, ""
+    if status:
+        reason = f"{most_steps} steps were not enough" if steps + rejected >= most_steps else f"diffrax says: {status}"
+        failure = f"diffrax failed: {reason}. {ADVICE}"
+        kept = np.isfinite(states).all(axis=0)
+        times, states = times[kept], states[:, kept]
     return ode_result(system, times, states, failure, f"diffrax reached the end, t = {t1:g}.", statistics)
 
 

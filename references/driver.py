@@ -40,15 +40,23 @@ class UserCall:
     def __init__(self) -> None:
         self.seconds: float | None = None
         self.ended: float | None = None
-        self._began = 0.0
+        self._began: float | None = None
 
     def __enter__(self) -> Self:
         self._began = time.process_time()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.seconds = time.process_time() - self._began
+        self.seconds, self._began = self.so_far(), None
         self.ended = cpu_time() if self.ended is None else self.ended
+
+    def forget(self) -> None:
+        """Make this as new, before a run: an exception may have come while the last call ended."""
+        self.seconds = self.ended = self._began = None
+
+    def so_far(self) -> float:
+        """CPU time of the call under way, s; 0.0 outside of it."""
+        return 0.0 if self._began is None else time.process_time() - self._began
 
 
 user_call = UserCall()  # one: a process makes one run at a time

@@ -27,6 +27,7 @@ from references.ida_options import (
     own_tangent,
     tolerances,
 )
+from references.ode import states_at
 from twoloop.callbacks import stand_in
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -88,7 +89,8 @@ def solve_ida(
         IDA's tolerances for q, v (and Lam, Mu in the stabilised form). At a given tolerance the error at the end
         scatters by a factor of 2 to 24 (15 runs) with rounding alone, which changes IDA's choice of steps and orders.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, interpolated by IDA. None: every step is stored.
+        Increasing times in t_span at which to store the solution, interpolated by IDA, in a second run of the same
+        steps that is not timed. None: every step is stored, which scikit-sundae does by copying all before it.
     max_order : int
         The highest order of the BDF, 1 to 5. Those above 2 are unstable for undamped vibrations that the step does not
         resolve.
@@ -123,29 +125,67 @@ def solve_ida(
     absolute = tolerances(system, size, error_test, float(atol))
     if form == "index1":
         absolute[2 * system.n_q :] = NOT_TESTED
-    compiled = compiled_residual(system, form)
     y0, yp0 = start_of(system, form, t0, q0, v0)
-    tspan = np.array([t0, t1]) if times is None else _stops(t0, t1, times)
     limit, said = TimeLimit(time_limit), io.StringIO()
-    residual, jacobian = _callbacks(system, compiled, limit)
-    solver = sksundae.ida.IDA(
-        residual,
-        jacfn=jacobian,
-        rtol=float(rtol),
-        atol=absolute,
-        max_order=max_order,
-        min_step=SMALLEST_STEP * (t1 - t0),
-        max_step=t1 - t0,
-        max_num_steps=10**9,  # per output time
-    )
+    options = {
+        "rtol": float(rtol),
+        "atol": absolute,
+        "max_order": max_order,
+        "min_step": SMALLEST_STEP * (t1 - t0),
+        "max_step": t1 - t0,
+        "max_num_steps": 10**9,  # per output time
+    }
+    compiled = compiled_residual(system, form)
+    solver = _solver(system, compiled, options, limit)
     with redirect_stdout(said), user_call as clock:
-        outcome = solver.solve(tspan, y0, yp0)
-    return _result(system, form, outcome, times, said.getvalue(), clock.seconds or 0.0, limit)
+        if times is None:
+            outcome = solver.solve(np.array([t0, t1]), y0, yp0)
+        else:
+            solver.init_step(t0, y0, yp0)
+            outcome = solver.step(t1, tstop=t1)
+    shown = outcome
+    if times is not None:
+        solver = _solver(system, compiled, options, TimeLimit(None))
+        shown = states_at(solver, (t0, t1), times[times <= outcome.t], y0, yp0)
+    return _result(system, form, outcome, shown, times is None, said.getvalue(), clock.seconds or 0.0, limit)
+
+
+def _solver(
+    system: ConstrainedSystem,
+    compiled: tuple[Callable[..., None], Callable[..., None]],
+    options: dict[str, Any],
+    limit: TimeLimit,
+) -> Any:
+    residual, jacobian = _callbacks(system, compiled, limit)
+    return sksundae.ida.IDA(residual, jacfn=jacobian, **options)
 
 
 def compiled_residual(system: ConstrainedSystem, form: str) -> tuple[Callable[..., None], Callable[..., None]]:
     """Residual (t, y, y', res, n_q, n_c, p) and dF/dy + cj dF/dy' (t, y, y', cj, JJ, n_q, n_c, p) of a form."""
     return _compiled(form, *system.functions[:5], compiled_gamma(system), own_tangent(system))
+
+
+def compiled_rates(system: ConstrainedSystem) -> Callable[..., None]:
+    """(t, y, JJ, n_q, n_c, p) -> None: dF/dy' of the form "stabilised", which is M, C_q^T and ones, into zeros."""
+    f = system.functions
+    return _rates(f.mass, f.jacobian)
+
+
+@lru_cache(maxsize=64)
+def _rates(mass: Dispatcher, jacobian: Dispatcher) -> Callable[..., None]:
+    @njit(types.void(types.float64, _READ, _MATRIX, *_SIZES, _VECTOR), error_model="numpy")
+    def rates(t, y, JJ, n, m, p):  # type: ignore[no-untyped-def]
+        q, M, Cq = y[:n].copy(), np.zeros((n, n)), np.zeros((m, n))
+        mass(t, q, p, M)
+        jacobian(t, q, p, Cq)
+        for i in range(n):
+            JJ[i, i] = 1.0
+            for j in range(n):
+                JJ[n + i, n + j] = M[i, j]
+            for k in range(m):
+                JJ[n + i, 2 * n + k] = JJ[i, 2 * n + m + k] = Cq[k, i]
+
+    return rates  # type: ignore[no-any-return]
 
 
 def _callbacks(
@@ -191,29 +231,23 @@ def start_of(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array
     return np.concatenate([q, v, zeros, zeros]), np.concatenate([v, a, lam, zeros])
 
 
-def _stops(t0: float, t1: float, times: Array) -> Array:
-    """Output times with both ends, and at least three: given two, IDA returns every step."""
-    stops = np.unique(np.concatenate([[t0], times, [t1]]))
-    return stops if stops.size > 2 else np.array([t0, 0.5 * (t0 + t1), t1])
-
-
 def _result(
     system: ConstrainedSystem,
     form: str,
     outcome: Any,
-    times: Array | None,
+    shown: Any,
+    every_step: bool,
     said: str,
     cpu: float,
     limit: TimeLimit,
 ) -> Result:
+    """The Result of the states `shown`, of a run that ended as `outcome` says."""
     n, m = system.n_q, system.n_c
-    y, yp = outcome.y.T, outcome.yp.T
+    y, yp = shown.y.T, shown.yp.T
     lam = (y if form == "index1" else yp)[2 * n : 2 * n + m]
-    keep = np.append(True, np.diff(outcome.t) > 0.0)  # a failed run comes with its last state twice
-    if times is not None:
-        keep &= np.isin(outcome.t, times)
+    keep = np.append(True, np.diff(shown.t) > 0.0)  # a failed run comes with its last state twice
     failed = outcome.status < 0
-    end = float(outcome.t[-1])
+    end = float(np.max(outcome.t))
     message = f"IDA reached the end, t = {end:g}."
     if failed and limit.exceeded:
         message = limit.message("IDA", end, "take looser tolerances")
@@ -225,16 +259,16 @@ def _result(
             "other form or other tolerances."
         )
     return Result(
-        t=outcome.t[keep],
+        t=shown.t[keep],
         q=y[:n, keep],
         v=y[n : 2 * n, keep],
         a=yp[n : 2 * n, keep],
         lam=lam[:, keep],
-        h=np.diff(outcome.t[keep]) if times is None else np.empty(0),
+        h=np.diff(shown.t[keep]) if every_step else np.empty(0),
         status=Status.SOLVER_FAILED if failed else Status.REACHED_END,
         message=message,
         stats=Statistics(
-            n_accepted=int(keep.sum()) - 1 if times is None else None,
+            n_accepted=int(keep.sum()) - 1 if every_step else None,
             n_evaluations=int(outcome.nfev),
             n_factorizations=int(outcome.njev),
             cpu_time=cpu,

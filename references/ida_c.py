@@ -33,10 +33,10 @@ OUTPUTS = 1001  # instants of the default t_eval
 SMALLEST_STEP = (
     1e-12  # of the length of t_span; without a smallest step IDA shrinks its steps towards a NaN without end
 )
-MOST_STEPS = 10**7  # between two output times
+MOST_STEPS = 10**7
 STEPS_A_CALL = 100  # between two looks at the clock
 
-IDA_NORMAL, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 1, -1
+IDA_NORMAL, IDA_ONE_STEP, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 2, 1, -1
 
 
 def solve_ida_c(
@@ -71,7 +71,8 @@ def solve_ida_c(
     rtol, atol : float
         IDA's tolerances, for the unknowns in the error test.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, interpolated by IDA. None: `OUTPUTS` times, evenly.
+        Increasing times in t_span at which to store the solution, interpolated by IDA, in a second run of the same
+        steps that is not timed. None: `OUTPUTS` times, evenly.
     max_order : int
         The highest order of the BDF, 1 to 5. Those above 2 are unstable for undamped vibrations that the step does not
         resolve.
@@ -80,8 +81,8 @@ def solve_ida_c(
         mean over all unknowns, so that without the others the same tolerances allow q an error
         sqrt((2 n_q + 2 n_c)/n_q) times as large, and q and v one sqrt(1 + n_c/n_q) times as large.
     time_limit : float, optional
-        Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps and at output times. A
-        run past it is a failed one. None: no limit.
+        Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps. A run past it is a
+        failed one. None: no limit.
 
     Returns
     -------
@@ -89,9 +90,8 @@ def solve_ida_c(
         `a` and `lam` as IDA has them, with the sign of M a + C_q^T lam = Q; `h` is empty. The statistics are IDA's own
         counters: steps and failed steps, Newton iterations (n_outer), residual evaluations without those that the
         differences of the Jacobian take (n_evaluations), and Jacobians, each with its factorisation
-        (n_factorizations). cpu_time is that of a second use of IDA's
-        memory: IDAReInit, and the loop over the output times that calls IDASolve. A failure of IDA
-        gives the output before it, `Status.SOLVER_FAILED` and the name of IDA's flag.
+        (n_factorizations). cpu_time is that of a second use of IDA's memory: IDAReInit, and IDASolve to the end,
+        without output. A failure of IDA gives the output before it, `Status.SOLVER_FAILED` and the name of IDA's flag.
 
     Raises
     ------
@@ -115,12 +115,16 @@ def solve_ida_c(
 
     sundials, state = library(), _start(system, t0, q0, v0)
     absolute = tolerances(system, state.size // 2, error_test, float(atol))
+    start = state.copy()
     with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order) as solver:
         limit = TimeLimit(time_limit)
         with user_call as clock:  # of one who keeps the memory
             check("IDAReInit", sundials.IDAReInit(solver[0], t0, *solver[1:]))
-            rows, flag, reached = _integrate(sundials.IDASolve, solver, state, t0, t1, times, limit)
+            flag, reached = _to_the_end(sundials.IDASolve, solver, t0, t1, limit)
         statistics = _statistics(solver[0], clock.seconds or 0.0)
+        state[:] = start
+        check("IDAReInit", sundials.IDAReInit(solver[0], t0, *solver[1:]))
+        rows = _states_at(sundials.IDASolve, solver, state, t0, t1, times[times <= reached])
     message = f"IDA reached the end, t = {reached:g}."
     if limit.exceeded:
         message = limit.message("IDA", reached, "take looser tolerances")
@@ -186,29 +190,36 @@ def _integrator(
         yield memory, y, yp
 
 
-def _integrate(
-    solve: Any, solver: tuple[Any, Any, Any], state: Array, t0: float, t1: float, times: Array, limit: TimeLimit
-) -> tuple[Array, int, float]:
-    """Rows [y y'] at the times before a failure, IDA's last flag, and the time that IDA reached.
+def _to_the_end(solve: Any, solver: tuple[Any, Any, Any], t0: float, t1: float, limit: TimeLimit) -> tuple[int, float]:
+    """IDA's last flag, and the time that IDA reached.
 
     Past the time limit the flag is that of IDA when it is stopped at its greatest number of steps.
     """
     memory, y, yp = solver
     reached, flag = REAL(t0), 0
-    place = ctypes.byref(reached)
-    rows, stored = np.empty((times.size, state.size)), 0
-    for stop in [*times.tolist(), t1]:
-        if stop > t0 and flag != IDA_TSTOP_RETURN:
-            for calls in itertools.count(1):
-                flag = IDA_TOO_MUCH_WORK if limit.passed() else solve(memory, stop, place, y, yp, IDA_NORMAL)
-                if flag != IDA_TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
+    for calls in itertools.count(1):
+        flag = IDA_TOO_MUCH_WORK if limit.passed() else solve(memory, t1, ctypes.byref(reached), y, yp, IDA_NORMAL)
+        if flag != IDA_TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
+            break
+    return flag, reached.value
+
+
+def _states_at(solve: Any, solver: tuple[Any, Any, Any], state: Array, t0: float, t1: float, times: Array) -> Array:
+    """Rows [y y'] at times that the same steps have reached before."""
+    memory, y, yp = solver
+    place, flag, rows = ctypes.byref(REAL(t0)), 0, np.empty((times.size, state.size))
+    for k, stop in enumerate(times.tolist()):
+        if stop > t0:
+            if k == 0 or times[k - 1] <= t0:  # the length of the first step depends on where it is to go
+                solve(memory, t1, place, y, yp, IDA_ONE_STEP)
+            while flag != IDA_TSTOP_RETURN:
+                flag = solve(memory, stop, place, y, yp, IDA_NORMAL)
+                if flag != IDA_TOO_MUCH_WORK:
                     break
             if flag < 0:
-                break
-        if stored < times.size:
-            rows[stored] = state
-            stored += 1
-    return rows[:stored], flag, reached.value
+                return rows[:k]
+        rows[k] = state
+    return rows
 
 
 def _statistics(memory: Any, cpu: float) -> Statistics:

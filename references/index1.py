@@ -15,8 +15,10 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
-from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
+from references.accelerations import OPTIONS, Equations, matrix_of, saddle_solve, schur_factors, times_inverse
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
+from references.expressions import NotSymbolic
+from references.straight_line import straight_line_jacobian
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
 from twoloop.kernels.linalg import ldl_solve
@@ -27,6 +29,7 @@ Array = NDArray[np.float64]
 
 METHODS: dict[str, type[OdeSolver]] = {"DOP853": DOP853, "RK45": RK45, "LSODA": LSODA, "Radau": Radau, "BDF": BDF}
 PAIRS = ("Pr8", "Pr9")  # explicit Runge-Kutta pairs of extensisq (P. J. Prince), of orders 8(7) and 9(8)
+IMPLICIT = ("LSODA", "Radau", "BDF")  # wholly, or where the problem is stiff
 ONE_STEP = ("DOP853", "RK45")  # explicit, and nothing of them but y and f outlives a step: they can be projected
 STABILISATIONS = {
     "none": "C_q a = Q_d; drifts off the constraints",
@@ -66,7 +69,9 @@ def solve_index1(
         Consistent initial coordinates and velocities.
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr8", "Pr9"}
         The solver of `scipy.integrate`, or of extensisq (`PAIRS`: on the four-bar the best of its pairs from 1e-5 down,
-        Pr9 at tight tolerances). The implicit ones difference the right-hand side for their Jacobian.
+        Pr9 at tight tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
+        can be had as expressions of up to `straight_line.MOST_OPERATIONS`, without Baumgarte's terms; else they
+        difference the right-hand side.
     rtol, atol : float
         SciPy's tolerances for q and v.
     stabilisation : {"none", "baumgarte", "projection"}
@@ -87,7 +92,8 @@ def solve_index1(
         linkage (period 2.25 s, DOP853, tolerances 1e-6 and 1e-9, 100 s) 10 costs 21 and 13 % more evaluations than no
         stabilisation, and its error is 1/300 and 1/35; from 20 on the cost grows with alpha: the ODE becomes stiff.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, by the solver's interpolant. None: every step.
+        Increasing times in t_span at which to store the solution, by the solver's interpolant, in a second run of the
+        same steps that is not timed. None: every step.
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at in every evaluation of the right-hand side. A run
         past it is a failed one. None: no limit.
@@ -97,10 +103,10 @@ def solve_index1(
     Result
         `a` and `lam` (with the sign of M a + C_q^T lam = Q) computed from the stored q and v as in the right-hand
         side, so with Baumgarte's terms where they are used. `h` holds all accepted steps. Of the statistics:
-        n_accepted; n_evaluations, all evaluations of the right-hand side, those for a difference Jacobian, for the
-        interpolant and after a projection included; n_factorizations, SciPy's LU count, for "Radau" and "BDF". cpu_time
-        is that of the integration, without the final `a` and `lam`. A failure gives what was computed before it,
-        `Status.SOLVER_FAILED` and the solver's text.
+        n_accepted; n_evaluations, all evaluations of the right-hand side, those for a difference Jacobian and after a
+        projection included, those for the interpolant not; n_factorizations, SciPy's LU count, for "Radau" and "BDF".
+        cpu_time is that of the integration, without the final `a` and `lam`. A failure gives what was computed before
+        it, `Status.SOLVER_FAILED` and the solver's text.
 
     Raises
     ------
@@ -119,11 +125,20 @@ def solve_index1(
     equations = RightHandSide(system, t0, q0, strength)
     y0 = np.concatenate([q0, v0])
     equations.warm(t0, y0, stabilisation == "projection")
-    run = _Run(equations, times, stabilisation == "projection", time_limit)
-    options = {"rtol": float(rtol), "atol": float(atol)}
+    projected = stabilisation == "projection"
+    options: dict[str, Any] = {"rtol": float(rtol), "atol": float(atol)}
+    if method in IMPLICIT and (jacobian := equations.jacobian(t0, y0)):
+        options["jac"] = jacobian
+    run = _Run(equations, None if times is None else times[:0], projected, time_limit)
     with user_call as clock:
         run.go(solver_type, t0, y0, t1, options)
-    return _result(method, equations, run, t1, clock.seconds or 0.0)
+    evaluations, shown = int(equations.counters[0]), run
+    if times is not None:
+        shown = _Run(equations, times[times <= run.ends[-1]], projected, None)
+        if times[0] <= run.ends[-1]:
+            shown.go(solver_type, t0, y0, t1, options)
+        run.failure = run.failure or shown.failure
+    return _result(method, equations, run, shown, evaluations, t1, clock.seconds or 0.0)
 
 
 def _pair(method: str) -> type[OdeSolver]:
@@ -180,6 +195,23 @@ class RightHandSide(Equations):
 
         return fun  # type: ignore[no-any-return]
 
+    def jacobian(self, t: float, y: Array) -> Callable[[float, Array], Array] | None:
+        """df/dy as SciPy calls it, compiled; None where it cannot be had, or is too long to be compiled."""
+        try:
+            derivatives = None if self.alpha > 0.0 else straight_line_jacobian(self.system, t, *np.split(y, 2))
+        except NotSymbolic:
+            return None
+        if derivatives is None:
+            return None
+
+        def jac(t: float, y: Array) -> Array:
+            columns = np.zeros((y.size, y.size))
+            derivatives(t, y, columns)
+            return columns.T
+
+        jac(t, y)  # compiles
+        return jac
+
     def project(self, t: float, y: Array) -> bool:
         """Move y onto the constraints; False if that does not converge."""
         return bool(self.projection(t, y, self.system.n_c, self.system.functions.p, self.factors, self.known))
@@ -206,21 +238,25 @@ class _Run:
         self.failure = ""
         self.n_factorizations: int | None = None
 
-    def go(self, solver_type: type[OdeSolver], t0: float, y0: Array, t1: float, options: dict[str, float]) -> None:
+    def go(self, solver_type: type[OdeSolver], t0: float, y0: Array, t1: float, options: dict[str, Any]) -> None:
         """Integrate to t1 or to a failure, which leaves its text in `failure`."""
         self.ends.append(t0)
-        if self.times is None or self.times[0] == t0:
+        if self.times is None or t0 in self.times[:1]:
             self._store(t0, y0)
         solver = None
         try:
             solver = solver_type(self.equations.function(self.limit), t0, y0, t1, **options)
-            while solver.status == "running" and not self.failure:
+            while solver.status == "running" and not self.failure and not self._has_all():
                 self.failure = self._attempt(solver)
                 if not self.failure:
                     self._accept(solver)
         except OutOfTimeError:
             self.failure = "out of time"
         self.n_factorizations = solver.nlu if isinstance(solver, Radau | BDF) else None
+
+    def _has_all(self) -> bool:
+        """Whether the output times of a run that is for them alone are stored."""
+        return bool(self.times is not None and 0 < self.times.size == len(self.t))
 
     def _attempt(self, solver: OdeSolver) -> str:
         """Make a step, and return why it failed."""
@@ -282,11 +318,13 @@ class _Run:
         self.y.append(y)
 
 
-def _result(method: str, equations: RightHandSide, run: _Run, t1: float, cpu: float) -> Result:
+def _result(
+    method: str, equations: RightHandSide, run: _Run, shown: _Run, evaluations: int, t1: float, cpu: float
+) -> Result:
+    """The Result of what `shown` has stored, of a run that took so many evaluations."""
     n = equations.system.n_q
-    evaluations = int(equations.counters[0])
-    t = np.array(run.t)
-    states = np.array(run.y).reshape(-1, 2 * n).T
+    t = np.array(shown.t)
+    states = np.array(shown.y).reshape(-1, 2 * n).T
     a, lam = equations.at_points(t, states, equations.alpha)
     message = f"{method} reached the end, t = {t1:g}."
     if run.limit.exceeded:
@@ -339,17 +377,14 @@ def _projection(
     mass: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
 ) -> Callable[..., Any]:
     """(t, y, n_c, p, factors, known) -> success; y is projected in place, positions by Newton, then velocities."""
+    mass_at = matrix_of(mass)
 
     @njit(**OPTIONS)
     def project(t, y, m, p, factors, known):  # type: ignore[no-untyped-def]
         n = y.size // 2
         q, v = y[:n].copy(), y[n:].copy()
-        L, Cq, C = factors, np.zeros((m, n)), np.zeros(m)
-        if not known & CONSTANT:
-            L = np.zeros((n, n))
-            mass(t, q, p, L)
-            if not factor(L):
-                return False
+        Cq, C = np.zeros((m, n)), np.zeros(m)
+        L, definite = mass_at(t, q, p, factors, known)
         size = 1.0
         for j in range(n):
             size = max(size, abs(q[j]))
@@ -362,7 +397,7 @@ def _projection(
             C[:] = 0.0
             jacobian(t, q, p, Cq)
             constraint(t, q, p, C)
-            change = _least_change(L, known, Cq, C, q)
+            change = _least_change(L, definite, known, Cq, C, q)
             if change == np.inf:
                 return False
         Cq[:, :] = 0.0
@@ -372,7 +407,7 @@ def _projection(
         for i in range(m):
             for j in range(n):
                 C[i] += Cq[i, j] * v[j]
-        if _least_change(L, known, Cq, C, v) == np.inf:
+        if _least_change(L, definite, known, Cq, C, v) == np.inf:
             return False
         for j in range(n):
             y[j] = q[j]
@@ -383,18 +418,24 @@ def _projection(
 
 
 @njit(**OPTIONS)
-def _least_change(L, known, Cq, C, x):  # type: ignore[no-untyped-def]
-    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular."""
+def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
+    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular. C is lost.
+
+    Where M is not positive definite, x changes by the d of M d + C_q^T mu = 0 and C_q d = C, which is the same.
+    """
     m, n = Cq.shape
-    S, definite = schur_factors(L, known, Cq)
-    if not definite:
-        return np.inf
-    ldl_solve(S, C)
     change = np.zeros(n)
-    for i in range(m):
-        for j in range(n):
-            change[j] += Cq[i, j] * C[i]
-    times_inverse(L, known, change)
+    if definite:
+        S, good = schur_factors(L, known, Cq)
+        if not good:
+            return np.inf
+        ldl_solve(S, C)
+        for i in range(m):
+            for j in range(n):
+                change[j] += Cq[i, j] * C[i]
+        times_inverse(L, known, change)
+    elif not saddle_solve(L, Cq, change, C):
+        return np.inf
     largest = 0.0
     for j in range(n):
         x[j] -= change[j]

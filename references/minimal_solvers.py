@@ -116,7 +116,7 @@ def solve_cvode_minimal(
         name = flag_name("CVodeGetReturnFlagName", flag)
         failure = f"CVODE failed after t = {reached:.10g} with {name} ({flag}). {ADVICE}"
     kept = times[times <= reached]
-    rows = integrate(*arguments, kept, TimeLimit(None))[0]
+    rows = integrate(*arguments, kept, TimeLimit(None))[0] if kept.size else np.empty((0, len(own.start)))
     end = f"CVODE, Adams, reached the end, t = {t_end:g}."
     return _result(problem, own, kept[: len(rows)], rows, failure, end, statistics)
 

@@ -1,5 +1,8 @@
 """What the adapters of solvers of y' = f(t, y), y = [q, v], share: the Result of their states."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
@@ -22,6 +25,20 @@ ADVICE = (
 def output_times(times: Array | None, t0: float, t1: float) -> Array:
     """The instants at which to store the solution: those given, or `OUTPUTS` evenly."""
     return np.linspace(t0, t1, OUTPUTS) if times is None else times
+
+
+def states_at(solver: Any, span: tuple[float, float], times: Array, *start: Array) -> SimpleNamespace:
+    """The states of a solver of scikit-sundae at times that the same steps have reached before."""
+    t0, t1 = span
+    shown = [solver.init_step(t0, *start)]
+    if times.size and times[-1] > t0:
+        solver.step(t1, "onestep", t1)  # the length of the first step depends on where it is to go
+        shown += [solver.step(stop, tstop=t1) for stop in times[times > t0].tolist()]
+    if not (times.size and times[0] == t0):
+        shown = shown[1:]
+    size = start[0].size
+    y, yp = (np.array([getattr(each, name, each.y) for each in shown]).reshape(-1, size) for name in ("y", "yp"))
+    return SimpleNamespace(t=times, y=y, yp=yp)
 
 
 def ode_result(

@@ -8,11 +8,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
 COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
+AROUND = 10.0  # times the limit of a run, for all that an adapter does beside the user's call: building, output
 MOST_CALLS = 3
 REPEATS = 5
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
@@ -72,7 +73,7 @@ class Case:
     tolerances : tuple of float or None
         For solvers that have one. None: those of the solver, from 1e-3 down; a stiff case asks for looser ones.
     time_limit : float
-        CPU seconds that a run may use.
+        CPU seconds that the call of a run may use that its user writes.
     timed : float
         s of CPU time: a shorter run is timed by calling it again until it has used so much.
     tags : tuple of str
@@ -151,6 +152,8 @@ class Solver:
         used(value, result) -> what a solver that chooses among methods took, between which nothing is interpolated.
     builds_each : bool
         Whether it compiles or builds anew for each value of the setting, not once a case.
+    builds_span : bool
+        Whether what it builds holds the time span, so that its warm-up is a whole run.
     """
 
     name: str
@@ -165,6 +168,7 @@ class Solver:
     traces: bool = False
     used: Callable[[float, Result], str] | None = None
     builds_each: bool = False
+    builds_span: bool = False
 
     def took(self, value: float, result: Result | None) -> str:
         """The method that a run took, where the solver chooses; else nothing."""
@@ -315,8 +319,10 @@ def warm_up(run: Run, repeat: int, warm: set[tuple[int, str, float]], limit: flo
     if what in warm:
         return
     warm.add(what)
-    span = 10.0 * run.value if run.solver.setting == "h" else WARM_UP * run.case.t_end
-    attempt(replace(run, case=replace(run.case, t_end=min(span, run.case.t_end), time_limit=limit)), repeat)
+    if not run.solver.builds_span:
+        span = 10.0 * run.value if run.solver.setting == "h" else WARM_UP * run.case.t_end
+        run = replace(run, case=replace(run.case, t_end=min(span, run.case.t_end), time_limit=limit))
+    attempt(run, repeat, limit)
 
 
 def called_from(run: Run) -> str:
@@ -325,18 +331,21 @@ def called_from(run: Run) -> str:
     return "Python" if in_python else run.solver.called_from
 
 
-def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str, float]:
-    """Make a run: its result, where there is one, a status, a message, and the CPU time of the user's call in s."""
-    result, status, message, spent, user_call.seconds = None, "", "", 0.0, None
+def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result | None, str, str, float]:
+    """Make a run: its result, where there is one, a status, a message, and the CPU time of the user's call in s.
+
+    The limit is that of the user's call; all that an adapter does may take `around` s, by default AROUND times as much.
+    """
+    result, status, message, spent = None, "", "", 0.0
+    user_call.forget()
+    limit = run.case.time_limit
     try:
-        with _limited(run.case.time_limit):
+        with _Alarm(limit, AROUND * limit if around is None else around) as alarm:
             began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
             spent = time.process_time() - began
     except NotApplicable as why:
         status, message = "NOT_APPLICABLE", str(why)
-    except TimeLimit:
-        status, message = "TIME_LIMIT", f"Stopped after {run.case.time_limit:g} s of CPU time, the limit of a run."
     except ImportError as error:
         status, message = "NOT_AVAILABLE", str(error)
     except RuntimeError as error:
@@ -345,6 +354,8 @@ def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str, float]:
         message = str(error)
     except Exception as error:  # a solver that raises must not end a night of runs: the row says what it raised
         status, message = "RAISED", f"{type(error).__name__}: {error}"
+    if alarm.rang:  # whatever a foreign library has made of the exception
+        return None, "TIME_LIMIT", alarm.rang, 0.0
     if result is None:
         return None, status, message, 0.0
     spent = spent if user_call.seconds is None else user_call.seconds
@@ -355,28 +366,35 @@ def attempt(run: Run, repeat: int) -> tuple[Result | None, str, str, float]:
     return result, result.status.name, result.message, spent
 
 
-@contextmanager
-def _limited(seconds: float) -> Iterator[None]:
-    """Raise TimeLimit in this process after so many seconds of its CPU time, where the system can.
+class _Alarm:
+    """Raise TimeLimit in this process when a user's call, or all around it, has used up its CPU time, where it can.
 
-    Compiled code is not interrupted but at its return to Python.
+    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised.
     """
-    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
-    began = time.process_time()
+    def __init__(self, seconds: float, around: float):
+        self.seconds, self.around, self.rang = seconds, around, ""
+        self._can = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+        self._began, self._before = 0.0, None
 
-    def stop(*_: object) -> None:
-        if time.process_time() - began >= seconds:
+    def __enter__(self) -> Self:
+        if self._can:
+            self._began = time.process_time()
+            # a timer of wall-clock time: one of CPU time makes the clocks of CPU time advance in ticks of 4 ms on Linux
+            self._before = signal.signal(signal.SIGALRM, self._look)  # type: ignore[assignment]
+            # again and again: an exception raised in a callback of a foreign solver may be swallowed by it
+            signal.setitimer(signal.ITIMER_REAL, 1.1 * self.seconds, min(1.0, 0.5 * self.seconds))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._can:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._before)
+
+    def _look(self, *_: object) -> None:
+        if user_call.so_far() >= 1.1 * self.seconds:  # a solver's own limit comes first
+            self.rang = f"Stopped after {self.seconds:g} s of CPU time, the limit of a run."
+        elif time.process_time() - self._began >= self.around:
+            self.rang = f"Stopped after {self.around:g} s of CPU time, the limit of all that an adapter does."
+        if self.rang:
             raise TimeLimit
-
-    # a timer of wall-clock time: one of CPU time makes the clocks of CPU time advance in ticks of 4 ms on Linux
-    before = signal.signal(signal.SIGALRM, stop)
-    # again and again: an exception raised in a callback of a foreign solver may be swallowed by it
-    signal.setitimer(signal.ITIMER_REAL, 1.1 * seconds, min(1.0, 0.5 * seconds))  # a solver's own limit comes first
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)

@@ -86,6 +86,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Pr9, index 1": (ORANGE, "p"),
     "IDAS, CasADi": (RED, "d"),
     "CVODES, CasADi": (BLUE, "d"),
+    "CVODES, CasADi, Adams": (GREEN, "d"),
     "collocation, CasADi": (GREY, "d"),
     "IDA from C, stabilised": (BLACK, ">"),
     "IDA from C, q and v tested": (BLACK, "<"),

@@ -62,7 +62,8 @@ GEAR_STARTS = ("accurate", "ramp")
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
     *(HEYOKA, CVODE_C, "CVODE from C, BDF", CVODE_C_PROJECTED, IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX),
-    *(IDAS, "CVODES, CasADi", "collocation, CasADi", "CVODE, Adams", "LSODA, index 1", "DOP853, index 1"),
+    *(IDAS, "CVODES, CasADi", "CVODES, CasADi, Adams", "collocation, CasADi", "CVODE, Adams"),
+    *("LSODA, index 1", "DOP853, index 1"),
     *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised"),
     *("Radau, solve_dae", "Radau9, solve_dae"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, GeneralizedAlpha 0.6", "Exudyn, TrapezoidalIndex2"),
@@ -199,12 +200,13 @@ def _diffrax(case: Case, tolerance: float, repeat: int) -> Result:
     return _by_expressions(solve_diffrax, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
 
 
-def _casadi(integrator: str, case: Case, tolerance: float, repeat: int) -> Result:
+def _casadi(method: str | None, case: Case, tolerance: float, repeat: int) -> Result:
+    """IDAS, or CVODES by a method."""
     from references.casadi_integrators import solve_cvodes, solve_idas
 
-    solve = {"IDAS": solve_idas, "CVODES": solve_cvodes}[integrator]
-    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
-    return _by_expressions(solve, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
+    solve = solve_idas if method is None else partial(solve_cvodes, method=method)
+    options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": case.time_limit}
+    return _by_expressions(solve, *_start(case), t_eval=np.append(0.0, case.instants), **options)
 
 
 def _collocation(case: Case, step: float, repeat: int) -> Result:
@@ -311,10 +313,10 @@ def _all() -> Iterator[Solver]:
         yield _solver(name, "SUNDIALS", "compiled", "tol", run, keeps=keeps, traces=True)
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
-    for name in ("IDAS", "CVODES"):
-        run, more = partial(_casadi, name), {"builds_each": True, "traces": True}
-        yield _solver(f"{name}, CasADi", "CasADi", "compiled", "tol", run, keeps=False, **more)
-    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, keeps=False, traces=True)
+    more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
+    for name, integrator in ((IDAS, None), ("CVODES, CasADi", "BDF"), ("CVODES, CasADi, Adams", "Adams")):
+        yield _solver(name, "CasADi", "compiled", "tol", partial(_casadi, integrator), **more)
+    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, **more)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
     for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from references.accelerations import Equations, accelerations, compiled_gamma
+from references.accelerations import Equations, accelerations, compiled_gamma, factor, saddle_solve
 from references.four_bar_minimal import MinimalFourBar
+from references.index1 import solve_index1
 from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
-from twoloop.mechanisms import four_bar
+from twoloop import ConstrainedSystem
+from twoloop.mechanisms import four_bar, governor, heavy_top, spatial_four_bar, spatial_slider_crank
 
 
 def unbalanced(system, t, q, v, a, lam):
@@ -68,6 +70,73 @@ def test_singular_matrices():
     assert worst(a[:, 1], [0.0, -9.81]) == 0.0 and lam[0, 1] == 0.0
     with pytest.raises(ValueError, match="mass of 'pendulum' must be positive definite"):
         accelerations(pendulum(mass=lambda t, q: np.diag([1.0, 0.0])), [0.0], [[1.0], [0.0]], np.zeros((2, 1)))
+
+
+def saddle(M, Cq, Q, Qd):
+    """Accelerations and multipliers by numpy."""
+    matrix = np.block([[M, Cq.T], [Cq, np.zeros((Qd.size, Qd.size))]])
+    return np.split(np.linalg.solve(matrix, np.concatenate([Q, Qd])), [Q.size])
+
+
+SLOW = pytest.mark.slow  # as the heavy top, but larger
+MAKE = [heavy_top, *(pytest.param(each, marks=SLOW) for each in (spatial_slider_crank, spatial_four_bar, governor))]
+
+
+@pytest.mark.parametrize("make", MAKE)
+def test_a_mass_that_is_singular_alone_is_solved_with_its_constraints(make):
+    problem = make()
+    system, (t0, q, v) = problem.system, (0.0, problem.q0, problem.v0)
+    a, lam = accelerations(system, [t0], q[:, None], v[:, None])
+    known = saddle(system.mass(t0, q), system.jacobian(t0, q), system.force(t0, q, v), system.gamma(t0, q, v))
+    size = max(1.0, *(np.abs(each).max() for each in known))
+    assert worst(a[:, 0], known[0]) < 1e-11 * size and worst(lam[:, 0], known[1]) < 1e-11 * size
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_saddle_points_of_indefinite_matrices(seed):
+    rng = np.random.default_rng(seed)
+    M, Cq, Q, Qd = rng.normal(size=(6, 6)), rng.normal(size=(4, 6)), rng.normal(size=6), rng.normal(size=4)
+    M += M.T
+    M[seed] = M[:, seed] = 0.0
+    a, lam = Q.copy(), Qd.copy()
+    assert not factor(M.copy()) and saddle_solve(M, Cq, a, lam)
+    for mine, known in zip((a, lam), saddle(M, Cq, Q, Qd), strict=True):
+        assert worst(mine, known) < 1e-10
+    Cq[3] = Cq[0] - Cq[1]  # dependent
+    assert not saddle_solve(M, Cq, Q.copy(), Qd.copy())
+    M[0, 0] = np.nan
+    assert not saddle_solve(M, Cq, Q.copy(), Qd.copy())
+
+
+def test_rounding_is_not_taken_for_mass():
+    assert factor(np.diag([1e-9, 1.0, 1e9])) and not factor(np.diag([1.0, 0.0]))
+    e = np.array([0.1, 0.7, 0.3])
+    assert not factor(np.eye(3) * (e @ e) - np.outer(e, e))  # its last pivot is some 1e-17
+
+
+@pytest.mark.parametrize("constant", [True, False])
+def test_a_massless_coordinate_that_a_constraint_holds(constant):
+    """x and y on a unit circle, and z = x, without mass, driven by a force that the multiplier has to carry."""
+    mass = np.diag([1.0, 1.0, 0.0])
+    system = ConstrainedSystem.from_python(
+        n_q=3,
+        n_c=2,
+        mass=mass if constant else lambda t, q: mass,
+        force=lambda t, q, v: np.array([0.0, -9.81, 0.5]),
+        constraint=lambda t, q: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0), q[2] - q[0]]),
+        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0], [-1.0, 0.0, 1.0]]),
+        gamma=lambda t, q, v: np.array([-(v[0] ** 2) - v[1] ** 2, 0.0]),
+    )
+    start = np.array([1.0, 0.0, 1.0]), np.zeros(3)
+    for more in ({"stabilisation": "none"}, {"stabilisation": "baumgarte"}, {"stabilisation": "projection"}):
+        result = solve_index1(system, (0.0, 1.0), *start, rtol=1e-10, atol=1e-10, **more)
+        assert result.success, result.message
+        q, v, lam = result.q[:, -1], result.v[:, -1], result.lam[:, -1]
+        assert abs(0.5 * (v[0] ** 2 + v[1] ** 2) + 9.81 * q[1] - 0.5 * (q[0] - 1.0)) < 1e-8
+        assert abs(lam[1] - 0.5) < 1e-12
+        if more["stabilisation"] == "projection":
+            assert worst(system.constraint(1.0, q), 0.0) < 1e-14
+            assert worst(system.jacobian(1.0, q) @ v, 0.0) < 1e-13
 
 
 def test_wrong_arguments_are_named():

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -103,15 +104,64 @@ def test_what_cannot_be_run_is_a_row(kept, raised, status, says):
     assert got["error_q"] is None and got["lost"] and got["astray"]
 
 
-def test_a_run_past_its_limit_is_a_row(kept):
+def spend(seconds):
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+
+
+@pytest.mark.parametrize(("marked", "said"), [(True, "0.05 s of CPU time, the limit of a run"), (False, "0.5 s")])
+def test_a_run_past_its_limit_is_a_row(kept, marked, said):
     def run(case, value, repeat):
-        while case.t_end == T_END:
-            pass
+        with user_call if marked else nullcontext():
+            while case.t_end == T_END:
+                pass
         return ours(case, value, repeat)
 
     with kept:  # not repeated, unlike one that ends in time
         rows = collect([Run(case(time_limit=0.05), solver(run), 1e-6, repeats=3)], kept)
-    assert rows["status"].tolist() == ["TIME_LIMIT"] and "0.05 s" in rows["message"][0]
+    assert rows["status"].tolist() == ["TIME_LIMIT"] and said in rows["message"][0]
+
+
+def test_the_limit_is_that_of_the_users_call_and_not_of_what_an_adapter_does_beside_it(kept):
+    def run(case, value, repeat):
+        if case.t_end == T_END:
+            spend(0.8)  # building, the output
+        with user_call:
+            return ours(case, value, repeat)
+
+    assert row(kept, run, case(time_limit=0.5))["status"] == "REACHED_END"
+
+
+@pytest.mark.parametrize("made", ["raised", "failed", "ended"])
+def test_a_limit_is_one_whatever_a_foreign_library_makes_of_it(kept, made):
+    def run(case, value, repeat):
+        result = ours(case, value, repeat)
+        if case.t_end < T_END:
+            return result
+        try:
+            with user_call:
+                spend(10.0)
+        except bench.TimeLimit:
+            if made == "raised":
+                raise RuntimeError("KeyboardInterrupt") from None
+        failed = {"status": Status.SOLVER_FAILED, "message": "failed: KeyboardInterrupt"}
+        return result if made == "ended" else replace(result, **failed)
+
+    got = row(kept, run, case(time_limit=0.05))
+    assert got["status"] == "TIME_LIMIT" and "0.05 s" in got["message"] and got["error_q"] is None
+
+
+def test_what_is_built_for_a_time_span_is_built_by_the_warm_up(kept):
+    ends = []
+
+    def run(case, value, repeat):
+        ends.append((case.t_end, case.time_limit))
+        return ours(case, value, repeat)
+
+    with kept:
+        collect([Run(case(time_limit=7.0), solver(run, builds_span=True), 1e-6, repeats=1)], kept)
+    assert ends == [(T_END, 7.0)] * 2
 
 
 def test_the_time_limit_sets_no_timer_of_cpu_time(kept):
@@ -201,9 +251,7 @@ def test_an_interrupted_result_stops_the_collector(kept):
 
 def test_the_time_is_that_of_the_whole_call_or_of_what_an_adapter_marks(kept):
     def beside():  # what a call does beside the integration
-        end = time.process_time() + 0.02
-        while time.process_time() < end:
-            pass
+        spend(0.02)
 
     def whole(case, value, repeat):
         beside()

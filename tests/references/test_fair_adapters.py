@@ -1,0 +1,225 @@
+"""Rivals are put, timed and stopped as their users would do it: what is built, counted, limited, and said of them."""
+
+import numpy as np
+import pytest
+
+from references import casadi_integrators, diffrax_dopri8, fully_implicit, index1
+from references.casadi_integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
+from references.cvode import solve_cvode
+from references.cvode_c import solve_cvode_c
+from references.driver import TimeLimit, user_call
+from references.four_bar_minimal import trajectory
+from references.ida import solve_ida
+from references.ida_c import solve_ida_c
+from references.index1 import solve_index1
+from studies.bench import Case, Run, attempt
+from studies.solvers import CATALOGUE, RIVALS
+from studies.validation import MAKE
+from tests.problems import pendulum
+from twoloop.mechanisms import four_bar, projection_pendulum
+from twoloop.result import Status
+
+FOUR_BAR, PENDULUM = four_bar(), projection_pendulum()
+
+
+def start(problem, t_end):
+    return problem.system, (0.0, t_end), problem.q0, problem.v0
+
+
+# --- CasADi
+
+
+def test_idas_takes_the_steps_that_a_tight_tolerance_needs():
+    pytest.importorskip("casadi")
+    result = solve_idas(*start(PENDULUM, 120.0), 1e-13, 1e-13, t_eval=[120.0])
+    assert result.success and result.stats.n_accepted > 100_000, result.message
+
+
+def test_adams_of_cvodes_is_another_method_and_right():
+    pytest.importorskip("casadi")
+    bdf, adams = (solve_cvodes(*start(PENDULUM, 2.0), 1e-9, 1e-9, method=each) for each in ("BDF", "Adams"))
+    assert adams.success and 1e-13 < np.abs(adams.q[:, -1] - PENDULUM.q0).max() < 1e-5
+    assert adams.stats.n_accepted < 0.8 * bdf.stats.n_accepted
+    name = "CVODES, CasADi, Adams"
+    made, status, *_ = attempt(Run(Case("pendulum", PENDULUM, 2.0, n_instants=5), CATALOGUE[name], 1e-9), 0)
+    assert status == "REACHED_END" and made.stats.n_accepted == adams.stats.n_accepted and name in RIVALS
+    with pytest.raises(ValueError, match="method must be one of BDF, Adams; given 'adams'"):
+        solve_cvodes(*start(PENDULUM, 2.0), method="adams")
+
+
+def test_collocation_is_that_of_gauss():
+    """At Radau's points the same steps have twelve times the error."""
+    pytest.importorskip("casadi")
+    result = solve_collocation(*start(FOUR_BAR, FOUR_BAR.reference.t), 200)
+    assert 1e-9 < np.abs(result.q[:, -1] - FOUR_BAR.reference.q).max() < 8e-7
+
+
+def test_one_output_before_the_end_is_the_state_then():
+    pytest.importorskip("casadi")
+    result = solve_idas(*start(FOUR_BAR, 1.0), 1e-9, 1e-9, t_eval=[0.5])
+    assert result.t.tolist() == [0.5]
+    assert np.abs(result.q - trajectory(FOUR_BAR.parameters, [0.5])[0]).max() < 1e-5
+
+
+@pytest.mark.parametrize(("compiler", "flags"), [("cc", FLAGS), ("false", PLAIN)])
+def test_the_compiler_is_asked_what_it_takes(compiler, flags):
+    casadi_integrators._flags.cache_clear()
+    assert casadi_integrators._flags(compiler) == flags
+    casadi_integrators._flags.cache_clear()
+
+
+@pytest.mark.parametrize("name", [name for name in CATALOGUE if name.endswith(("CasADi", "CasADi, Adams"))])
+def test_the_alarm_within_casadi_is_a_time_limit(name):
+    pytest.importorskip("casadi")
+    solver = CATALOGUE[name]
+    case = Case("four-bar", FOUR_BAR, 2e4, n_instants=1, time_limit=0.05)
+    assert solver.builds_each and solver.builds_span
+    result, status, message, _ = attempt(Run(case, solver, 1e-10 if solver.setting == "tol" else 0.1), 0, 60.0)
+    assert status == "TIME_LIMIT" and "0.05 s" in message and result is None
+
+
+# --- diffrax
+
+
+@pytest.mark.slow  # compiles for ten seconds
+def test_diffrax_looks_at_the_clock_before_the_second_run_and_takes_many_steps():
+    pytest.importorskip("diffrax")
+    assert diffrax_dopri8.MOST_STEPS == 10**7 and "order 8" in diffrax_dopri8.solve_diffrax.__doc__
+    late = diffrax_dopri8.solve_diffrax(*start(PENDULUM, 10.0), 1e-9, 1e-9, time_limit=1e-9)
+    assert late.status is Status.SOLVER_FAILED and "time_limit" in late.message and late.t.size == 0
+    result = diffrax_dopri8.solve_diffrax(*start(PENDULUM, 30.0), 1e-9, 1e-9)
+    assert result.success and result.stats.n_accepted > 100
+
+
+# --- mass matrices that are singular without the constraints, as with Euler parameters
+
+BY_ACCELERATIONS = ("DOP853, index 1", "DOP853, projected", "LSODA, index 1", "Pr9, index 1", "CVODE, Adams")
+EULER = {"heavy top": (*BY_ACCELERATIONS, "Radau, index 1", "IDA from C, stabilised")}
+LARGE = ("spatial slider-crank", "spatial four-bar", "A05 governor")
+
+
+@pytest.mark.parametrize("name", ["heavy top", *(pytest.param(each, marks=pytest.mark.slow) for each in LARGE)])
+def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name):
+    problem = next(problem for problem in (make() for make in MAKE) if problem.name == name)
+    known = problem.reference
+    for solver in EULER.get(name, (*BY_ACCELERATIONS, "IDA from C, stabilised")):
+        errors = []
+        for tol in (1e-5, 1e-9):
+            case = Case(name, problem, known.t, n_instants=1, time_limit=60.0)
+            result, status, message, _ = attempt(Run(case, CATALOGUE[solver], tol), 0)
+            if status == "NOT_AVAILABLE":
+                break
+            assert status == "REACHED_END", (solver, message)
+            difference = np.abs(result.q[:, -1] - known.q)
+            errors.append(np.nanmax(difference))
+        assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
+
+
+# --- output is nobody's in the time of a call
+
+TIMES = np.linspace(0.0, 2.0, 201)
+WITH_OUTPUT = {
+    "IDA from C": lambda *at, **more: solve_ida_c(*at, 1e-8, 1e-8, **more),
+    "IDA": lambda *at, **more: solve_ida(*at, "index1", 1e-8, 1e-8, **more),
+    "CVODE, Adams": lambda *at, **more: solve_cvode(*at, "Adams", 1e-8, 1e-8, **more),
+    "CVODE from C": lambda *at, **more: solve_cvode_c(*at, "Adams", 1e-8, 1e-8, **more),
+    "CVODE from C, BDF": lambda *at, **more: solve_cvode_c(*at, "BDF", 1e-8, 1e-8, **more),
+    "DOP853": lambda *at, **more: solve_index1(*at, "DOP853", 1e-8, 1e-8, **more),
+    "DOP853, projected": lambda *at, **more: solve_index1(*at, "DOP853", 1e-8, stabilisation="projection", **more),
+    "LSODA": lambda *at, **more: solve_index1(*at, "LSODA", 1e-8, 1e-8, **more),
+    "Radau": lambda *at, **more: solve_index1(*at, "Radau", 1e-6, 1e-6, **more),
+    "BDF": lambda *at, **more: solve_index1(*at, "BDF", 1e-6, 1e-6, **more),
+}
+
+
+@pytest.mark.parametrize("name", WITH_OUTPUT)
+def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
+    pytest.importorskip("sksundae")
+    solve = WITH_OUTPUT[name]
+    end, many = (solve(*start(PENDULUM, 2.0), t_eval=each) for each in ([2.0], TIMES))
+    assert end.success and many.success and np.array_equal(many.t, TIMES)
+    counts = [(each.stats.n_accepted, each.stats.n_evaluations, each.stats.n_factorizations) for each in (end, many)]
+    assert counts[0] == counts[1] and counts[0][1] > 10
+    # the second run takes the steps of the first: what is shown is the run that is timed
+    assert np.abs(end.q[:, -1] - many.q[:, -1]).max() < 1e-13
+    early = solve(*start(PENDULUM, 2.0), t_eval=[1.0])
+    assert np.abs(early.q[:, 0] - many.q[:, 100]).max() < 1e-13
+
+    late = solve(*start(PENDULUM, 2.0), t_eval=[0.0, 2.0], time_limit=1e-9)
+    assert late.status is Status.SOLVER_FAILED and late.t.tolist() in ([], [0.0])
+
+
+def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
+    made = []
+    before = index1.METHODS["DOP853"]
+
+    class Watched(before):
+        def dense_output(self):
+            made.append(user_call.so_far())
+            return super().dense_output()
+
+    monkeypatch.setitem(index1.METHODS, "DOP853", Watched)
+    assert solve_index1(*start(PENDULUM, 2.0), t_eval=TIMES).success
+    assert made and not any(made)  # outside of the user's call
+
+
+def test_a_run_past_its_limit_is_not_run_again_to_its_end():
+    for solve in (WITH_OUTPUT["DOP853"], WITH_OUTPUT["IDA from C"], WITH_OUTPUT["CVODE from C"]):
+        result = solve(*start(PENDULUM, 1e6), t_eval=[1e6], time_limit=0.01)
+        assert result.status is Status.SOLVER_FAILED and "time_limit" in result.message and result.t.size == 0
+
+
+# --- Jacobians
+
+
+def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
+    """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
+    at = start(PENDULUM, 5.0)
+    solvers = {
+        "Radau": lambda: solve_index1(*at, "Radau", 1e-7, 1e-7),
+        "BDF": lambda: solve_index1(*at, "BDF", 1e-7, 1e-7),
+        "CVODE": lambda: solve_cvode(*at, "BDF", 1e-7, 1e-7),
+    }
+    exact = {name: solve() for name, solve in solvers.items()}
+    monkeypatch.setattr(index1, "straight_line_jacobian", lambda *_: None)
+    differenced = {name: solve() for name, solve in solvers.items()}
+    for name in solvers:
+        assert exact[name].success and exact[name].stats.n_evaluations < differenced[name].stats.n_evaluations, name
+        assert np.abs(exact[name].q[:, -1] - differenced[name].q[:, -1]).max() < 1e-4
+
+
+def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
+    system, q, v = PENDULUM.system, PENDULUM.q0, PENDULUM.v0
+    y = np.concatenate([q, v])
+    plain = index1.RightHandSide(system, 0.0, q, 0.0)
+    jacobian, function = plain.jacobian(0.0, y), plain.function(TimeLimit(None))
+    differences = [(function(0.0, y + e) - function(0.0, y - e)) / 2e-6 for e in 1e-6 * np.eye(y.size)]
+    assert np.abs(jacobian(0.0, y) - np.transpose(differences)).max() < 1e-6 * np.abs(differences).max()
+    assert index1.RightHandSide(system, 0.0, q, 10.0).jacobian(0.0, y) is None  # of other equations
+    in_python = pendulum()
+    assert index1.RightHandSide(in_python, 0.0, np.array([1.0, 0.0]), 0.0).jacobian(0.0, np.eye(4)[0]) is None
+
+
+def test_solve_dae_differences_once_a_jacobian_and_is_told_the_rest():
+    system, q, v = PENDULUM.system, PENDULUM.q0 + 0.1, PENDULUM.v0 + 0.2
+    run = fully_implicit._Run(system, None, None)
+    y, yp = np.concatenate([q, v, np.zeros(2 * system.n_c)]), np.linspace(-1.0, 1.0, 2 * (system.n_q + system.n_c))
+    known, calls = [np.zeros((y.size, y.size)) for _ in range(2)], []
+    matrix = run._matrix
+    for cj, into in zip((0.0, 1.0), known, strict=True):
+        matrix(0.3, y, yp, cj, into, *run._sizes_and_p)
+    run._matrix = lambda *given: calls.append(given[3]) or matrix(*given)
+    by_y, by_yp = run.jacobians(0.3, y, yp)
+    assert calls == [0.0] and np.array_equal(by_y, known[0]) and np.count_nonzero(by_yp) > y.size / 2
+    assert np.abs(known[1] - known[0] - by_yp).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", ["Radau", "BDF"])
+def test_solve_dae_is_right_and_stops_in_time(method):
+    pytest.importorskip("solve_dae")
+    solve = fully_implicit.solve_fully_implicit
+    result = solve(*start(FOUR_BAR, 1.0), method, 1e-7, 1e-7)
+    assert result.success
+    assert np.abs(result.q[:, -1] - trajectory(FOUR_BAR.parameters, [1.0])[0][:, 0]).max() < 1e-4
+    late = solve(*start(FOUR_BAR, 1.0), method, 1e-7, 1e-7, time_limit=1e-9)
+    assert late.status is Status.SOLVER_FAILED and "time_limit" in late.message
