@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.accelerations import CONSTANT, OPTIONS, Equations, factor, schur_factors, times_inverse
-from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
+from references.driver import (
+    OutOfTimeError,
+    TimeLimit,
+    check_choice,
+    check_run,
+    check_tolerances,
+    longest_step,
+    user_call,
+)
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
 from twoloop.kernels.linalg import ldl_solve
@@ -53,6 +61,7 @@ def solve_index1(
     alpha: float | None = None,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system as the ODE q' = v, v' = a(t, q, v) with one of SciPy's solvers.
 
@@ -91,6 +100,8 @@ def solve_index1(
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at in every evaluation of the right-hand side. A run
         past it is a failed one. None: no limit.
+    max_step : float, optional
+        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
@@ -121,6 +132,7 @@ def solve_index1(
     equations.warm(t0, y0, stabilisation == "projection")
     run = _Run(equations, times, stabilisation == "projection", time_limit)
     options = {"rtol": float(rtol), "atol": float(atol)}
+    options |= {} if max_step is None else {"max_step": longest_step(max_step, t1 - t0)}
     with user_call as clock:
         run.go(solver_type, t0, y0, t1, options)
     return _result(method, equations, run, t1, clock.seconds or 0.0)
