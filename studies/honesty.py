@@ -134,7 +134,7 @@ def about(name: str, trap: Trap) -> dict[str, str]:
 
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """One cell, in a process of its own that is ended when it does not come back."""
-    row = about(name, trap) | {"tol": trap.tolerance, "n_drawn": trap.n_drawn}
+    row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=cell, args=(call, trap, truth, there), daemon=True)
@@ -222,6 +222,7 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     rows, forces, inputs, held = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT, HELD_OUT))
     both = pd.concat([rows, forces])
     found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(both), "totals": totals(both)}
+    found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
     return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
@@ -266,11 +267,8 @@ def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
     for name, which in parts.items():
         own = rows[which]
         ran = own[own["outcome"] != NOT_RUN]
-        line = {
-            "n": len(ran),
-            "wrong": int(ran["outcome"].isin((SILENT, HANG)).sum()),
-            "unasked": int(unasked(ran).sum()),
-        }
+        wrong = ran["outcome"].isin((SILENT, HANG))
+        line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
         line |= {"n_mistakes": int((ran["group"] == MISTAKE).sum()), "n_forces": int((ran["group"] == FORCE).sum())}
         found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
     return found

@@ -25,8 +25,8 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 Array = NDArray[np.float64]
 
 NEVER = 1e30  # s
-# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp, such
-# a one with other numbers, on which no method was repaired
+# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,
+# such a one with other numbers, on which no method was repaired
 INPUT, MISTAKE, FORCE, HELD_OUT = "input", "mistake", "force", "held out"
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 13  # of the numbers of the forces
