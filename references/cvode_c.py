@@ -15,7 +15,7 @@ from numba import carray, cfunc, types
 from numpy.typing import ArrayLike, NDArray
 
 from references.cvode_projection import projection_for_cvode
-from references.driver import TimeLimit, UserCall, check_choice, check_run, check_tolerances, user_call
+from references.driver import TimeLimit, UserCall, check_choice, check_run, check_tolerances, longest_step, user_call
 from references.ode import ADVICE, ode_result, output_times
 from references.straight_line import straight_line, straight_line_jacobian
 from references.sundials import REAL, check, context, counted, flag_name, library, made
@@ -52,6 +52,7 @@ def solve_cvode_c(
     projected: bool = False,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
 
@@ -82,6 +83,8 @@ def solve_cvode_c(
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps. A run past it is a
         failed one. None: no limit.
+    max_step : float, optional
+        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
@@ -110,7 +113,7 @@ def solve_cvode_c(
     arguments = (functions, start, t0, t1, METHODS[method], float(rtol), float(atol))
 
     limit = TimeLimit(time_limit)
-    _, flag, reached, statistics = integrate(*arguments, np.empty(0), limit)
+    _, flag, reached, statistics = integrate(*arguments, np.empty(0), limit, max_step)
     failure = ""
     if limit.exceeded:
         failure = limit.message("CVODE", reached, "take looser tolerances")
@@ -118,7 +121,7 @@ def solve_cvode_c(
         name = flag_name("CVodeGetReturnFlagName", flag)
         failure = f"CVODE failed after t = {reached:.10g} with {name} ({flag}). {ADVICE}"
     kept = times[times <= reached]
-    rows = integrate(*arguments, kept, TimeLimit(None))[0] if kept.size else np.empty((0, start.size))
+    rows = integrate(*arguments, kept, TimeLimit(None), max_step)[0] if kept.size else np.empty((0, start.size))
     end = f"CVODE, {method}, reached the end, t = {t1:g}."
     return ode_result(system, kept[: len(rows)], rows.T, failure, end, statistics)
 
@@ -176,6 +179,7 @@ def integrate(
     atol: float,
     times: Array,
     limit: TimeLimit,
+    max_step: float | None = None,
 ) -> tuple[Array, int, float, Statistics]:
     """Rows y at the times before a failure, CVODE's last flag, the time that it reached, its counters.
 
@@ -204,7 +208,7 @@ def integrate(
                 check("CVodeSetProjFn", sundials.CVodeSetProjFn(memory, functions.projection.address))
         for name, value in (
             ("MaxNumSteps", STEPS_A_CALL),
-            ("MaxStep", t1 - t0),
+            ("MaxStep", longest_step(max_step, t1 - t0)),
             ("MinStep", SMALLEST_STEP * (t1 - t0)),
             ("StopTime", t1),
         ):

@@ -103,6 +103,14 @@ def check_time_limit(time_limit: float | None) -> None:
         check_positive("time_limit", time_limit)
 
 
+def longest_step(max_step: float | None, span: float) -> float:
+    """Return the longest step that a solver may take: what is asked for, or the whole run."""
+    if max_step is None:
+        return span
+    check_positive("max_step", max_step)
+    return min(float(max_step), span)
+
+
 def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
     """Raise unless `value` is one of these words."""
     if not isinstance(value, str) or value not in choices:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_run, user_call
+from references.driver import TimeLimit, check_run, longest_step, user_call
 from references.expressions import Expressions, functions_of
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_positive
@@ -34,6 +34,7 @@ def solve_heyoka(
     *,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with heyoka's Taylor integrator.
 
@@ -58,6 +59,8 @@ def solve_heyoka(
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps. A run past it is a
         failed one. None: no limit.
+    max_step : float, optional
+        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
@@ -80,11 +83,12 @@ def solve_heyoka(
     integrator, outcomes = _integrator(system, t0, q0.tobytes(), v0.tobytes(), float(tol))
     start = np.concatenate([q0, v0])
 
+    longest = longest_step(max_step, t1 - t0)
     limit, steps = TimeLimit(time_limit), 0
     with user_call as clock:
         integrator.time, integrator.state[:] = t0, start
         while True:
-            outcome, _, _, taken, *_ = integrator.propagate_until(t1, max_steps=STEPS_A_CALL)
+            outcome, _, _, taken, *_ = integrator.propagate_until(t1, max_steps=STEPS_A_CALL, max_delta_t=longest)
             steps += taken
             if outcome != outcomes.step_limit or limit.passed():
                 break
@@ -97,7 +101,7 @@ def solve_heyoka(
     kept = times[times <= (reached if failure else t1)]
     integrator.time, integrator.state[:] = t0, start
     grid = kept if kept.size and kept[0] == t0 else np.append(t0, kept)  # it must begin where the state is
-    states = integrator.propagate_grid(grid)[-1].T[:, grid.size - kept.size :]
+    states = integrator.propagate_grid(grid, max_delta_t=longest)[-1].T[:, grid.size - kept.size :]
     end = f"heyoka, order {integrator.order}, reached the end, t = {t1:g}."
     return ode_result(system, kept, states, failure, end, Statistics(n_accepted=steps, cpu_time=cpu))
 

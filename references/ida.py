@@ -18,7 +18,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import compiled_gamma
-from references.driver import TimeLimit, check_choice, check_run, check_tolerances, user_call
+from references.driver import TimeLimit, check_choice, check_run, check_tolerances, longest_step, user_call
 from references.ida_options import (
     HIGHEST_ORDER,
     NOT_TESTED,
@@ -66,6 +66,7 @@ def solve_ida(
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
     time_limit: float | None = None,
+    max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA.
 
@@ -101,6 +102,8 @@ def solve_ida(
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at in every evaluation of the residual. A run past it
         is a failed one. None: no limit.
+    max_step : float, optional
+        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
@@ -132,7 +135,7 @@ def solve_ida(
         "atol": absolute,
         "max_order": max_order,
         "min_step": SMALLEST_STEP * (t1 - t0),
-        "max_step": t1 - t0,
+        "max_step": longest_step(max_step, t1 - t0),
         "max_num_steps": 10**9,  # per output time
     }
     compiled = compiled_residual(system, form)

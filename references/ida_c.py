@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.accelerations import accelerations
-from references.driver import TimeLimit, check_run, check_system, check_tolerances, user_call
+from references.driver import TimeLimit, check_run, check_system, check_tolerances, longest_step, user_call
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials import REAL, check, context, counted, flag_name, library, made
@@ -51,6 +51,7 @@ def solve_ida_c(
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
     time_limit: float | None = None,
+    max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA, in the form "stabilised", without Python in the integration.
 
@@ -83,6 +84,8 @@ def solve_ida_c(
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps. A run past it is a
         failed one. None: no limit.
+    max_step : float, optional
+        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
@@ -115,8 +118,8 @@ def solve_ida_c(
 
     sundials, state = library(), _start(system, t0, q0, v0)
     absolute = tolerances(system, state.size // 2, error_test, float(atol))
-    start = state.copy()
-    with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order) as solver:
+    start, longest = state.copy(), longest_step(max_step, t1 - t0)
+    with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order, longest) as solver:
         limit = TimeLimit(time_limit)
         with user_call as clock:  # of one who keeps the memory
             check("IDAReInit", sundials.IDAReInit(solver[0], t0, *solver[1:]))
@@ -156,6 +159,7 @@ def _integrator(
     rtol: float,
     atol: Array,
     max_order: int,
+    longest: float,
 ) -> Iterator[tuple[Any, Any, Any]]:
     """IDA's memory and its vectors y and y', which are the halves of `state`; all is freed at the end."""
     f, n = system.functions, state.size // 2
@@ -182,7 +186,7 @@ def _integrator(
             ("IDASetLinearSolver", linear, matrix),
             ("IDASetJacFn", jacobian.address),
             ("IDASetMaxNumSteps", STEPS_A_CALL),
-            ("IDASetMaxStep", t1 - t0),
+            ("IDASetMaxStep", longest),
             ("IDASetMinStep", SMALLEST_STEP * (t1 - t0)),
             ("IDASetStopTime", t1),
         ):

@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.accelerations import OPTIONS, Equations, matrix_of, saddle_solve, schur_factors, times_inverse
-from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
+from references.driver import (
+    OutOfTimeError,
+    TimeLimit,
+    check_choice,
+    check_run,
+    check_tolerances,
+    longest_step,
+    user_call,
+)
 from references.expressions import NotSymbolic
 from references.straight_line import straight_line_jacobian
 from twoloop.checks import check_positive
@@ -56,6 +64,7 @@ def solve_index1(
     alpha: float | None = None,
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system as the ODE q' = v, v' = a(t, q, v) with one of SciPy's solvers.
 
@@ -97,6 +106,8 @@ def solve_index1(
     time_limit : float, optional
         Wall-clock time that the integration may take, s, looked at in every evaluation of the right-hand side. A run
         past it is a failed one. None: no limit.
+    max_step : float, optional
+        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
@@ -127,6 +138,7 @@ def solve_index1(
     equations.warm(t0, y0, stabilisation == "projection")
     projected = stabilisation == "projection"
     options: dict[str, Any] = {"rtol": float(rtol), "atol": float(atol)}
+    options |= {} if max_step is None else {"max_step": longest_step(max_step, t1 - t0)}
     if method in IMPLICIT and (jacobian := equations.jacobian(t0, y0)):
         options["jac"] = jacobian
     run = _Run(equations, None if times is None else times[:0], projected, time_limit)

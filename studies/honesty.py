@@ -3,11 +3,10 @@
 import multiprocessing
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from importlib.util import find_spec
-from itertools import pairwise
+from itertools import chain, pairwise
 from multiprocessing.connection import Connection
 from typing import Any
 from unittest.mock import patch
@@ -16,31 +15,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from references.cvode_c import solve_cvode_c
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import solve_index1
 from studies import figures, honesty_picture, study
 from studies.cli import StudyError
+from studies.honesty_solvers import DEFAULT, DEFAULT_COMPILED, LIMITED, OURS, Call, solvers, why_not
 from studies.render import render, table
 from studies.sharp_forces import T_END
 from studies.store import Output, Row
 from studies.traps import AGREE as TRUE_TO
-from studies.traps import FORCE, INPUT, MISTAKE, Trap, traps
-from twoloop import ConstrainedSystem, Result, solve_dae
+from studies.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
+from twoloop import ConstrainedSystem, solve_dae
 
 Array = NDArray[np.float64]
 
-OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
-IDA_C, CVODE_C, HEYOKA = "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
-COMPILED_ONLY = (IDA_C, CVODE_C, HEYOKA)
-SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
-OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
-    *("auto, compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14", "Gauss16", "SunRadau5"),
-    *("RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
-)
-DEFAULT, DEFAULT_COMPILED = "auto (two-loop)", "auto, compiled (two-loop)"
-QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
 GRACE = 6.0  # s beyond the time limit of a run after which it hangs
@@ -48,67 +34,28 @@ TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right 
 TRUTH_LIMIT = 10.0  # s that one of them may take
 AGREE = 1e-7  # how far the two may differ
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
-UNASKED = "wrong, never asked"
-SHORT = {HANG: "**hang**", SILENT: "**silent**", UNASKED: "**unasked**", SAID: "said", RIGHT: "right", NOT_RUN: "–"}
+UNASKED = "wrong and silent, never asked"  # shown of those that are the same, bit for bit, as without the trap
+SHORT = {
+    HANG: "**hang**",
+    SILENT: "**silent**",
+    UNASKED: "**silent** (unasked)",
+    SAID: "said",
+    RIGHT: "right",
+    NOT_RUN: "–",
+}
 ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
 UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
+REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, to a solver: no run
+    *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
+    *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
+)
+BUILT = ("heyoka", "cvode_c")  # calls of solvers that are built for each system, which takes longer than they run
 
 PARTS = {  # of the bars of the figure
     "right": (RIGHT,),
     "said so": (SAID,),
-    "wrong, force never asked": (UNASKED,),
     "wrong and silent, or hanging": (SILENT, HANG),
 }
-
-Call = Callable[[Trap], Result]
-
-
-def own(method: str, trap: Trap) -> Result:
-    """One of ours, as a user calls it."""
-    name, _, code = method.partition(", ")
-    options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
-    options |= ({"compiled": True} if code else {}) | dict(trap.steps)
-    return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, method=name, **options)
-
-
-def scipy(method: str, trap: Trap) -> Result:
-    """One of SciPy's solvers on index 1."""
-    return solve_index1(*_start(trap), method, trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
-
-
-def ida(trap: Trap) -> Result:
-    """IDA through scikit-sundae."""
-    return solve_ida(*_start(trap), "stabilised", trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
-
-
-def ida_c(trap: Trap) -> Result:
-    """IDA's library with compiled functions."""
-    return solve_ida_c(*_start(trap), trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
-
-
-def cvode_c(trap: Trap) -> Result:
-    """CVODE's library with code made of the mechanism."""
-    return solve_cvode_c(*_start(trap), "Adams", trap.tolerance, trap.tolerance, time_limit=trap.time_limit)
-
-
-def heyoka(trap: Trap) -> Result:
-    """heyoka's Taylor series, compiled for the mechanism."""
-    from references.heyoka_taylor import solve_heyoka
-
-    return solve_heyoka(*_start(trap), trap.tolerance, time_limit=trap.time_limit)
-
-
-def _start(trap: Trap) -> tuple[Any, Any, Any, Any]:
-    return trap.system, (0.0, trap.t_end), trap.q0, trap.v0
-
-
-def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
-    """Name to call, of those that are asked a group of traps; "two-loop" ones first."""
-    ours = (*OWN, *(OF_FORCES if group == FORCE else ()))
-    made: dict[str, Call] = {f"{name} (two-loop)": partial(own, name) for name in (QUICK_OWN if quick else ours)}
-    made |= {} if quick else {"IDA, stabilised": ida, IDA_C: ida_c}
-    made |= {} if quick else {CVODE_C: cvode_c, HEYOKA: heyoka}
-    return made | {f"{name}, index 1": partial(scipy, name) for name in (QUICK_SCIPY if quick else SCIPY)}
 
 
 def right_answer(trap: Trap) -> Array | None:
@@ -168,6 +115,8 @@ def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
 
 def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
     """The rule: what a run that came back is."""
+    if row["status"] == "RAISED" and any(words in row["message"] for words in REFUSALS):
+        return NOT_RUN
     if row["status"] != "REACHED_END":
         return SAID
     limit = LOOSENESS * max(trap.tolerance, LEAST)
@@ -175,17 +124,17 @@ def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
         return RIGHT
     if row["warned"] or UNCONTROLLED in row["message"]:
         return SAID
-    return SILENT if row["asked"] else UNASKED
+    return SILENT
 
 
-def about(name: str, trap: Trap) -> Row:
+def about(name: str, trap: Trap) -> dict[str, str]:
     """Which cell it is."""
     return {"group": trap.group, "trap": trap.name, "mechanism": trap.mechanism, "solver": name}
 
 
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """One cell, in a process of its own that is ended when it does not come back."""
-    row = about(name, trap) | {"tol": trap.tolerance}
+    row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=cell, args=(call, trap, truth, there), daemon=True)
@@ -209,15 +158,12 @@ def make(output: Output) -> pd.DataFrame:
     rows = []
     with output.kept() as kept, unchecked():
         compiled: set[tuple[Any, ...]] = set()
-        for trap in traps(output.call.quick):
+        for trap in chain(traps(output.call.quick), held_out(output.call.quick)):
             known = solvers(output.call.quick, trap.group)
-            if all(f"{trap.name} | {trap.mechanism} | {name}" in kept for name in known):
-                truth = None
-            else:
-                truth = right_answer(trap)
+            keys = {name: " | ".join(about(name, trap).values()) for name in known}
+            truth = None if all(key in kept for key in keys.values()) else right_answer(trap)
             for name, call in known.items():
-                key = f"{trap.name} | {trap.mechanism} | {name}"
-                if key not in kept:
+                if (key := keys[name]) not in kept:
                     if why := why_not(name, trap):
                         kept.add(key, about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why})
                     else:
@@ -227,27 +173,21 @@ def make(output: Output) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def why_not(name: str, trap: Trap) -> str:
-    """Why a solver is not run on a trap; "" where it is."""
-    if trap.steps and not name.endswith("(two-loop)"):
-        return "its adapter takes no steps"
-    if name == HEYOKA and find_spec("heyoka") is None:
-        return "heyoka is not installed"
-    return "it takes compiled functions only" if name in COMPILED_ONLY and trap.system.called_in_python else ""
-
-
 def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
     """Compile in this process what the children call, on a harmless motion."""
-    shared = call.func.__name__ if isinstance(call, partial) and not name.endswith("(two-loop)") else name
-    size = (shared, trap.system.n_q, trap.system.n_c, trap.system.called_in_python)
-    sane = trap.sane or trap.system
-    if size in compiled:
+    shared = call.func.__name__ if isinstance(call, partial) and not name.endswith(OURS) else name
+    sane, tolerance = trap.sane or trap.system, 1e-4
+    made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *sane.functions[:-2])
+    if shared in BUILT:
+        tolerance = trap.tolerance
+        made_for += (trap.group, trap.name, trap.mechanism)
+    if made_for in compiled:
         return
-    compiled.add(size)
+    compiled.add(made_for)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            call(replace(trap, system=sane, t_end=1e-6, tolerance=1e-4))
+            call(replace(trap, system=sane, t_end=1e-6, tolerance=tolerance))
         except Exception:  # comes again in the run, where it is counted
             return
 
@@ -267,67 +207,89 @@ class unchecked:
             each.stop()
 
 
+def unasked(rows: pd.DataFrame) -> pd.Series:
+    """Which of the runs that are wrong and silent never evaluated the force in question."""
+    return (rows["outcome"] == SILENT) & rows["asked"].eq(False)
+
+
 def counts_of(rows: pd.DataFrame) -> dict[str, int]:
     """Runs, and how many of them had each outcome."""
-    return {"n": len(rows)} | {what: int((rows["outcome"] == what).sum()) for what in ORDER}
+    return {"n": len(rows)} | {what: int((rows["outcome"] == what).sum()) for what in ORDER if what != UNASKED}
 
 
 def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says: of mistakes and of forces, and of both together how far ours can be trusted."""
-    # what our adapters of solvers that take expressions cannot write down is no answer of theirs
-    if "message" in all_rows:
-        refused = all_rows["message"].astype(str).str.startswith("NotSymbolic")
-        all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
-    rows, forces, inputs = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT))
-    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(pd.concat([rows, forces]))}
-    found["totals"] = totals(pd.concat([rows, forces]))
+    """What the report says: of mistakes and forces, how far ours can be trusted on both, and what was held out."""
+    rows, forces, inputs, held = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT, HELD_OUT))
+    both = pd.concat([rows, forces])
+    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(both), "totals": totals(both)}
+    found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
-    return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO}
+    found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
+    return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
 
 
 def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Outcomes of each solver on the traps that it was run on, ours first."""
+    """Outcomes of each solver on the traps that it was run on: ours, others as they come, and limited."""
     ran = rows[rows["outcome"] != NOT_RUN]
     counts = [{"solver": str(name)} | counts_of(own) for name, own in ran.groupby("solver", sort=False)]
-    return sorted(counts, key=lambda line: not line["solver"].endswith("(two-loop)"))
+    return sorted(counts, key=lambda line: (not line["solver"].endswith(OURS), line["solver"].endswith(LIMITED)))
+
+
+def parts_of(rows: pd.DataFrame) -> dict[str, pd.Series]:
+    """Which rows are of ours, of others as they come, and of these with a largest step."""
+    ours, limited = rows["solver"].str.endswith(OURS), rows["solver"].str.endswith(LIMITED)
+    return {"ours": ours, "others": ~ours & ~limited, "limited": limited}
 
 
 def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
     ran = rows[rows["outcome"] != NOT_RUN]
-    ours = ran["solver"].str.endswith("(two-loop)")
     found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": []}
     found["solvers"] = totals(rows)
     for family, own in ran.groupby("trap", sort=False):
-        mine = own["solver"].str.endswith("(two-loop)")
-        line = {"family": str(family), "ours": counts_of(own[mine]), "others": counts_of(own[~mine])}
-        found["families"].append(line | {"by": sorted(set(own[mine & (own["outcome"] == SILENT)]["solver"]))})
+        parts = parts_of(own)
+        line = {"family": str(family)} | {whose: counts_of(own[which]) for whose, which in parts.items()}
+        by = own[parts["ours"] & (own["outcome"] == SILENT)]["solver"]
+        found["families"].append(line | {"by": sorted(set(by))})
     found["mechanisms"] = [str(name) for name in ran["mechanism"].unique()]
-    return found | {"ours": counts_of(ran[ours]), "others": counts_of(ran[~ours])}
+    return found | {whose: counts_of(ran[which]) for whose, which in parts_of(ran).items()}
 
 
-def trust_in(rows: pd.DataFrame) -> dict[str, Any]:
-    """Runs on all traps, and those wrong without a word: of the default, compiled, of our others, of others."""
-    ran = rows[rows["outcome"] != NOT_RUN]
-    wrong, unasked = ran["outcome"].isin((SILENT, HANG)), ran["outcome"] == UNASKED
-    ours = ran["solver"].str.endswith("(two-loop)")
-    default, compiled = ran["solver"] == DEFAULT, ran["solver"] == DEFAULT_COMPILED
-    parts = {"default": default, "compiled": compiled, "ours": ours & ~default & ~compiled, "others": ~ours}
-    return {
-        name: {"n": int(which.sum()), "wrong": int((wrong & which).sum()), "unasked": int((unasked & which).sum())}
-        for name, which in parts.items()
-    }
+def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
+    """Runs, of what, and those wrong without a word: of the default, compiled, of our others, of others, limited.
+
+    What an adapter refuses is no run.
+    """
+    parts = parts_of(rows)
+    parts = {"default": rows["solver"] == DEFAULT, "compiled": rows["solver"] == DEFAULT_COMPILED} | parts
+    parts["ours"] &= ~parts["default"] & ~parts["compiled"]
+    found = {}
+    for name, which in parts.items():
+        own = rows[which]
+        ran = own[own["outcome"] != NOT_RUN]
+        wrong = ran["outcome"].isin((SILENT, HANG))
+        line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
+        line |= {"n_mistakes": int((ran["group"] == MISTAKE).sum()), "n_forces": int((ran["group"] == FORCE).sum())}
+        found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
+    return found
+
+
+def bad_in(rows: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
+    """Runs that are wrong and silent, or hang, of ours, of others as they come, and limited."""
+    bad = rows[rows["outcome"].isin((SILENT, HANG))]
+    columns = ["trap", "mechanism", "solver", "outcome", "error"]
+    return {whose: bad[which][columns].to_dict("records") for whose, which in parts_of(bad).items()}
 
 
 def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes on traps that lie in a model, a motion or a setting."""
     names, trap_names = list(dict.fromkeys(rows["solver"])), list(dict.fromkeys(rows["trap"]))
     found: dict[str, Any] = {"n_traps": len(trap_names), "n_cells": int((rows["outcome"] != NOT_RUN).sum())}
-    found["cells"] = []
+    found["cells"], shown = [], rows["outcome"].mask(unasked(rows), UNASKED)
     for trap in trap_names:
         line = {"trap": trap}
         for name in names:
-            these = rows[(rows["trap"] == trap) & (rows["solver"] == name)]["outcome"].tolist()
+            these = shown[(rows["trap"] == trap) & (rows["solver"] == name)].tolist()
             line[name] = [what for what in ORDER if what in these]
         found["cells"].append(line)
     for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
@@ -344,25 +306,24 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
         str(trap) for trap, own in ran.groupby("trap", sort=False) if own["outcome"].isin((SILENT, HANG)).all()
     ]
     found["counts"] = {name: counts_of(rows[rows["solver"] == name]) for name in names}
-    found["unasked"] = int((rows["outcome"] == UNASKED).sum())
-    bad = rows[rows["outcome"].isin((SILENT, HANG))]
-    for which in (True, False):
-        some = bad[bad["solver"].str.endswith("(two-loop)") == which]
-        found["ours_bad" if which else "others_bad"] = [
-            {key: row[key] for key in ("trap", "mechanism", "solver", "outcome", "error")} for _, row in some.iterrows()
-        ]
-    return found
+    found["unasked"] = int(unasked(rows).sum())
+    return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
 
 
-def outcomes(found: dict[str, Any], without: set[str]) -> str:
+def outcomes(found: dict[str, Any], names: Sequence[str], without: set[str]) -> str:
     """A line for each trap, a column for each solver."""
-    short = [name.replace(" (two-loop)", "") for name in found["solvers"]]
+    short = [name.replace(OURS, "") for name in names]
     lines = [
-        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in found["solvers"])]
+        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in names)]
         for each in found["cells"]
         if each["trap"] not in without
     ]
     return table(["trap", *short], lines)
+
+
+def told(counts: dict[str, int] | None) -> str:
+    """Outcomes under forces in a cell."""
+    return "/".join(str(counts[what]) for what in (SILENT, SAID, RIGHT)) if counts and counts["n"] else "–"
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
@@ -371,22 +332,23 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     output.save_findings(found)
     figures.save(honesty_picture.picture(found["totals"], PARTS), output, "honesty")
     alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
-    ready = {"cells": outcomes(found, alike), "input": outcomes(found["input"], set())}
-    of_force = (SILENT, SAID, RIGHT)
+    limited = [name for name in found["solvers"] if name.endswith(LIMITED)]
+    as_they_come = [name for name in found["solvers"] if name not in limited]
+    ready = {"cells": outcomes(found, as_they_come, alike), "limited": outcomes(found, limited, alike)}
+    ready["input"] = outcomes(found["input"], found["input"]["solvers"], set())
+    both = found["forces"], found["held_out"]
+    whose = {"ours": "ours", "others": "others", "limited": "others, max_step"}
+    held = {each["family"]: each for each in both[1]["families"]}
     ready["forces"] = table(
-        ["force", *(f"{whose}: silent / said / right" for whose in ("ours", "others"))],
+        ["force", *whose.values(), *(f"held out: {words}" for words in whose.values())],
         [
-            [each["family"], *("/".join(str(each[whose][what]) for what in of_force) for whose in ("ours", "others"))]
-            for each in found["forces"]["families"]
+            [each["family"], *(told(part.get(who)) for part in (each, held.get(each["family"], {})) for who in whose)]
+            for each in both[0]["families"]
         ],
     )
-    of_solvers = [
-        [each["solver"].replace(" (two-loop)", ""), *(each[what] for what in of_force)]
-        for each in found["forces"]["solvers"]
-    ]
-    flawless = [line[0] for line in of_solvers if line[1] == line[2] == 0 and line[3]]
-    lines = [line for line in of_solvers if any(line[1:]) and line[0] not in flawless]
-    ready["solvers"] = table(["solver", "silent", "said", "right"], [*lines, [", ".join(flawless), 0, 0, "all"]])
+    by_solver = [{each["solver"]: each for each in part["solvers"]} for part in both]
+    lines = [[name.replace(OURS, ""), *(told(part.get(name)) for part in by_solver)] for name in by_solver[0]]
+    ready["solvers"] = table(["solver", "first set", "held out"], lines)
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 

@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 
 from studies import figures
 
-COLORS = (figures.BLUE, figures.SKY, figures.GREY, figures.RED)  # of right, said so, never asked, silent
+COLORS = (figures.BLUE, figures.SKY, figures.RED)  # of right, said so, silent
 NUMBERED = 2  # from this part on the bars carry the number of runs
 
 
 def picture(totals: Sequence[Mapping[str, Any]], parts: Mapping[str, Sequence[str]]) -> Figure:
-    """A bar for each solver, ours first: the share of its runs with the outcomes of each part."""
+    """A bar for each solver, ours first, then others: the share of its runs with the outcomes of each part."""
     names = [f"{line['solver'].replace(' (two-loop)', '')} ({line['n']})" for line in totals]
     figure, axes = plt.subplots(figsize=(7.6, 0.17 * len(totals) + 0.9), layout="constrained")
     left = np.zeros(len(totals))

@@ -17,7 +17,7 @@ from studies.random_linkages import end_of
 from studies.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families
 from studies.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.sharp_mechanisms import chain as chain_of
-from studies.sharp_motion import CHECK, RTOL, march, off
+from studies.sharp_motion import CHECK, RTOL, march, motion, off
 from twoloop import ConstrainedSystem
 from twoloop.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
@@ -25,10 +25,13 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 Array = NDArray[np.float64]
 
 NEVER = 1e30  # s
-# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp
-INPUT, MISTAKE, FORCE = "input", "mistake", "force"
+# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,
+# such a one with other numbers, on which no method was repaired
+INPUT, MISTAKE, FORCE, HELD_OUT = "input", "mistake", "force", "held out"
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 13  # of the numbers of the forces
+HELD_OUT_SEED = 20261121  # of those held out: a date, used once, when all methods were as they are
+GROWN = 100.0  # how much errors may grow in a motion that is held out: as much as in the first set
 FORCES = (  # families of `sharp_forces`
     "drag",
     *(f"tanh friction, width {width:g}" for width in FRICTIONS),
@@ -162,12 +165,16 @@ class Trap:
     positions : callable or None
         positions(t) -> q, where they are known.
     group : str
-        INPUT, MISTAKE or FORCE.
+        INPUT, MISTAKE, FORCE or HELD_OUT.
     tolerance, time_limit : float
     steps : mapping
         `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
     unnoticed : ConstrainedSystem or None
         The system as it is for a solver that never evaluates it where the trap lies.
+    impulse : bool
+        Whether velocities jump.
+    n_drawn : int
+        How many forces were drawn until the motion under one was known.
     """
 
     name: str
@@ -184,6 +191,8 @@ class Trap:
     steps: Mapping[str, float] = field(default_factory=dict)
     unnoticed: ConstrainedSystem | None = None
     group: str = MISTAKE
+    impulse: bool = False
+    n_drawn: int = 1
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -303,14 +312,38 @@ def under_forces(quick: bool) -> Iterator[Trap]:
     for family, bodies in forces(quick):
         drawn = families()[family](np.random.default_rng([SEED, [*FORCES, KINK].index(family)]))
         mechanism = bodies(drawn)
-        yield Trap(
-            family,
-            mechanism.name,
-            mechanism.system,
-            mechanism.q0,
-            mechanism.v0,
-            T_END,
-            mechanism.system,
-            positions=lambda t, mechanism=mechanism: end_under_force(mechanism),  # type: ignore[misc]
-            group=FORCE,
-        )
+        yield of_force(mechanism, FORCE, partial(end_under_force, mechanism))
+
+
+def held_out(quick: bool) -> Iterator[Trap]:
+    """The same forces and mechanisms with other numbers, each drawn until two methods agree and errors do not grow."""
+    for place, (family, bodies) in enumerate(forces(quick)):
+        g, n_drawn = np.random.default_rng([HELD_OUT_SEED, place]), 0
+        while True:
+            n_drawn += 1
+            mechanism = bodies(families()[family](g))
+            try:
+                known = motion(mechanism)
+            except (RuntimeError, ValueError):  # SciPy's method fails
+                continue
+            if known.apart <= AGREE and known.growth <= GROWN:
+                break
+        yield of_force(mechanism, HELD_OUT, partial(known.q.__getitem__, -1), n_drawn)
+
+
+def of_force(mechanism: Mechanism, group: str, end: Callable[[], Array], n_drawn: int = 1) -> Trap:
+    """The trap of a mechanism under a force, whose end is known."""
+    sharp = mechanism.sharp
+    return Trap(
+        sharp.family,
+        mechanism.name,
+        mechanism.system,
+        mechanism.q0,
+        mechanism.v0,
+        T_END,
+        mechanism.system,
+        positions=lambda t: end(),
+        group=group,
+        impulse=sharp.driven and bool(sharp.breaks),
+        n_drawn=n_drawn,
+    )

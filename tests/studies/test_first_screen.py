@@ -13,6 +13,7 @@ from studies import first_calls, headline, honesty, index, rivals, table3, table
 from studies.bench import Case
 from studies.render import number, render
 from studies.takes import takes
+from studies.traps import FORCE
 from tests.studies.test_index import energy
 from tests.studies.test_table3 import found_of
 from tests.studies.test_table3 import rows as rows_of_table3
@@ -70,13 +71,18 @@ def of_table3(paper=(3.0, 9.0, 12.0), explicit=(0.2, 0.25, 0.25)):
 def of_honesty():
     """Findings of honesty as far as the screen needs them; the counts are made from outcomes."""
     wrong = {"auto (two-loop)": 1, "auto, compiled (two-loop)": 2, "Taylor (two-loop)": 3, "IDA from C": 4}
+    wrong |= {"IDA from C, max_step": 5}
     lines = []
     for k, (solver, n) in enumerate(wrong.items()):
         outcomes = [honesty.SILENT] * (n - 1) + [honesty.HANG] + [honesty.RIGHT] * (60 + k)
-        outcomes += [honesty.NOT_RUN] * 5 + ([honesty.UNASKED] * 6 if k == 0 else [])
-        lines += [{"solver": solver, "outcome": outcome} for outcome in outcomes]
+        outcomes += [honesty.NOT_RUN] * 5  # refused
+        lines += [{"solver": solver, "outcome": outcome, "asked": True} for outcome in outcomes]
+        lines += [{"solver": solver, "outcome": honesty.SILENT, "asked": False} for _ in range(6 if k == 0 else 0)]
+    rows = pd.DataFrame(lines).assign(group=FORCE, status="RAISED")
+    held_out = honesty.trust_in(rows[rows["outcome"] != honesty.SILENT])
     forces = {"n_families": 17, "mechanisms": ["a", "b", "c"]}
-    return {"n_traps": 23, "forces": forces, "trust": honesty.trust_in(pd.DataFrame(lines))}
+    made = {"n_traps": 23, "forces": forces, "forces_only": ["auto, compiled (two-loop)"] * 14}
+    return made | {"trust": honesty.trust_in(rows), "held_out": {"trust": held_out}}
 
 
 def findings():
@@ -141,11 +147,14 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         + f"{N}, undecided in 0; in 0 no rival gets there; on 1 of 2 mechanisms it is nowhere behind.",
         count(None) + f"{N}, undecided in 0; in 0 no rival gets there; on 1 of 2 mechanisms it is nowhere behind.",
         "takes 15 to 48 times the time of the cheapest of them, for 1e-2, 1e-4 and 1e-6 (",
-        "wrong with success and no warning are 1 of 67 runs of the default, 2 of 63 of the compiled default, ",
-        "3 of 65 of our other methods and 4 of 67 of other projects' solvers",
+        "wrong with success and no warning are 7 of 67 runs of the default (6 of them step over a force of 1 ms), ",
+        "2 of 63 of the compiled default, 3 of 65 of our other methods, 4 of 67 of other projects' solvers",
+        "and 5 of 69 of these",
         "under 17 kinds of sharp everyday forces (drag, friction, ",
-        " on 3 mechanisms, ",
-        "and on 23 other traps after a valid start. 6 more runs of the default step over a force of 1 ms.",
+        " on 3 mechanisms; all but 14 of ours, the compiled default among them, also met 23 other traps",
+        "drawn afterwards, it is 1 of 61 runs of the default, 1 of 62 of the compiled default, "
+        "1 of 63 of our other methods, ",
+        "1 of 64 of other projects' solvers as they come and 1 of 65 of these",
         " Of 2111 runs of random mechanisms under such forces, by every preset, 14 are wrong in this way",
     ]
     for said in expected:

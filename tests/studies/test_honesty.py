@@ -4,12 +4,26 @@ import time
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from studies import honesty
+from studies import honesty, honesty_solvers
+from studies.honesty_solvers import IDA_C, LIMITED, own, solvers, why_not
 from studies.render import render
-from studies.traps import FORCE, INPUT, MISTAKE, forces, of_linkages, traps, under_forces
+from studies.traps import (
+    FORCE,
+    GROWN,
+    HELD_OUT,
+    INPUT,
+    KINK,
+    MISTAKE,
+    forces,
+    held_out,
+    of_linkages,
+    traps,
+    under_forces,
+)
 from twoloop import solve_dae
 from twoloop.methods import PRESETS
 
@@ -17,7 +31,7 @@ TRAPS = {trap.name: trap for trap in traps(quick=True)}
 SOUND = TRAPS["redundant row"]
 
 
-DOP853 = partial(honesty.own, "DOP853")
+DOP853 = partial(own, "DOP853")
 
 
 def row_of(trap, call=DOP853):
@@ -52,15 +66,17 @@ def test_a_call_that_does_not_come_back_hangs(monkeypatch):
     assert honesty.run("x", lambda trap: time.sleep(60.0), short, None)["outcome"] == honesty.HANG
 
 
-def test_what_was_never_evaluated_is_told_from_what_was_missed():
+def test_what_was_never_evaluated_is_wrong_and_silent_too():
     pulse = TRAPS["pulse of 1 ms"]
-    assert row_of(pulse)["outcome"] == honesty.UNASKED
+    row = row_of(pulse)
+    assert row["outcome"] == honesty.SILENT and not row["asked"]
     assert row_of(TRAPS["pulse of 1 ms, max_step half of it"])["outcome"] == honesty.RIGHT
 
     def coarse(trap):  # ends before the pulse has: it has seen it
         return solve_dae(trap.system, (0.0, 1.0005), trap.q0, trap.v0, method="DOP853", max_step=1e-3)
 
-    assert row_of(pulse, coarse)["outcome"] == honesty.SILENT
+    row = row_of(pulse, coarse)
+    assert row["outcome"] == honesty.SILENT and row["asked"]
 
 
 def test_steps_without_error_control_may_say_so():
@@ -78,9 +94,9 @@ def test_traps_in_the_motion_have_a_known_end():
 
 def test_a_solver_of_compiled_functions_is_not_asked_for_python():
     trap = TRAPS["exception in a Python callback after 1 s"]
-    assert honesty.why_not(honesty.IDA_C, trap)
-    assert not honesty.why_not("BDF (two-loop)", trap)
-    assert honesty.why_not("LSODA, index 1", TRAPS["first step of 1 s"])
+    assert why_not(IDA_C, trap)
+    assert not why_not("BDF (two-loop)", trap)
+    assert why_not("LSODA, index 1", TRAPS["first step of 1 s"])
 
 
 @pytest.mark.parametrize(
@@ -95,7 +111,7 @@ def test_a_solver_of_compiled_functions_is_not_asked_for_python():
 )
 @pytest.mark.parametrize("method", ["SunRadau5", "DOP853", "BDF"])
 def test_ours_say_so(name, method):
-    assert row_of(TRAPS[name], partial(honesty.own, method))["outcome"] == honesty.SAID
+    assert row_of(TRAPS[name], partial(own, method))["outcome"] == honesty.SAID
 
 
 def test_sentences_turn_with_the_rows():
@@ -106,6 +122,8 @@ def test_sentences_turn_with_the_rows():
             "mechanism": "chain of 2",
             "solver": solver,
             "outcome": honesty.RIGHT,
+            "status": "REACHED_END",
+            "asked": True,
             "error": 1e-9,
         }
         for trap in ("a", "b")
@@ -114,7 +132,7 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
+        tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
     assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
@@ -131,6 +149,7 @@ def test_sentences_turn_with_the_rows():
 
 
 OURS, COMPILED, OTHER, THEIRS = honesty.DEFAULT, honesty.DEFAULT_COMPILED, "BDF (two-loop)", "LSODA, index 1"
+BOUND = THEIRS + LIMITED
 
 
 def rows_of_forces(wrong=()):
@@ -143,9 +162,11 @@ def rows_of_forces(wrong=()):
                 "mechanism": "pendulum",
                 "solver": solver,
                 "outcome": honesty.SILENT if (solver, group) in wrong else honesty.RIGHT,
+                "status": "REACHED_END",
+                "asked": True,
                 "error": 1e-9,
             }
-            for solver in (OURS, COMPILED, OTHER, THEIRS)
+            for solver in (OURS, COMPILED, OTHER, THEIRS, BOUND)
             for group in (MISTAKE, FORCE)
         ]
     )
@@ -153,25 +174,98 @@ def rows_of_forces(wrong=()):
 
 def told_of_forces(rows):
     found = honesty.findings_of(rows)
-    tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
+    tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
     return found, render("honesty", found, tables, stamp="stamp", quick=False)
 
 
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces())
-    assert found["trust"]["default"] == {"n": 2, "wrong": 0, "unasked": 0}
-    assert "None of ours is wrong and silent." in text
+    assert found["trust"]["default"] == {"n": 2, "wrong": 0, "unasked": 0, "n_mistakes": 1, "n_forces": 1, "refused": 0}
+    assert "None of ours is wrong and silent on the first set." in text
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
-    assert {name: each["wrong"] for name, each in found["trust"].items()} == {
-        "default": 0,
-        "compiled": 1,
-        "ours": 1,
-        "others": 1,
-    }
-    assert "the default 0 of 2 runs, compiled 1 of 2, our other methods 1 of 2, other projects' solvers 1 of 2." in text
+    wrong = {"default": 0, "compiled": 1, "ours": 1, "others": 1, "limited": 0}
+    assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
+    assert "| the default, compiled | 1 | 1 | 1 of 2 | 0 | 0 |" in text
+    assert "| other projects' solvers as they come | 1 | 1 | 1 of 2 |" in text
+    assert "| the same with max_step | 1 | 1 | 0 of 2 |" in text
     assert "gust (BDF, auto, compiled)." in text
     line = found["forces"]["families"][0]
-    assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == 1
+    assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == line["limited"][honesty.RIGHT] == 1
+
+
+def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
+    rows = rows_of_forces([(OURS, MISTAKE), (THEIRS, MISTAKE), (THEIRS, FORCE)])
+    rows.loc[rows["group"] == MISTAKE, "asked"] = False
+    found, text = told_of_forces(rows)
+    assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
+    assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
+    assert found["cells"][0][OURS] == [honesty.UNASKED] and found["unasked"] == 2
+    assert "or hang: 1. auto (two-loop) on *a*" in text and "None of ours is wrong and silent, and" not in text
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "NotSymbolic: force of 'chain of 2': it branches on what depends on t",
+        "ValueError: compiled=True needs equations that can be written down; force of 'chain of 1': it branches",
+        "ValueError: method='Taylor' needs callbacks whose operations it can see; force of 'chain of 1'",
+        "ValueError: mass of 'spatial slider-crank' must be positive definite; at t = 0.0 it is not",
+    ],
+)
+def test_a_refusal_is_no_run(message):
+    raised = {"status": "RAISED", "message": message, "error": None, "warned": "", "asked": True}
+    assert honesty.outcome(raised, SOUND, True) == honesty.NOT_RUN
+    assert honesty.outcome(raised | {"message": "KeyError: of a callback"}, SOUND, True) == honesty.SAID
+    rows = rows_of_forces()
+    changed = (rows["solver"] == COMPILED) & (rows["group"] == MISTAKE)
+    rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
+    found, text = told_of_forces(rows)
+    assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
+    assert "| the default, compiled | 0 | 1 | 0 of 1 | 0 | 1 |" in text
+
+
+def test_what_a_refusal_says_is_what_is_said():
+    trap = next(trap for trap in under_forces(quick=False) if trap.name == "square wave")
+    for method in ("auto, compiled", "Taylor"):
+        assert honesty.run("x", partial(own, method), trap, None)["outcome"] == honesty.NOT_RUN
+    in_space = next(trap for trap in under_forces(quick=False) if trap.mechanism == "spatial slider-crank")
+    call = partial(honesty_solvers.scipy, "DOP853", False)
+    assert honesty.run("x", call, in_space, None)["outcome"] == honesty.NOT_RUN
+
+
+def test_a_second_line_has_the_longest_step_of_ours(monkeypatch):
+    asked = []
+    monkeypatch.setattr(honesty_solvers, "solve_index1", lambda *arguments, **options: asked.append(options))
+    every = solvers(False, FORCE)
+    pulse = TRAPS["pulse of 1 ms"]
+    every["LSODA, index 1"](pulse)
+    every["LSODA, index 1" + LIMITED](pulse)
+    every["LSODA, index 1"](TRAPS["pulse of 1 ms, max_step half of it"])
+    assert [options["max_step"] for options in asked] == [None, pulse.t_end / 100.0, 5e-4]
+    others = {name for name in every if not name.endswith(honesty.OURS)}
+    assert {name + LIMITED for name in others if not name.endswith(LIMITED)} < others
+    assert why_not("LSODA, index 1" + LIMITED, TRAPS["pulse of 1 ms, max_step half of it"])
+
+
+def test_an_impulse_is_asked_of_forms_that_hold_it():
+    kink = next(trap for trap in under_forces(quick=True) if trap.name == KINK)
+    assert kink.impulse and not any(trap.impulse for trap in under_forces(quick=True) if trap.name != KINK)
+    for name in solvers(False, FORCE):
+        assert bool(why_not(name, kink)) == (not name.endswith(honesty.OURS) and not name.startswith("IDA"))
+
+
+def test_forces_held_out_are_others_and_counted_apart():
+    first, held = list(under_forces(quick=True)), list(held_out(quick=True))
+    assert [(trap.name, trap.mechanism) for trap in first] == [(trap.name, trap.mechanism) for trap in held]
+    for one, other in zip(first, held, strict=True):
+        assert other.group == HELD_OUT and not np.array_equal(one.system.parameters, other.system.parameters)
+    assert row_of(held[0])["outcome"] == honesty.RIGHT and GROWN < honesty.LOOSENESS
+    again = rows_of_forces([(OURS, FORCE)])
+    apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
+    found, text = told_of_forces(pd.concat([rows_of_forces(), apart], ignore_index=True))
+    assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
+    assert "On the one held out: auto under gust on pendulum, error 1e-9." in text
+    assert "repaired on the first set of forces; they were not on the one held out" in text
 
 
 def test_checks_of_the_input_are_counted_apart():
@@ -187,7 +281,7 @@ def test_a_force_has_a_known_end_and_all_presets_are_asked():
     assert trap.mechanism == "pendulum"
     assert row_of(trap)["outcome"] == honesty.RIGHT
     assert row_of(replace(trap, system=TRAPS["drag"].system))["outcome"] == honesty.SILENT
-    asked = {name.removesuffix(" (two-loop)").split(",")[0] for name in honesty.solvers(False, FORCE)}
+    asked = {name.removesuffix(" (two-loop)").split(",")[0] for name in solvers(False, FORCE)}
     assert set(PRESETS) - asked == {"PaperIRK", "PaperNewmark"}
 
 

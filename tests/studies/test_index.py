@@ -171,26 +171,32 @@ def test_the_cheapest_are_found_among_ours_and_others():
 
 
 def test_the_sentence_on_trust_is_computed(tmp_path):
-    wrong = {"default": 0, "compiled": 3, "ours": 5, "others": 7}
+    wrong = {"default": 0, "compiled": 3, "ours": 5, "others": 7, "limited": 6}
     trust = {name: {"n": 50, "wrong": n, "unasked": 0} for name, n in wrong.items()}
+    held_out = {name: {"n": 30, "wrong": n + 1, "unasked": 0} for name, n in wrong.items()}
     bad = {"ours_bad": [], "others_bad": [], "unasked": 0, "missed_by_all": []}
     honesty = bad | {
         "n_traps": 20,
         "forces": {"n_families": 15, "mechanisms": ["pendulum", "four-bar"]},
         "trust": trust,
+        "held_out": {"trust": held_out},
+        "forces_only": ["auto, compiled (two-loop)", "Gauss4 (two-loop)"],
     }
     text = front(tmp_path, [case()], honesty=honesty)
-    assert "under 15 kinds of sharp everyday forces" in text and "on 2 mechanisms, and on 20 other traps" in text
-    assert (
-        "0 of 50 runs of the default, 3 of 50 of the compiled default, 5 of 50 of our other methods and 7 of 50" in text
-    )
+    assert "under 15 kinds of sharp everyday forces" in text and "also met 20 other traps" in text
+    assert "on 2 mechanisms; all but 2 of ours, the compiled default among them," in text
+    assert "0 of 50 runs of the default, 3 of 50 of the compiled default, 5 of 50 of our other methods, 7 of 50" in text
+    assert "as they come and 6 of 50 of these with steps of a hundredth of the run at most" in text
+    assert "repaired on these forces. Under the same with other numbers" in text
+    assert "it is 1 of 30 runs of the default, 4 of 30 of the compiled default, 6 of 30" in text
     assert "step over" not in text and "random mechanisms under such forces" not in text
-    trust["default"] |= {"unasked": 2}
+    trust["default"] |= {"wrong": 3, "unasked": 2}
     sharp = {"n": 3000, "wrong and silent": 4}
     text = front(
         tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
     )
-    assert ". 2 more runs of the default step over a force of 1 ms. Of 3000 runs of random mechanisms" in text
+    assert "3 of 50 runs of the default (2 of them step over a force of 1 ms), 3 of 50" in text
+    assert "Of 3000 runs of random mechanisms" in text
     assert "under such forces, by every preset, 4 are wrong in this way" in text
     assert "**Trust**" not in front(tmp_path, [case()])
 
