@@ -312,8 +312,8 @@ def _all() -> Iterator[Solver]:
     yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
     yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
     more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
-    for name, method in ((IDAS, None), ("CVODES, CasADi", "BDF"), ("CVODES, CasADi, Adams", "Adams")):
-        yield _solver(name, "CasADi", "compiled", "tol", partial(_casadi, method), **more)
+    for name, of in {IDAS: None, "CVODES, CasADi": "BDF", "CVODES, CasADi, Adams": "Adams"}.items():
+        yield _solver(name, "CasADi", "compiled", "tol", partial(_casadi, of), **more)
     yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, **more)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
