@@ -1,9 +1,11 @@
 """Rivals are put, timed and stopped as their users would do it: what is built, counted, limited, and said of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from references import casadi_integrators, diffrax_dopri8, fully_implicit, index1
+from references import casadi_integrators, cvode_c, diffrax_dopri8, fully_implicit, index1
 from references.casadi_integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
 from references.cvode import solve_cvode
 from references.cvode_c import solve_cvode_c
@@ -93,16 +95,17 @@ def test_diffrax_looks_at_the_clock_before_the_second_run_and_takes_many_steps()
 
 # --- mass matrices that are singular without the constraints, as with Euler parameters
 
-BY_ACCELERATIONS = ("DOP853, index 1", "DOP853, projected", "LSODA, index 1", "Pr9, index 1", "CVODE, Adams")
-EULER = {"heavy top": (*BY_ACCELERATIONS, "Radau, index 1", "IDA from C, stabilised")}
-LARGE = ("spatial slider-crank", "spatial four-bar", "A05 governor")
+QUICK = ("DOP853, index 1", "DOP853, projected", "Pr9, index 1")
+COMPILING = ("LSODA, index 1", "Radau, index 1", "CVODE, Adams", "IDA from C, stabilised")
+EULER = ("heavy top", "spatial slider-crank", "spatial four-bar", "A05 governor")
+SLOW = [pytest.param(name, (*QUICK, *COMPILING), marks=pytest.mark.slow) for name in EULER]
 
 
-@pytest.mark.parametrize("name", ["heavy top", *(pytest.param(each, marks=pytest.mark.slow) for each in LARGE)])
-def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name):
+@pytest.mark.parametrize(("name", "solvers"), [("heavy top", QUICK), *SLOW])
+def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name, solvers):
     problem = next(problem for problem in (make() for make in MAKE) if problem.name == name)
     known = problem.reference
-    for solver in EULER.get(name, (*BY_ACCELERATIONS, "IDA from C, stabilised")):
+    for solver in solvers:
         errors = []
         for tol in (1e-5, 1e-9):
             case = Case(name, problem, known.t, n_instants=1, time_limit=60.0)
@@ -147,6 +150,18 @@ def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
 
     late = solve(*start(PENDULUM, 2.0), t_eval=[0.0, 2.0], time_limit=1e-9)
     assert late.status is Status.SOLVER_FAILED and late.t.tolist() in ([], [0.0])
+
+
+def test_the_second_run_of_cvode_takes_the_steps_of_the_first():
+    pytest.importorskip("sksundae")
+    system, _, q, v = start(PENDULUM, 2.0)
+    functions = cvode_c.Functions(
+        cvode_c._right_hand_side(system, 0.0, q.tobytes(), v.tobytes()), None, None, np.empty(0)
+    )
+    given = functions, np.concatenate([q, v]), 0.0, 2.0, cvode_c.METHODS["Adams"], 1e-8, 1e-8
+    runs = [cvode_c.integrate(*given, times, TimeLimit(None)) for times in (np.empty(0), np.array([2.0]), TIMES)]
+    counts = [replace(statistics, cpu_time=0.0) for *_, statistics in runs]
+    assert counts[0] == counts[1] == counts[2] and counts[0].n_accepted > 50
 
 
 def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):

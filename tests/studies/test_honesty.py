@@ -228,9 +228,6 @@ def test_what_a_refusal_says_is_what_is_said():
     trap = next(trap for trap in under_forces(quick=False) if trap.name == "square wave")
     for method in ("auto, compiled", "Taylor"):
         assert honesty.run("x", partial(own, method), trap, None)["outcome"] == honesty.NOT_RUN
-    in_space = next(trap for trap in under_forces(quick=False) if trap.mechanism == "spatial slider-crank")
-    call = partial(honesty_solvers.scipy, "DOP853", False)
-    assert honesty.run("x", call, in_space, None)["outcome"] == honesty.NOT_RUN
 
 
 def test_a_second_line_has_the_longest_step_of_ours(monkeypatch):
