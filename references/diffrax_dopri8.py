@@ -22,7 +22,7 @@ from twoloop.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LARGEST = 9  # coordinates; the compilation of more takes too long
-MOST_STEPS = 10**7
+MOST_STEPS = 10**6  # some seconds, in which compiled code looks at no clock; who gets no farther was "not asked"
 
 
 def solve_diffrax(
