@@ -49,6 +49,7 @@ TRUTH_LIMIT = 10.0  # s that one of them may take
 AGREE = 1e-7  # how far the two may differ
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
 UNASKED = "wrong, never asked"
+REFUSED = "^NotSymbolic|needs equations that can be written down"
 SHORT = {HANG: "**hang**", SILENT: "**silent**", UNASKED: "**unasked**", SAID: "said", RIGHT: "right", NOT_RUN: "–"}
 ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
 UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
@@ -267,9 +268,9 @@ def counts_of(rows: pd.DataFrame) -> dict[str, int]:
 
 def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says: of mistakes and of forces, and of both together how far ours can be trusted."""
-    # what our adapters of solvers that take expressions cannot write down is no answer of theirs
+    # what cannot be written down as expressions is refused before a run, of theirs and of ours
     if "message" in all_rows:
-        refused = all_rows["message"].astype(str).str.startswith("NotSymbolic")
+        refused = all_rows["message"].astype(str).str.contains(REFUSED)
         all_rows = all_rows.assign(outcome=all_rows["outcome"].mask(refused, NOT_RUN))
     rows, forces, inputs = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT))
     found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(pd.concat([rows, forces]))}
@@ -292,9 +293,12 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def trust_in(rows: pd.DataFrame) -> dict[str, Any]:
-    """Runs on all traps, and those wrong without a word: of the default, compiled, of our others, of others."""
+    """Runs on all traps, and those wrong without a word: of the default, compiled, of our others, of others.
+
+    A run that never evaluates a force is as wrong as any; how many of the wrong ones are such is told beside.
+    """
     ran = rows[rows["outcome"] != NOT_RUN]
-    wrong, unasked = ran["outcome"].isin((SILENT, HANG)), ran["outcome"] == UNASKED
+    wrong, unasked = ran["outcome"].isin((SILENT, HANG, UNASKED)), ran["outcome"] == UNASKED
     ours = ran["solver"].str.endswith("(two-loop)")
     default, compiled = ran["solver"] == DEFAULT, ran["solver"] == DEFAULT_COMPILED
     parts = {"default": default, "compiled": compiled, "ours": ours & ~default & ~compiled, "others": ~ours}

@@ -157,6 +157,19 @@ def told_of_forces(rows):
     return found, render("honesty", found, tables, stamp="stamp", quick=False)
 
 
+def test_runs_that_never_evaluate_a_force_are_wrong_ones_and_refusals_are_no_runs():
+    rows = rows_of_forces().assign(message="Reached the end, t = 3.")
+    rows.loc[rows["solver"] == OURS, "outcome"] = honesty.UNASKED
+    refused = (rows["solver"] == COMPILED) & (rows["group"] == FORCE)
+    rows.loc[refused, ["outcome", "message"]] = [
+        honesty.SAID,
+        "ValueError: compiled=True needs equations that can be written down; force of 'crane': it branches",
+    ]
+    trust = told_of_forces(rows)[0]["trust"]
+    assert trust["default"] == {"n": 2, "wrong": 2, "unasked": 2}
+    assert trust["compiled"] == {"n": 1, "wrong": 0, "unasked": 0}
+
+
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces())
     assert found["trust"]["default"] == {"n": 2, "wrong": 0, "unasked": 0}

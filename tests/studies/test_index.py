@@ -164,12 +164,12 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
         "0 of 50 runs of the default, 3 of 50 of the compiled default, 5 of 50 of our other methods and 7 of 50" in text
     )
     assert "step over" not in text and "random mechanisms under such forces" not in text
-    trust["default"] |= {"unasked": 2}
+    trust["default"] |= {"wrong": 2, "unasked": 2}
     sharp = {"n": 3000, "wrong and silent": 4}
     text = front(
         tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
     )
-    assert "; 2 more of the default step over a force of 1 ms." in text
+    assert "; 2 of those of the default step over a force of 1 ms." in text
     assert "Of 3000 runs of random mechanisms under such forces, by every preset, 4 are" in text
     assert "**Trust**" not in front(tmp_path, [case()])
 
