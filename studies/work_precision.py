@@ -227,12 +227,14 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 
 
 def asked(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many pairs of solver and mechanism were not asked for all accuracies, and the rule."""
-    made = rows[rows["repeat"] == 0].groupby(["solver", "case"]).size()
-    fewer = int((made < made.groupby("solver").transform("max")).sum())
+    """How many pairs of rival and mechanism were refused, or not asked for all accuracies, and the rule."""
+    others = rows[rows["family"] != "two-loop"]
+    pairs = others.groupby(["solver", "case"]).ngroups
+    put = [own for _, own in tables.put(others).groupby(["solver", "case"])]
     return {
-        "n": len(made),
-        "fewer": fewer,
+        "n": pairs,
+        "refused": pairs - len(put),
+        "fewer": sum(not tables.missed(own, 0.0) for own in put),
         "far": adaptive.FAR,
         "running": adaptive.RUNNING,
         "outclassed": adaptive.OUTCLASSED,

@@ -206,7 +206,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
     }
     found |= {"machine": limit.findings_of(pd.DataFrame([machine]))}
     found |= {"goals": goals.findings_of([], table.assign(case="other"), table)}
-    found |= {"asked": {"n": 4, "fewer": 0, "far": 20.0, "running": 2, "outclassed": 10.0, "limit": 1.0}}
+    found |= {"asked": {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "outclassed": 10.0, "limit": 1.0}}
     found["behind"] = behind.findings_of(found["rivals"], table, {"four-bar": 700.0}, 0.5)
     return render("work_precision", found | changed, work_precision.ready(found | changed), stamp="", quick=False)
 
