@@ -64,10 +64,10 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 
 # the inner loop first, which all others need; then two processes, so that none compiles what another compiles
 compile: install ## compile the kernels, on two cores
-	@$(RUN) -c "import twoloop.kernels.calls"
-	@$(RUN) -c "import twoloop.kernels.newton" & \
+	@$(RUN) -c "import twoloop.kernels.evaluation.calls"
+	@$(RUN) -c "import twoloop.kernels.steps.newton_step" & \
 	$(RUN) -c "from twoloop.kernels import runge_kutta, momenta, bdf, newmark, explicit, adams, bridge, advance, dense, diagonal" && wait $$! && \
-	$(RUN) -c "import twoloop.kernels.switching"
+	$(RUN) -c "import twoloop.kernels.control.switching"
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from references import ablation_kernels as kernels
 from references.driver import TimeLimit, check_choice, check_run
-from twoloop.checks import check_positive
-from twoloop.consistency import check_start
-from twoloop.kernels.common import GAMMA_GIVEN, Kit
-from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem
-from twoloop.tableaux import Tableau
+from twoloop.checks.arguments import check_positive
+from twoloop.checks.consistency import check_start
+from twoloop.kernels.data.common import GAMMA_GIVEN, Kit
+from twoloop.methods.tableaux import Tableau
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

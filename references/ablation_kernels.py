@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, types
 
-from twoloop.caches import compile_kept, watch
-from twoloop.kernels.common import CONSTANT_MASS, INTEGERS, KIT, MATRIX, VECTOR
-from twoloop.kernels.linalg import ldl_factor, ldl_solve, lu_factor, lu_solve
-from twoloop.kernels.partition import full_pivoting
+from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve, lu_factor, lu_solve
+from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.data.common import CONSTANT_MASS, INTEGERS, KIT, MATRIX, VECTOR
+from twoloop.kernels.evaluation.partition import full_pivoting
 
 POSITIONS, FROZEN, PROJECTED, STABILISED, UNPROJECTED = range(5)
 

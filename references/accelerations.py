@@ -16,11 +16,11 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import check_system
-from twoloop.bounds import check_bounds
-from twoloop.checks import check_real
-from twoloop.kernels.common import GAMMA_GIVEN
-from twoloop.kernels.linalg import ldl_factor, ldl_solve
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.arguments import check_real
+from twoloop.checks.bounds import check_bounds
+from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
+from twoloop.kernels.data.common import GAMMA_GIVEN
+from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_problem, check_time_limit
-from twoloop.checks import check_positive, check_real, check_times
+from twoloop.checks.arguments import check_positive, check_real, check_times
 from twoloop.mechanisms import Problem
 
 Array = NDArray[np.float64]

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.index1 import RightHandSide
 from references.ode import ADVICE, ode_result, output_times, states_at
-from twoloop.consistency import check_start
-from twoloop.result import Result, Statistics
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.consistency import check_start
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 

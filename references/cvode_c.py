@@ -19,9 +19,10 @@ from references.driver import TimeLimit, UserCall, check_choice, check_run, chec
 from references.ode import ADVICE, ode_result, output_times
 from references.straight_line import straight_line, straight_line_jacobian
 from references.sundials import REAL, check, context, counted, flag_name, library, made
-from twoloop.consistency import check_start
-from twoloop.result import Result, Statistics
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.consistency import check_start
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 

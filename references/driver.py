@@ -9,9 +9,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks import check_positive, check_span, check_times, check_vector
-from twoloop.mechanisms.problem import Problem
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.arguments import check_positive, check_span, check_times, check_vector
+from twoloop.problem.problem import Problem
+from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 

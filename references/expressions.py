@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from references.driver import check_system
 from references.duals import Dual, functions_on_duals
-from twoloop.kernels.common import GAMMA_GIVEN
-from twoloop.series import on_symbols
-from twoloop.system import ConstrainedSystem
-from twoloop.traced_values import Traced
-from twoloop.tracing import Graph, Untraceable
+from twoloop.generate.series import on_symbols
+from twoloop.generate.traced_values import Traced
+from twoloop.generate.tracing import Graph, Untraceable
+from twoloop.kernels.data.common import GAMMA_GIVEN
+from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Functions = Mapping[str, Callable[[Any], Any]]  # those of FUNCTIONS that the package has, by name

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 
 from references.driver import check_choice, check_problem
 from references.exudyn_run import add_sensors, check_steps, run
-from twoloop.checks import check_size
-from twoloop.mechanisms.problem import Problem
-from twoloop.result import Result
+from twoloop.checks.arguments import check_size
+from twoloop.problem.problem import Problem
+from twoloop.result.result import Result
 
 Array = NDArray[np.float64]
 

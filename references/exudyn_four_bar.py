@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from references.driver import check_problem
 from references.exudyn_run import ALPHA, SOLVERS, add_sensors, check_option, check_radius, check_steps, run
-from twoloop.mechanisms.problem import Problem
-from twoloop.result import Result
+from twoloop.problem.problem import Problem
+from twoloop.result.result import Result
 
 __all__ = ["SOLVERS", "solve_exudyn"]
 

@@ -16,8 +16,9 @@ from exudyn.itemInterface import SensorNode
 from numpy.typing import NDArray
 
 from references.driver import TimeLimit, check_choice, check_time_limit, user_call
-from twoloop.checks import check_number, check_positive, check_size
-from twoloop.result import Result, Statistics, Status
+from twoloop.checks.arguments import check_number, check_positive, check_size
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
-from twoloop.checks import check_number, check_positive, check_real, check_vector
+from twoloop.checks.arguments import check_number, check_positive, check_real, check_vector
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.ida import compiled_rates, compiled_residual, start_of
-from twoloop.consistency import check_start
-from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.consistency import check_start
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

@@ -19,13 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from references.accelerations import accelerations
 from references.driver import TimeLimit, check_choice, check_run, user_call
 from references.index1 import solve_index1
-from twoloop.caches import compile_kept, watch
-from twoloop.checks import check_positive, check_size, check_times
-from twoloop.consistency import check_start
-from twoloop.kernels.common import INTEGERS, KIT, MATRIX, Kit
-from twoloop.kernels.linalg import lu_factor, lu_solve
-from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.arguments import check_positive, check_size, check_times
+from twoloop.checks.consistency import check_start
+from twoloop.kernels.algebra.linalg import lu_factor, lu_solve
+from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

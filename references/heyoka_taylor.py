@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from references.driver import TimeLimit, check_run, longest_step, user_call
 from references.expressions import Expressions, functions_of
 from references.ode import ADVICE, ode_result, output_times
-from twoloop.checks import check_positive
-from twoloop.consistency import check_start
-from twoloop.result import Result, Statistics
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.arguments import check_positive
+from twoloop.checks.consistency import check_start
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 

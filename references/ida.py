@@ -28,10 +28,11 @@ from references.ida_options import (
     tolerances,
 )
 from references.ode import states_at
-from twoloop.callbacks import stand_in
-from twoloop.consistency import check_start
-from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.consistency import check_start
+from twoloop.kernels.compile.callbacks import stand_in
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

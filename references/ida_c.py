@@ -21,9 +21,10 @@ from references.driver import TimeLimit, check_run, check_system, check_toleranc
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials import REAL, check, context, counted, flag_name, library, made
-from twoloop.consistency import check_start
-from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.consistency import check_start
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numba.core.dispatcher import Dispatcher
 
 from references.ida_options import no_force
 from references.sundials import library
-from twoloop.callbacks import stand_in
+from twoloop.kernels.compile.callbacks import stand_in
 
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 

@@ -16,9 +16,9 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from references.driver import check_choice
-from twoloop.checks import check_size
-from twoloop.kernels.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.arguments import check_size
+from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
+from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 

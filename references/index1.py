@@ -27,11 +27,12 @@ from references.driver import (
 )
 from references.expressions import NotSymbolic
 from references.straight_line import straight_line_jacobian
-from twoloop.checks import check_positive
-from twoloop.consistency import check_start
-from twoloop.kernels.linalg import ldl_solve
-from twoloop.result import Result, Statistics, Status
-from twoloop.system import ConstrainedSystem
+from twoloop.checks.arguments import check_positive
+from twoloop.checks.consistency import check_start
+from twoloop.kernels.algebra.linalg import ldl_solve
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
 

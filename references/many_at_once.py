@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from references.expressions import Expressions, functions_of
-from twoloop.mechanisms.problem import Problem
+from twoloop.problem.problem import Problem
 
 Array = NDArray[np.float64]
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed

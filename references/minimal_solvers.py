@@ -18,9 +18,10 @@ from references.heyoka_taylor import STEPS_A_CALL
 from references.minimal import Minimal, minimal
 from references.ode import ADVICE, ode_result, output_times
 from references.sundials import flag_name, library
-from twoloop.checks import check_positive
+from twoloop.checks.arguments import check_positive
 from twoloop.mechanisms import Problem
-from twoloop.result import Result, Statistics
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from references.four_bar_minimal import MinimalFourBar
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import Problem
-from twoloop.tableaux import Tableau
+from twoloop.methods.tableaux import Tableau
 
 Array = NDArray[np.float64]
 

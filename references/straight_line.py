@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from references.expressions import FUNCTIONS, Expressions, functions_of
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from studies.cli import StudyError
 from studies.metrics import violations
 from studies.study import Series, Study, key
 from twoloop import Result
-from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.floating]
 

@@ -16,7 +16,7 @@ from studies.render import number, power, render, table
 from studies.solvers import CATALOGUE, COMPARED
 from studies.store import Output
 from twoloop.mechanisms import Problem
-from twoloop.user_file import problem_from
+from twoloop.mechanisms.user_file import problem_from
 
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison

@@ -19,8 +19,8 @@ from studies.reference_motion import ReferenceMotion
 from studies.solvers import CATALOGUE, CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar
-from twoloop.plan import Method
-from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
+from twoloop.methods.plan import Method
+from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
 
 Array = NDArray[np.float64]
 Variant = tuple[str, str]  # variables and partition

@@ -12,11 +12,13 @@ import scipy.integrate
 from numpy.typing import NDArray
 
 from studies import metrics, render, solvers, tables
-from twoloop import ConstrainedSystem, Result, callback, mechanisms, methods, tableaux
-from twoloop.bdf import BDF
-from twoloop.dop853 import DOP853
+from twoloop import ConstrainedSystem, Result, callback, mechanisms
 from twoloop.mechanisms import Problem
-from twoloop.plan import Plan
+from twoloop.methods import presets as methods
+from twoloop.methods import tableaux
+from twoloop.methods.bdf import BDF
+from twoloop.methods.dop853 import DOP853
+from twoloop.methods.plan import Plan
 
 Array = NDArray[np.float64]
 
@@ -251,7 +253,7 @@ def in_tableau() -> Iterator[Fault]:
 
 def in_options() -> Iterator[Fault]:
     """The plan of a method: what its compiled step and the step-size control read."""
-    from twoloop.kernels import newmark
+    from twoloop.kernels.steps import newmark_step as newmark
 
     sound, double, pendulum = mechanisms.andrews(), mechanisms.double_pendulum(), mechanisms.projection_pendulum()
 

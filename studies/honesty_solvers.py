@@ -11,7 +11,7 @@ from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
 from studies.traps import FORCE, HELD_OUT, INPUT, MISTAKE, Trap
 from twoloop import Result, solve_dae
-from twoloop.run import LONGEST_UNSEEN
+from twoloop.run.run import LONGEST_UNSEEN
 
 OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"

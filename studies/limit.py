@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from references.straight_line import program_of
 from studies.store import KeptRows, Row
 from twoloop import solve_dae
+from twoloop.generate.straight_code import function_of, own_code
 from twoloop.mechanisms import four_bar
-from twoloop.straight_code import function_of, own_code
 
 GROUP = "limit"
 METHODS = ("Adams", "DOP853", "Taylor")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from references.four_bar_minimal import MinimalFourBar
 from twoloop import ConstrainedSystem
-from twoloop.callbacks import callback
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar
 
 equations = sys.modules[four_bar.__module__]  # the module, whose name its function has taken in the package

@@ -1,7 +1,7 @@
 """Callbacks of the mechanisms under the forces of `sharp_forces`, whose parameters come after their own."""
 
 from studies.sharp_forces import drive, force_along
-from twoloop.callbacks import callback
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import spatial
 
 GRAVITY = 9.81  # m/s^2

@@ -15,9 +15,9 @@ import numpy as np
 from references.index1 import solve_index1
 from studies.bench import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
-from twoloop.auto import LOOSE, TIGHTEST
-from twoloop.plan import Method
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.methods.auto import LOOSE, TIGHTEST
+from twoloop.methods.plan import Method
+from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 TOLERANCES = tuple(float(f"1e-{k}") for k in range(3, 14))  # of all solvers that have one: no gap of over a decade
 ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures

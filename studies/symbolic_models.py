@@ -17,7 +17,7 @@ import sympy as sp
 from scipy.optimize import brentq
 from sympy.physics.mechanics import dynamicsymbols
 
-from twoloop import generated, solve_dae
+from twoloop import solve_dae
 from twoloop.mechanisms import (
     closed_chain,
     driven_crank,
@@ -27,7 +27,8 @@ from twoloop.mechanisms import (
     rolling_disc,
     sundials_slider_crank,
 )
-from twoloop.mechanisms.problem import Problem
+from twoloop.problem import generated
+from twoloop.problem.problem import Problem
 from twoloop.symbolic import SymbolicMechanism, from_lagrangian
 
 t = dynamicsymbols._t

@@ -34,7 +34,7 @@ from studies.solvers import (
 from studies.store import Output
 from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, causes, machine, printed, reading_runs
 from twoloop import Result, RungeKutta, solve_dae
-from twoloop.tableaux import gauss
+from twoloop.methods.tableaux import gauss
 
 TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)

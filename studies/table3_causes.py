@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from studies.bench import Case, Run, Solver
 from studies.solvers import ERR_IN, ERR_OUT, IRK, NEWMARK, PAPER_TOL
 from twoloop import Result, RungeKutta, solve_dae
-from twoloop.tableaux import sun_radau_iib
+from twoloop.methods.tableaux import sun_radau_iib
 
 TOLERANCES = ERR_OUT
 FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from studies.render import listed
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
 
 SUFFIX = " (two-loop)"  # of our solvers, in the findings of honesty
 COMPILED_DEFAULT = "auto, compiled"

@@ -19,7 +19,7 @@ from studies.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.sharp_mechanisms import chain as chain_of
 from studies.sharp_motion import CHECK, RTOL, march, motion, off
 from twoloop import ConstrainedSystem
-from twoloop.callbacks import callback
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from tests.bad_input.case import Case
 from tests.bad_input.cases import CASES
-from twoloop import Status, result
+from twoloop import Status
+from twoloop.result import result
 
 PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
 LONGEST = 400  # characters of a message

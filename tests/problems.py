@@ -8,9 +8,9 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.kernels.calls import inner_loop
-from twoloop.kernels.common import FORCE_BY_Q_GIVEN, Kit
-from twoloop.kernels.explicit import explicit_step
+from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, Kit
+from twoloop.kernels.evaluation.calls import inner_loop
+from twoloop.kernels.steps.explicit_step import explicit_step
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}

@@ -13,8 +13,8 @@ import pytest
 
 from tests.problems import swing
 from twoloop import solve_dae
-from twoloop.animation import projected
 from twoloop.mechanisms import pendulum, spatial_slider_crank
+from twoloop.result.animation import projected
 
 Image = pytest.importorskip("PIL.Image")  # not among the oldest versions
 

@@ -14,8 +14,8 @@ from tests.bad_input.case import Q0, solve
 from tests.bad_input.cases import CASES
 from tests.problems import moving_pivot, moving_pivot_state, pendulum, violations
 from twoloop import Status, solve_dae
-from twoloop.checks import check_real, check_tolerance
-from twoloop.methods import PRESETS
+from twoloop.checks.arguments import check_real, check_tolerance
+from twoloop.methods.presets import PRESETS
 
 
 def refuses(error, words, *arguments, **options):

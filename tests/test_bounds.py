@@ -9,7 +9,7 @@ from numba import njit
 from tests.problems import pendulum
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
-from twoloop.callbacks import KINDS
+from twoloop.kernels.compile.callbacks import KINDS
 
 FAR = 10**7  # a write so far out would end the process
 Q, V = [-1.0, 0.0], [0.0, 0.0]

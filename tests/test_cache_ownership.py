@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from twoloop import caches, ownership
-from twoloop.ownership import doubt_of, make_own, own_folder, read_own, write_own
+from twoloop.kernels.compile import caches, ownership
+from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder, read_own, write_own
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="rights on other systems are not in the mode")
@@ -97,7 +97,7 @@ def test_nothing_is_loaded_from_a_folder_that_others_can_write(user):
 
 
 def test_generated_source_that_others_can_write_is_not_run(tmp_path, monkeypatch, capsys):
-    generated = pytest.importorskip("twoloop.generated")
+    generated = pytest.importorskip("twoloop.problem.generated")
     monkeypatch.setattr(generated, "sources_folder", lambda: tmp_path)
     code = generated.GeneratedCode("key", "def energy(t, q, v, p):\n    return 0.0\n")
     generated._write(tmp_path / "equations_key.py", f"{generated._head(code.source)}\n{code.source}")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from twoloop.caches import UNWRITABLE, watch
+from twoloop.kernels.compile.caches import UNWRITABLE, watch
 
 ROOT = Path(__file__).parents[1]
 
@@ -213,7 +213,7 @@ def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(fol
     blocked = block_caches(folder)
     folder.write(
         "kernels",
-        "from twoloop.kernels.common import kernel, f8\n"
+        "from twoloop.kernels.data.common import kernel, f8\n"
         "@kernel(f8(f8))\ndef twice(x):\n    return 2.0 * x\n"
         "@kernel(f8(f8))\ndef thrice(x):\n    return 3.0 * x\n",
     )
@@ -224,7 +224,8 @@ def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(fol
 
 def test_a_kernel_is_announced_when_it_compiles_and_only_then(folder):
     folder.write(
-        "kernels", "from twoloop.kernels.common import kernel, f8\n@kernel(f8(f8))\ndef twice(x):\n    return 2.0 * x\n"
+        "kernels",
+        "from twoloop.kernels.data.common import kernel, f8\n@kernel(f8(f8))\ndef twice(x):\n    return 2.0 * x\n",
     )
     source = "from kernels import *; print(twice(1.0))"
     folder.run(source)

@@ -10,8 +10,8 @@ import pytest
 
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
-from twoloop.callbacks import KINDS, OPTIONAL
-from twoloop.kernels.common import GIVEN, KIT, Functions
+from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
+from twoloop.kernels.data.common import GIVEN, KIT, Functions
 
 SOURCE = """
 import numpy as np

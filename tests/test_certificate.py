@@ -13,7 +13,6 @@ import pytest
 
 from tests.problems import run
 from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, load, solve_dae
-from twoloop.dense import DenseSolution
 from twoloop.mechanisms import (
     driven_crank,
     four_bar,
@@ -22,6 +21,7 @@ from twoloop.mechanisms import (
     redundant_slider_crank,
     rolling_disc,
 )
+from twoloop.run.dense import DenseSolution
 
 END = 3.0
 

@@ -9,9 +9,9 @@ import pytest
 import twoloop
 from tests.problems import swing
 from twoloop import Result, RungeKutta, Statistics, Status, citation, load
-from twoloop.citations import ENTRIES, METHODS
-from twoloop.methods import PRESETS
-from twoloop.tableaux import gauss, lobatto_iiie
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.tableaux import gauss, lobatto_iiie
+from twoloop.result.citations import ENTRIES, METHODS
 
 ROOT = Path(__file__).parents[1]
 

@@ -10,7 +10,7 @@ import pytest
 from tests.derivative_cases import UNITS, lever, linkage, slider_crank
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, consistent_state, solve_dae
-from twoloop.consistency import check_start
+from twoloop.checks.consistency import check_start
 from twoloop.mechanisms import four_bar
 
 REST = np.zeros(2)

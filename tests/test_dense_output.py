@@ -14,8 +14,8 @@ from tests.general.mechanisms import mechanism
 from tests.problems import force_residual, pendulum, pendulum_state, run, swing, violations, worst
 from twoloop import RungeKutta, Status, solve_dae
 from twoloop.mechanisms import moderately_stiff_beam
-from twoloop.methods import PRESETS
-from twoloop.tableaux import gauss, lobatto_iiie
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.tableaux import gauss, lobatto_iiie
 
 END = 2.0
 LOOSE = ("Newmark", "BDF", "TRBDF2", "ESDIRK4", "PaperIRK", "PaperNewmark")  # steps without number at tight tolerances
@@ -245,7 +245,7 @@ def test_a_run_without_a_step():
 
 
 def test_where_no_interior_states_are_found_the_neighbours_serve(default_four_bar, exact, monkeypatch):
-    monkeypatch.setattr("twoloop.dense.Interpolator._fill", lambda *_: {})
+    monkeypatch.setattr("twoloop.run.dense.Interpolator._fill", lambda *_: {})
     result = run(default_four_bar, 1.0, method="Gauss8", rtol=1e-6, atol=1e-6, dense_output=True)
     t = between(result)
     assert 0.0 < worst(result.sol(t).q, exact(t).q) < 1e-3
@@ -255,7 +255,7 @@ def test_more_intervals_than_are_kept(default_four_bar, exact, monkeypatch):
     result = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
     t = between(result)
     at_once = result.sol(t)
-    monkeypatch.setattr("twoloop.dense.KEPT", 5)
+    monkeypatch.setattr("twoloop.run.dense.KEPT", 5)
     again = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
     assert worst(again.sol(t).q, at_once.q) < 1e-12
     assert len(again.sol.interpolator.filled) <= 10

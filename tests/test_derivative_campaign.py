@@ -8,7 +8,7 @@ import pytest
 from tests import problems
 from tests.derivative_cases import UNITS, Case, lever, linkage, shaken_pendulum, slider_crank, sprung_rod
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.derivatives import check_derivatives, wrong_derivative
+from twoloop.checks.derivatives import check_derivatives, wrong_derivative
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 
 CHANGES = {

@@ -12,7 +12,7 @@ import pytest
 
 from tests.test_pages import blocks
 from twoloop import Result, Status, mechanisms
-from twoloop.result import explained
+from twoloop.run.record import explained
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(page.stem for page in DOCS.glob("*.md"))

@@ -13,7 +13,7 @@ import pytest
 from tests.problems import pendulum, pendulum_state, worst
 from twoloop import ConstrainedSystem, Newmark, Status, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.result import MEANINGS
+from twoloop.run.record import MEANINGS
 
 START = ([-1.0, 0.0], [0.0, 0.0])
 

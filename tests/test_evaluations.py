@@ -9,7 +9,7 @@ import pytest
 
 from twoloop import solve_dae
 from twoloop.mechanisms import andrews, four_bar
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9)
 ERROR = 1e-5  # of a coordinate at the end ...

@@ -6,7 +6,7 @@ import pytest
 from tests.problems import START, pendulum, pendulum_state, run, swing, worst
 from twoloop import Newmark, RungeKutta, Status, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.tableaux import gauss, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
 
 
 def test_fixed_steps_are_all_equal_and_times_exact_multiples():

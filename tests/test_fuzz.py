@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 import twoloop
 from tests.problems import pendulum
-from twoloop import ConstrainedSystem, Joint, consistent_state, mechanisms, solve_dae, tableaux
-from twoloop.callbacks import KINDS
+from twoloop import ConstrainedSystem, Joint, consistent_state, mechanisms, solve_dae
+from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.methods import tableaux
 
 FLOATS = st.floats(-1e3, 1e3)
 SORTS = {

@@ -13,8 +13,8 @@ import pytest
 from tests.problems import pendulum
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, solve_dae
-from twoloop.adapters import PythonFunctions
 from twoloop.mechanisms import four_bar, very_flexible_beam
+from twoloop.problem.adapters import PythonFunctions
 
 Q, V = [-0.6, -0.8], [0.4, -0.3]
 LOADS = np.diag([2.0, 3.0])

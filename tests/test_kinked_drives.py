@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from twoloop import ConstrainedSystem, Status, solve_dae
-from twoloop.impulse import beyond_jump
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
+from twoloop.run.impulse import beyond_jump
 
 # a cart on a driven path, two bars below it, the five coordinates coupled by the mass matrix
 MIXED = np.random.default_rng(5).normal(size=(5, 5)) * 0.3
@@ -270,7 +270,7 @@ def test_drives_that_contradict_one_another_end_the_run():
 
 def test_a_smooth_drive_is_left_alone():
     """The same steps with and without the look at C_t."""
-    from twoloop.run import Run
+    from twoloop.run.run import Run
 
     system = shaken()
     with pytest.MonkeyPatch.context() as patch:

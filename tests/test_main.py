@@ -10,7 +10,7 @@ import pytest
 import twoloop
 from twoloop import kernels, solve_dae
 from twoloop.__main__ import main
-from twoloop.caches import folder_of
+from twoloop.kernels.compile.caches import folder_of
 from twoloop.mechanisms import four_bar
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from twoloop import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark, solve_dae
-from twoloop.methods import PRESETS
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 
 def test_presets_are_those_promised():

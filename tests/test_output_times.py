@@ -7,8 +7,8 @@ import pytest
 
 from tests.problems import run, violations, worst
 from twoloop import Status
-from twoloop.dense import Interpolator
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
+from twoloop.run.dense import Interpolator
 
 PAPERS = ("PaperIRK", "PaperNewmark")
 ADAPTIVE = [name for name in PRESETS if name not in PAPERS]
@@ -50,8 +50,8 @@ def test_they_are_on_the_constraints(default_four_bar):
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7])
 def test_the_chunks_of_a_run_do_not_show(default_four_bar, chunk, monkeypatch):
     usual = run(default_four_bar, 1.0, t_eval=TIMES)
-    monkeypatch.setattr("twoloop.run.FIRST_CHUNK", chunk)
-    monkeypatch.setattr("twoloop.run.CHUNK_TIME", 0.0)  # chunks do not grow
+    monkeypatch.setattr("twoloop.run.run.FIRST_CHUNK", chunk)
+    monkeypatch.setattr("twoloop.run.run.CHUNK_TIME", 0.0)  # chunks do not grow
     other = run(default_four_bar, 1.0, t_eval=TIMES)
     assert (other.q == usual.q).all() and (other.lam == usual.lam).all()
 

@@ -26,7 +26,7 @@ def test_the_wheel_says_that_it_is_typed(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     with zipfile.ZipFile(tmp_path / build_wheel(str(tmp_path))) as wheel:
         names = set(wheel.namelist())
-    assert {"twoloop/py.typed", "twoloop/__init__.py", "twoloop/kernels/common.py"} <= names
+    assert {"twoloop/py.typed", "twoloop/__init__.py", "twoloop/kernels/data/common.py"} <= names
     assert {name.split("/")[0] for name in names} == {"twoloop", f"twoloop-{_version()}.dist-info"}
     assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from twoloop import ConstrainedSystem
-from twoloop.derivatives import check_derivatives, wrong_derivative
+from twoloop.checks.derivatives import check_derivatives, wrong_derivative
 
 TIME = 0.3
 TRIALS = 40

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import twoloop
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
 
 TEXT = (Path(__file__).parents[1] / "docs" / "reference.md").read_text(encoding="utf-8")
 ENTRIES = set(re.findall(r"^\.\. auto(?:class|function|exception):: (\S+)", TEXT, re.MULTILINE))

@@ -12,8 +12,8 @@ import pytest
 
 from tests.problems import pendulum, run, worst
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
-from twoloop.interrupts import CALLS_A_USER
 from twoloop.mechanisms import four_bar
+from twoloop.run.interrupts import CALLS_A_USER
 
 START = ([0.0, -1.0], [3.0, 0.0])
 OTHER = [1.0, 2.0, 1.5, 2.9]  # lengths of the default four-bar, its ground a little shorter

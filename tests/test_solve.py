@@ -17,8 +17,8 @@ from twoloop import (
     paper_newmark,
     solve_dae,
 )
-from twoloop.methods import PRESETS
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 # --- accuracy
 
@@ -244,7 +244,7 @@ def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, 
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
     t_end = 20.0 if method == "Gauss12" else 3.0  # a hundredth of which is longer than its steps
     whole = run(default_four_bar, t_end, **options)
-    monkeypatch.setattr("twoloop.run.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
+    monkeypatch.setattr("twoloop.run.run.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
     stats = whole.stats
     assert whole.rejected_error.sum() == stats.n_rejected_error
     assert whole.rejected_convergence.sum() == stats.n_rejected_convergence

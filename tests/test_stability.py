@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from twoloop import DOP853, ConstrainedSystem, Status, adams, dop853, solve_dae
-from twoloop.kernels import adams as kernels
-from twoloop.kernels import common
+from twoloop import DOP853, ConstrainedSystem, Status, solve_dae
+from twoloop.kernels.data import common
+from twoloop.kernels.steps import adams_step as kernels
 from twoloop.mechanisms import (
     bricard,
     closed_chain,
@@ -23,7 +23,8 @@ from twoloop.mechanisms import (
     spatial_four_bar,
     spatial_slider_crank,
 )
-from twoloop.stability import Looks, said_of_stiffness
+from twoloop.methods import adams, dop853
+from twoloop.run.stability import Looks, said_of_stiffness
 
 STIFF = "The problem looks stiff"
 METHODS = pytest.mark.parametrize("method", ["Adams", "DOP853"])
@@ -117,7 +118,7 @@ def test_a_stiff_spring_in_python_is_seen(method, monkeypatch):
     start = ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     messages = []
     for allowed in (0.0, np.inf):  # s of a chunk, from which on chunks do not grow
-        monkeypatch.setattr("twoloop.run.CHUNK_TIME", allowed)
+        monkeypatch.setattr("twoloop.run.run.CHUNK_TIME", allowed)
         result = solve_dae(stiff, (0.0, 0.3), *start, method=method, rtol=1e-4, atol=1e-4)
         messages.append(result.message)
     found = re.search(r"vibrations of (\S+) rad/s", result.message)

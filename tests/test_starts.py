@@ -8,15 +8,7 @@ import pytest
 
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
-from twoloop.mechanisms import (
-    andrews,
-    bricard,
-    four_bar,
-    heavy_top,
-    n_four_bar,
-    spatial_four_bar,
-    spatial_slider_crank,
-)
+from twoloop.mechanisms import andrews, bricard, four_bar, heavy_top, n_four_bar, spatial_four_bar, spatial_slider_crank
 
 STRETCHED = np.arccos(0.25)  # theta_3 at which bars 1 and 2 of the linkage of 0.8, 1.2, 1 and 2 m are in line
 CRANK = 8

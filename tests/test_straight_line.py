@@ -12,10 +12,15 @@ from hypothesis import strategies as st
 from numba import njit
 
 from tests.problems import pendulum, worst
-from twoloop import ConstrainedSystem, ConstraintWarning, caches, callback, straight_code
-from twoloop.kernels import calls
-from twoloop.kernels.common import BY_GENERAL, DONE
-from twoloop.llvm_trigonometry import LARGEST_ANGLE
+from twoloop import ConstrainedSystem, ConstraintWarning, callback
+from twoloop.generate import straight_code
+from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
+from twoloop.generate.straight_code import function_of, own_code
+from twoloop.generate.straight_line import Choice, Derivative, Factors, Outputs, Solution, StraightLine
+from twoloop.generate.tracing import Form, Graph
+from twoloop.kernels.compile import caches
+from twoloop.kernels.data.common import BY_GENERAL, DONE
+from twoloop.kernels.evaluation import calls
 from twoloop.mechanisms import (
     andrews,
     bricard,
@@ -28,12 +33,9 @@ from twoloop.mechanisms import (
     rolling_disc,
     spatial_four_bar,
 )
-from twoloop.methods import PRESETS
-from twoloop.run import Run
+from twoloop.methods.presets import PRESETS
+from twoloop.run.run import Run
 from twoloop.solve import solve_dae
-from twoloop.straight_code import function_of, own_code
-from twoloop.straight_line import Choice, Derivative, Factors, Outputs, Solution, StraightLine
-from twoloop.tracing import Form, Graph
 
 MECHANISMS = [
     four_bar,

@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 from tests.problems import pendulum as bare_pendulum
-from twoloop import ConstrainedSystem, callback, stage_code, straight_code, sweep, sweeps, workers
-from twoloop.digests import digest_of
+from twoloop import ConstrainedSystem, callback, sweep
+from twoloop.generate import stage_code, straight_code
 from twoloop.mechanisms import Problem
+from twoloop.sweeps import sweep as sweeps
+from twoloop.sweeps import workers
+from twoloop.sweeps.digests import digest_of
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 
@@ -144,7 +147,7 @@ PAIRS = {
 @pytest.mark.parametrize("name", PAIRS)
 def test_rows_of_another_function_of_the_same_name_are_refused(name, resumes, monkeypatch):
     first, second = PAIRS[name]
-    monkeypatch.setattr("twoloop.saved_sweep.described", lambda value: "the same words")
+    monkeypatch.setattr("twoloop.sweeps.saved_sweep.described", lambda value: "the same words")
     assert resumes(first, first)
     assert not resumes(first, second)
 
@@ -332,7 +335,7 @@ def swinging_under(gravity):
 
 
 def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
-    monkeypatch.setattr("twoloop.caches.MOST_HELD", 1)
+    monkeypatch.setattr("twoloop.kernels.compile.caches.MOST_HELD", 1)
     held, made = [], straight_code.OwnCode
 
     class Watched(made):

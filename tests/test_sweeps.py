@@ -5,8 +5,10 @@ import pytest
 
 import twoloop
 from tests.problems import pendulum as bare_pendulum
-from twoloop import saved_sweep, solve_dae, sweep, sweeps
+from twoloop import solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar, pendulum
+from twoloop.sweeps import saved_sweep
+from twoloop.sweeps import sweep as sweeps
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 

@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 
-from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 FAMILIES = {"gauss": gauss, "radau_iia": radau_iia, "sun_radau_iib": sun_radau_iib, "lobatto_iiie": lobatto_iiie}
 ORDERS = {

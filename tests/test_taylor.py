@@ -5,8 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from twoloop import ConstrainedSystem, Taylor, callback, consistent_state, series_code, solve_dae
-from twoloop.kernels.series import N_MEMORY_SCALARS
+from twoloop import ConstrainedSystem, Taylor, callback, consistent_state, solve_dae
+from twoloop.generate import series_code
+from twoloop.generate.series import series_program
+from twoloop.generate.straight_code import own_code
+from twoloop.kernels.steps.recurrences import N_MEMORY_SCALARS
 from twoloop.mechanisms import (
     andrews,
     bricard,
@@ -18,8 +21,6 @@ from twoloop.mechanisms import (
     rolling_disc,
     spatial_four_bar,
 )
-from twoloop.series import series_program
-from twoloop.straight_code import own_code
 
 FORCES = {
     "sine and cosine": lambda t, q, v: math.sin(q) * math.cos(2.0 * q),

@@ -9,12 +9,12 @@ import pytest
 
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, Status, callback
-from twoloop.calls_on_symbols import as_forms
-from twoloop.series import series_program
+from twoloop.generate.calls_on_symbols import as_forms
+from twoloop.generate.series import series_program
+from twoloop.generate.straight_code import own_code
+from twoloop.generate.traced_values import Traced
+from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.solve import solve_dae
-from twoloop.straight_code import own_code
-from twoloop.traced_values import Traced
-from twoloop.tracing import Graph, Untraceable
 
 WEIGHT = np.array([0.0, -9.81])
 START = {"t_span": (0.0, 0.3), "q0": [1.0, 0.0], "v0": [0.0, 0.0]}

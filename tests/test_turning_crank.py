@@ -10,7 +10,7 @@ from scipy.linalg import null_space
 from studies.energy_drift import drift, windows
 from twoloop import BDF, DOP853, Newmark, RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.tableaux import gauss
+from twoloop.methods.tableaux import gauss
 
 SPEED = 12.0  # rad/s of bar 3 at the start, enough for full turns
 T_END, H = 60.0, 0.0045  # s

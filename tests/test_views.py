@@ -14,7 +14,7 @@ import twoloop
 from tests.problems import pendulum, run, swing
 from twoloop import solve_dae
 from twoloop.mechanisms import knife_edge, rolling_disc
-from twoloop.plotting import violation
+from twoloop.result.plotting import violation
 
 pytest.importorskip("pandas")  # not among the oldest versions
 pytest.importorskip("matplotlib")

@@ -1,22 +1,23 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0."""
 
-from twoloop.bdf import BDF
-from twoloop.callbacks import callback
-from twoloop.certificate import Certificate, CertificateWarning
-from twoloop.citations import citation
-from twoloop.consistency import ConstraintWarning
-from twoloop.dop853 import DOP853
-from twoloop.drawing import Drawing
-from twoloop.esdirk import ESDIRK
-from twoloop.joints import Joint
-from twoloop.methods import Newmark, RungeKutta, paper_irk, paper_newmark
-from twoloop.projection import ConsistentState, consistent_state
-from twoloop.result import Result, Statistics, Status
+from twoloop.checks.consistency import ConstraintWarning
+from twoloop.kernels.compile.callbacks import callback
+from twoloop.methods.bdf import BDF
+from twoloop.methods.dop853 import DOP853
+from twoloop.methods.esdirk import ESDIRK
+from twoloop.methods.presets import Newmark, RungeKutta, paper_irk, paper_newmark
+from twoloop.methods.taylor import Taylor
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.certificate import Certificate, CertificateWarning
+from twoloop.result.citations import citation
+from twoloop.result.loading import load
+from twoloop.result.result import Result
+from twoloop.run.projection import ConsistentState, consistent_state
+from twoloop.run.record import Statistics, Status
 from twoloop.solve import solve_dae
-from twoloop.storage import load
-from twoloop.sweeps import sweep
-from twoloop.system import ConstrainedSystem
-from twoloop.taylor import Taylor
+from twoloop.sweeps.sweep import sweep
 
 __version__ = "0.1.0"
 

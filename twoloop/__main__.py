@@ -12,9 +12,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from twoloop import Result, __version__, kernels, solve_dae
-from twoloop.caches import folder_of
-from twoloop.methods import PRESETS
-from twoloop.user_file import problem_from
+from twoloop.kernels.compile.caches import folder_of
+from twoloop.mechanisms.user_file import problem_from
+from twoloop.methods.presets import PRESETS
 
 NEEDED = ("numpy", "scipy", "numba")
 OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask")

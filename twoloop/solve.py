@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks import (
+from twoloop.checks.arguments import (
     check_flag,
     check_positive,
     check_size,
@@ -20,18 +20,18 @@ from twoloop.checks import (
     check_vector,
     shown,
 )
-from twoloop.consistency import check_start, check_system
-from twoloop.events import check_events
-from twoloop.interrupts import Interrupts, not_begun
-from twoloop.kernels.intervals import ACCELERATIONS, VELOCITIES
-from twoloop.methods import PRESETS
-from twoloop.plan import Method
-from twoloop.recorder import Wanted
-from twoloop.result import Result
-from twoloop.run import Run
-from twoloop.straight_code import own_code
-from twoloop.system import ConstrainedSystem
-from twoloop.traced_values import Traced
+from twoloop.checks.consistency import check_start
+from twoloop.generate.straight_code import own_code
+from twoloop.generate.traced_values import Traced
+from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
+from twoloop.methods.plan import Method
+from twoloop.methods.presets import PRESETS
+from twoloop.problem.events import check_events
+from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.result.result import Result
+from twoloop.run.interrupts import Interrupts, not_begun
+from twoloop.run.recorder import Wanted
+from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
@@ -203,13 +203,14 @@ def solve_dae(
         with _progress_bar(progress, chosen.name, t0, t1) as report:
             lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
-            result = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
-        untested = result.untested if getattr(chosen, "tested", "all") == "positions" else None
+            record = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
+        untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)
         if own is not None:  # Newmark's own test, of positions, has its place
-            rtol, atol[:], untested = own, own, np.ones(len(result.h), dtype=bool)
-        return replace(result, method=chosen.name, rtol=float(rtol), atol=atol, untested=untested)
-    return not_begun(system, t0, event_functions, chosen.name)
+            rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
+        own = {"method": chosen.name, "rtol": float(rtol), "atol": atol, "untested": untested}
+        return Result(**vars(record) | own)
+    return Result(**vars(not_begun(system, t0, event_functions, chosen.name)))
 
 
 def check_method(method: str | Method) -> Method:

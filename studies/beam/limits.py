@@ -15,8 +15,8 @@ from studies.solvers import ERR_IN, PAPER_TOL
 from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import Problem, ancf_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent
-from twoloop.plan import Method
-from twoloop.tableaux import Tableau, sun_radau_iib
+from twoloop.methods.plan import Method
+from twoloop.methods.tableaux import Tableau, sun_radau_iib
 
 Row = dict[str, Any]
 

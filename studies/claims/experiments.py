@@ -15,7 +15,7 @@ from studies.beam.runs import without_tangent
 from studies.solvers import IMPLICIT
 from twoloop import ConstrainedSystem, ConstraintWarning, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar, knife_edge, moderately_stiff_beam, rolling_disc, very_flexible_beam
-from twoloop.tableaux import sun_radau_iib
+from twoloop.methods.tableaux import sun_radau_iib
 
 Array = NDArray[np.float64]
 

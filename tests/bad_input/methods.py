@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, Case, argument
 from twoloop import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark
-from twoloop.tableaux import Tableau, gauss, lobatto_iiie, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import Tableau, gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 
 def runge_kutta(tableau=None, **options):
@@ -28,8 +28,8 @@ METHODS = [
         lambda tableau: RungeKutta(tableau),
         "tableau",
         [
-            (None, TypeError, r"must be a twoloop.tableaux.Tableau.*given None", "give gauss(3), say"),
-            ("Gauss6", TypeError, "must be a twoloop.tableaux.Tableau.*given 'Gauss6'", "give gauss(3), say"),
+            (None, TypeError, r"must be a twoloop.methods.tableaux.Tableau.*given None", "give gauss(3), say"),
+            ("Gauss6", TypeError, "must be a twoloop.methods.tableaux.Tableau.*given 'Gauss6'", "give gauss(3), say"),
             (DOUBLE, ValueError, "must have distinct nodes", "take another tableau"),
         ],
     ),

@@ -24,7 +24,7 @@ from tests.bad_input.case import (
 )
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, Newmark, solve_dae
-from twoloop.tableaux import gauss
+from twoloop.methods.tableaux import gauss
 
 SOLVE = [
     *argument("solve_dae", solve, "q0", VECTORS),

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from twoloop import ConstrainedSystem
-from twoloop.callbacks import KINDS
+from twoloop.kernels.compile.callbacks import KINDS
 
 G = 9.81
 TIGHT = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}

@@ -11,7 +11,7 @@ from tests.general.faulty import without_inertia
 from tests.general.mechanism import G
 from tests.general.wrong_rows import ROWS, edge, slide
 from twoloop import solve_dae
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -9,7 +9,7 @@ from tests.bad_input.case import HUGE, WRONG, Case, argument
 from tests.general import knife_edge
 from tests.general.faulty import parted_drives, parted_velocities, without_inertia
 from twoloop import ConstrainedSystem, RungeKutta, consistent_state, solve_dae
-from twoloop.tableaux import gauss
+from twoloop.methods.tableaux import gauss
 
 GROUP = "Rows and inertia"
 

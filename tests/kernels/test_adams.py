@@ -20,7 +20,7 @@ from tests.problems import (
     worst,
 )
 from twoloop import solve_dae
-from twoloop.kernels import adams
+from twoloop.kernels.steps import adams_step as adams
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 LINKAGES = ["default_four_bar", "collinear_four_bar"]

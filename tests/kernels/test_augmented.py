@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-import twoloop.workspace as workspace_module
+import twoloop.run.workspace as workspace_module
 from studies.scaling import chain
 from tests.general.mechanisms import mechanism
 from tests.general.runs import error
 from tests.problems import force_residual, violations, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
-from twoloop.dop853 import DOP853
-from twoloop.kernels import common
-from twoloop.kernels.augmented import MANY, augmented_pays
+from twoloop.kernels.data import common
+from twoloop.kernels.evaluation.augmented import MANY, augmented_pays
 from twoloop.mechanisms import n_four_bar
-from twoloop.run import Run
+from twoloop.methods.dop853 import DOP853
+from twoloop.run.run import Run
 
 # every kind of row and of mass: redundant rows, driven ones, rows of velocities, a mass that varies and one without
 # inverse, Gamma by differences

@@ -3,14 +3,15 @@ import pytest
 
 from tests.problems import called, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
-from twoloop import workspace as workspace_module
-from twoloop.kernels import common, lapack
-from twoloop.kernels.banded import factor_bordered, lu_band, solve_bordered
+from twoloop.kernels.algebra import lapack
+from twoloop.kernels.algebra.banded import factor_bordered, lu_band, solve_bordered
+from twoloop.kernels.data import common
 from twoloop.kernels.layout import make_work
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
-from twoloop.methods import Newmark, RungeKutta
-from twoloop.run import Run
-from twoloop.tableaux import gauss, radau_iia
+from twoloop.methods.presets import Newmark, RungeKutta
+from twoloop.methods.tableaux import gauss, radau_iia
+from twoloop.run import workspace as workspace_module
+from twoloop.run.run import Run
 
 NEWTON = RungeKutta(radau_iia(3), outer="newton")
 

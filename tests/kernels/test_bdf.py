@@ -20,8 +20,8 @@ from tests.problems import (
     worst,
 )
 from twoloop import BDF, solve_dae
-from twoloop.bdf import BDF_HIGHEST
-from twoloop.kernels import bdf
+from twoloop.kernels.steps import bdf_step as bdf
+from twoloop.methods.bdf import BDF_HIGHEST
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 

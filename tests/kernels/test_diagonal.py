@@ -5,11 +5,11 @@ import pytest
 
 from tests.problems import worst
 from twoloop import ESDIRK, ConstrainedSystem, RungeKutta, solve_dae
-from twoloop.esdirk import FORMULAS
-from twoloop.kernels.diagonal import FILTERED
+from twoloop.kernels.steps.diagonal_step import FILTERED
 from twoloop.mechanisms import four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import tip_height
-from twoloop.tableaux import radau_iia
+from twoloop.methods.esdirk import FORMULAS
+from twoloop.methods.tableaux import radau_iia
 
 TIMES = np.linspace(0.1, 1.0, 10)
 

@@ -21,7 +21,7 @@ from tests.problems import (
     worst,
 )
 from twoloop import DOP853, ConstrainedSystem, solve_dae
-from twoloop.kernels import explicit
+from twoloop.kernels.steps import explicit_step as explicit
 from twoloop.mechanisms import very_flexible_beam
 
 STAGES = 12

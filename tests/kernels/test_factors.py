@@ -7,10 +7,19 @@ from hypothesis import strategies as st
 
 from studies.scaling import chain
 from tests.problems import entry
-from twoloop.dop853 import DOP853
-from twoloop.kernels import factors
-from twoloop.kernels.elimination import DENSE, FIRST_LOWER, N_HEAD, N_SLOTS, SIZE, WIDEST, index_size, values_size
-from twoloop.run import Run
+from twoloop.kernels.algebra import factors
+from twoloop.kernels.algebra.elimination import (
+    DENSE,
+    FIRST_LOWER,
+    N_HEAD,
+    N_SLOTS,
+    SIZE,
+    WIDEST,
+    index_size,
+    values_size,
+)
+from twoloop.methods.dop853 import DOP853
+from twoloop.run.run import Run
 
 make_program, factor = entry(factors.make_program), entry(factors.factor)
 solve, solve_transposed, sign_of = entry(factors.solve), entry(factors.solve_transposed), entry(factors.sign_of)

@@ -17,7 +17,7 @@ from tests.problems import (
     worst,
 )
 from twoloop import ConstrainedSystem, Newmark, RungeKutta, solve_dae
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 METHODS = {
     "irk": RungeKutta(sun_radau_iib(3), inner_tol=1e-9),

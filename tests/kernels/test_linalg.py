@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.problems import entry
-from twoloop.kernels import linalg
+from twoloop.kernels.algebra import linalg
 
 copy, lu_factor, lu_solve = (entry(helper) for helper in (linalg.copy, linalg.lu_factor, linalg.lu_solve))
 ldl_factor, ldl_solve = entry(linalg.ldl_factor), entry(linalg.ldl_solve)

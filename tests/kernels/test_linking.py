@@ -4,8 +4,8 @@ import numba
 from numba import types
 from numba.core.types.functions import Function
 
-from twoloop.kernels.common import OPTIONS, compiled, merged
-from twoloop.linking import KernelCompiler
+from twoloop.kernels.compile.linking import KernelCompiler
+from twoloop.kernels.data.common import OPTIONS, compiled, merged
 
 
 @compiled

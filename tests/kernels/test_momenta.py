@@ -22,9 +22,11 @@ from tests.problems import (
     worst,
 )
 from twoloop import RungeKutta, solve_dae
-from twoloop.kernels import advance, common, momenta
+from twoloop.kernels import advance
+from twoloop.kernels.data import common
 from twoloop.kernels.layout import make_work
-from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+from twoloop.kernels.steps import canonical_step as momenta
+from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 SYMPLECTIC = {"Sun": sun_radau_iib(3), "Gauss": gauss(3), "Lobatto": lobatto_iiie(4), "midpoint": gauss(1)}
 START = np.array([0.7, -0.4, 1.1, -0.6])  # angles and momenta of the double pendulum

@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from tests.problems import G, moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, violations, worst
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar, moderately_stiff_beam
-from twoloop.methods import PRESETS
-from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 TABLEAUX = {
     tableau.name: tableau

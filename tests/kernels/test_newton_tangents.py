@@ -9,12 +9,12 @@ from scipy.linalg import block_diag
 
 from tests.problems import called, kit_of, oblique_pendulum, oblique_start, without_tangent, worst
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
-from twoloop import workspace as workspace_module
-from twoloop.kernels import common
+from twoloop.kernels.data import common
 from twoloop.kernels.layout import make_work
-from twoloop.kernels.newton_tangents import tangent_by_q, tangent_by_v
+from twoloop.kernels.steps.newton_tangents import tangent_by_q, tangent_by_v
 from twoloop.mechanisms import moderately_stiff_beam, very_flexible_beam
-from twoloop.tableaux import gauss, radau_iia
+from twoloop.methods.tableaux import gauss, radau_iia
+from twoloop.run import workspace as workspace_module
 
 NEWTON = RungeKutta(radau_iia(3), outer="newton")
 STIFFNESS, DAMPING = 1e4, 30.0

@@ -7,7 +7,7 @@ import pytest
 
 from tests.problems import moving_pivot, moving_pivot_state, worst
 from twoloop import BDF, DOP853, ESDIRK, Newmark, RungeKutta, solve_dae
-from twoloop.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 START = (0.4, 0.0)  # the angle stays below half a radian, and so the independent coordinate the same
 TIMES = np.linspace(0.25, 2.0, 8)

@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 from references.four_bar_minimal import trajectory
 from tests.problems import called, kit_of, worst
 from twoloop import RungeKutta, solve_dae
-from twoloop.kernels import advance, common
+from twoloop.kernels import advance
+from twoloop.kernels.data import common
+from twoloop.kernels.evaluation.partition import full_pivoting, scale_rows
 from twoloop.kernels.layout import make_work
-from twoloop.kernels.partition import full_pivoting, scale_rows
 from twoloop.mechanisms import four_bar
-from twoloop.tableaux import gauss, lobatto_iiie, sun_radau_iib
+from twoloop.methods.tableaux import gauss, lobatto_iiie, sun_radau_iib
 
 seeds = st.integers(0, 2**32 - 1)
 

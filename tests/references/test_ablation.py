@@ -20,7 +20,7 @@ from tests.problems import (
 )
 from twoloop import Status
 from twoloop.mechanisms import four_bar
-from twoloop.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
 PAPER, FROZEN, PROJECTED, STABILISED, UNPROJECTED = VARIANTS
 TABLEAUX = {tableau.name: tableau for tableau in (sun_radau_iib(3), gauss(2), radau_iia(3))}

@@ -18,7 +18,7 @@ from references.ida_c import solve_ida_c
 from references.index1 import METHODS, solve_index1
 from tests.problems import pendulum, worst
 from twoloop.mechanisms import four_bar, very_flexible_beam
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 PROBLEM = four_bar()
 LONG = 1e6  # s of motion: none of the solvers is there within the limits below

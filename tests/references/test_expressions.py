@@ -12,7 +12,7 @@ from references.ode import ode_result
 from references.straight_line import Program, Value, program_of, straight_line
 from studies.validation import MAKE
 from twoloop import ConstrainedSystem, Statistics
-from twoloop.callbacks import callback
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import double_pendulum, four_bar, heavy_top, n_four_bar, very_flexible_beam
 
 NUMBERS = functions_of(math)  # "expressions" that are numbers

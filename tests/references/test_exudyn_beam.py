@@ -17,7 +17,7 @@ from references.exudyn_four_bar import SOLVERS, solve_exudyn
 from references.ida import solve_ida
 from twoloop.mechanisms import ancf_beam, four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 TIMES = np.arange(11) / 10.0
 STEPS = 2000  # of Exudyn; twice as many move the tip of the cable by 1.2e-5 m

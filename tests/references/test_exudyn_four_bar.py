@@ -8,7 +8,7 @@ import pytest
 from references.exudyn_four_bar import SOLVERS, solve_exudyn
 from references.four_bar_minimal import MinimalFourBar
 from twoloop.mechanisms import four_bar
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 # largest position error at 10 s with h = 1e-3, about twice what was measured (peers.md gives the first two too)
 BOUNDS = {

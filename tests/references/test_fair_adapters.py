@@ -19,7 +19,7 @@ from studies.solvers import CATALOGUE, RIVALS
 from studies.validation import MAKE
 from tests.problems import pendulum
 from twoloop.mechanisms import four_bar, projection_pendulum
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 FOUR_BAR, PENDULUM = four_bar(), projection_pendulum()
 

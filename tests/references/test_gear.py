@@ -22,9 +22,9 @@ from tests.problems import (
     violations,
     worst,
 )
-from twoloop.caches import watch
+from twoloop.kernels.compile.caches import watch
 from twoloop.mechanisms import four_bar
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 PROBLEM = four_bar()
 

@@ -9,7 +9,7 @@ from references.four_bar_minimal import MinimalFourBar
 from references.ida import FORMS, solve_ida
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 TOLERANCES = (1e-5, 1e-7, 1e-9)

@@ -16,7 +16,7 @@ from references.ida_c import OUTPUTS, solve_ida_c
 from references.ida_compiled import iteration_matrix_at, residual_at
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 PROBLEM = four_bar()
 # largest error of q at 1001 instants over 10 s: three times the largest of 15 runs that differ in rounding

@@ -21,7 +21,7 @@ from tests.problems import (
     worst,
 )
 from twoloop.mechanisms import four_bar
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 # position error at 10 s with the tolerances 1e-6 and 1e-8: three times what was measured, the scatter of tolerances

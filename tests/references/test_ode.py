@@ -5,10 +5,10 @@ import pytest
 
 from references.ode import ode_result
 from twoloop import mechanisms, solve_dae
-from twoloop.result import Statistics
+from twoloop.run.record import Statistics
 
 
-@pytest.mark.filterwarnings("ignore::twoloop.consistency.ConstraintWarning")
+@pytest.mark.filterwarnings("ignore::twoloop.checks.consistency.ConstraintWarning")
 @pytest.mark.parametrize("make", [mechanisms.double_pendulum, mechanisms.redundant_slider_crank])
 def test_accelerations_and_multipliers_are_those_of_least_norm(make):
     problem = make()

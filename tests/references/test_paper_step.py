@@ -6,7 +6,7 @@ import pytest
 from references.paper_step import Step, advance, independents, true_states
 from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.tableaux import sun_radau_iib
+from twoloop.methods.tableaux import sun_radau_iib
 
 SUN = sun_radau_iib(3)
 H, LOOPS = 0.02, 1e-12

@@ -18,12 +18,7 @@ from references.straight_line import straight_line, straight_line_jacobian
 from studies.figures import STYLES
 from studies.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
 from twoloop import ConstrainedSystem, callback
-from twoloop.mechanisms import (
-    double_pendulum,
-    four_bar,
-    projection_pendulum,
-    spatial_slider_crank,
-)
+from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
 
 FOUR_BAR = four_bar()
 PENDULUM = projection_pendulum()

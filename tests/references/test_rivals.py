@@ -11,7 +11,7 @@ from references.heyoka_taylor import solve_heyoka
 from references.index1 import solve_index1
 from twoloop import ConstrainedSystem, callback
 from twoloop.mechanisms import four_bar, rolling_disc
-from twoloop.result import Status
+from twoloop.run.record import Status
 
 PROBLEM = four_bar()
 T_END = PROBLEM.reference.t

@@ -21,7 +21,7 @@ from studies.cli import Call, StudyError
 from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
 from studies.store import Output
 from twoloop import solve_dae
-from twoloop.tableaux import gauss, sun_radau_iib
+from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 W_MAX = {SOFT: 3358.5, STIFF: 33585.0}
 

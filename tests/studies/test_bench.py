@@ -18,7 +18,7 @@ from studies.store import KeptRows
 from tests.problems import pendulum, pendulum_energy, pendulum_state, worst
 from twoloop import Status, solve_dae
 from twoloop.mechanisms import Problem
-from twoloop.mechanisms.problem import Reference
+from twoloop.problem.problem import Reference
 
 T_END = 1.0
 

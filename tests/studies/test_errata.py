@@ -11,7 +11,7 @@ from references.paper_step import Step, choice, independents, kkt, true_states
 from studies.claims import ERRATA
 from studies.render import render
 from twoloop.mechanisms import four_bar, very_flexible_beam
-from twoloop.tableaux import sun_radau_iib
+from twoloop.methods.tableaux import sun_radau_iib
 
 SUN = sun_radau_iib(3)
 PHASES = 20  # instants of a period at which an equation is looked at

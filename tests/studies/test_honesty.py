@@ -25,7 +25,7 @@ from studies.traps import (
     under_forces,
 )
 from twoloop import solve_dae
-from twoloop.methods import PRESETS
+from twoloop.methods.presets import PRESETS
 
 TRAPS = {trap.name: trap for trap in traps(quick=True)}
 SOUND = TRAPS["redundant row"]

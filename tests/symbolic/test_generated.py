@@ -11,8 +11,9 @@ import pytest
 import sympy as sp
 from sympy.physics.mechanics import dynamicsymbols
 
-from twoloop import generated, solve_dae
-from twoloop.generated import GeneratedCode
+from twoloop import solve_dae
+from twoloop.problem import generated
+from twoloop.problem.generated import GeneratedCode
 from twoloop.symbolic import from_lagrangian
 from twoloop.symbolic.equations import Equations
 

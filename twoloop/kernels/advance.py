@@ -5,15 +5,8 @@
 
 import numpy as np
 
-from twoloop.kernels.calls import (
-    accelerations,
-    check_redundant,
-    find_tangents,
-    prepare_mass,
-    renew_partition,
-    take_midpoint,
-)
-from twoloop.kernels.common import (
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.data.common import (
     AUGMENTED,
     BY_GENERAL,
     DEFECT,
@@ -54,10 +47,17 @@ from twoloop.kernels.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.differences import representable
-from twoloop.kernels.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
-from twoloop.kernels.linalg import copy
-from twoloop.kernels.partition import CHANGED, partition_is_poor
+from twoloop.kernels.evaluation.calls import (
+    accelerations,
+    check_redundant,
+    find_tangents,
+    prepare_mass,
+    renew_partition,
+    take_midpoint,
+)
+from twoloop.kernels.evaluation.gamma import representable
+from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
+from twoloop.kernels.evaluation.partition import CHANGED, partition_is_poor
 
 # what advance() returns; PAUSED: a buffer is full, or MAX_ATTEMPTS were made
 (

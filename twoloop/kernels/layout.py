@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.kernels.common import N_COUNTERS, N_NOTES, WORK, Work
-from twoloop.kernels.elimination import index_size, values_size
-from twoloop.kernels.kinks import PARTS
-from twoloop.kernels.lapack import N_ROUTINES
+from twoloop.kernels.algebra.elimination import index_size, values_size
+from twoloop.kernels.algebra.lapack import N_ROUTINES
+from twoloop.kernels.data.common import N_COUNTERS, N_NOTES, WORK, Work
+from twoloop.kernels.evaluation.kinks import PARTS
 
 
 def make_work(

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from twoloop.mechanisms.knife_edge import knife_edge
     from twoloop.mechanisms.n_four_bar import n_four_bar
     from twoloop.mechanisms.pendulum import pendulum, projection_pendulum
-    from twoloop.mechanisms.problem import Condition, Problem, Reference
     from twoloop.mechanisms.rolling_disc import rolling_disc
     from twoloop.mechanisms.slider_crank import driven_slider_crank, redundant_slider_crank
     from twoloop.mechanisms.spatial_four_bar import spatial_four_bar
     from twoloop.mechanisms.spatial_slider_crank import spatial_slider_crank
     from twoloop.mechanisms.sundials_slider_crank import sundials_slider_crank
+    from twoloop.problem.problem import Condition, Problem, Reference
 
 _ELSEWHERE = {  # names that are not those of their modules
     "Condition": "problem",

@@ -16,10 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.callbacks import callback
-from twoloop.checks import check_number, check_positive, check_size
-from twoloop.drawing import Drawing
-from twoloop.joints import Joint
+from twoloop.checks.arguments import check_number, check_positive, check_size
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.ancf_element import (
     FALL,
     FOURTH,
@@ -36,8 +34,10 @@ from twoloop.mechanisms.ancf_element import (
     mass,
 )
 from twoloop.mechanisms.points import LinearPoints
-from twoloop.mechanisms.problem import Array, Problem
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint
+from twoloop.problem.problem import Array, Problem
+from twoloop.problem.system import ConstrainedSystem
 
 __all__ = [
     "ancf_beam",

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.callbacks import callback
-from twoloop.kernels.common import compiled
-from twoloop.mechanisms.problem import Array
+from twoloop.kernels.compile.callbacks import callback
+from twoloop.kernels.data.common import compiled
+from twoloop.problem.problem import Array
 
 # places in p: length of an element; lambda + 2 mu, lambda and mu times the area of the cross-section, N; means of y^2
 # and y^4 over the thickness; mass of a unit of length, kg/m; gravity along -y, m/s^2

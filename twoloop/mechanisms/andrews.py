@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.callbacks import callback
-from twoloop.drawing import Drawing
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Array, Problem, Reference
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.problem import Array, Problem, Reference
+from twoloop.problem.system import ConstrainedSystem
 
 # kg, kg m^2, m, N/m, N m
 M1, M2, M3, M4, M5, M6, M7 = 0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498

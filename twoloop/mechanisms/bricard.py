@@ -7,11 +7,11 @@ model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity along -y.
 
 import numpy as np
 
-from twoloop.joints import Joint
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.points import box
-from twoloop.mechanisms.problem import Array, Problem
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
+from twoloop.problem.joints import Joint
+from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81
 WIDTH = 0.1  # m, of the bars

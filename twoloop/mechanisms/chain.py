@@ -5,10 +5,10 @@ import math
 import numpy as np
 from scipy.optimize import brentq
 
-from twoloop.checks import check_size
+from twoloop.checks.arguments import check_size
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Array, Problem
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81
 N_MOST = 20

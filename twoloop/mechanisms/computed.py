@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.mechanisms.problem import Reference
+from twoloop.problem.problem import Reference
 
 FILE = Path(__file__).with_name("references.json")
 

@@ -7,10 +7,10 @@ import cmath
 
 import numpy as np
 
-from twoloop.description import body_names
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
-from twoloop.mechanisms.problem import Problem
+from twoloop.problem.description import body_names
+from twoloop.problem.problem import Problem
 
 GRAVITY = 9.81
 CRANK, ROD = 0.3, 1.0  # m

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.callbacks import callback
-from twoloop.checks import check_finite, check_vector
-from twoloop.description import body_names
-from twoloop.drawing import Drawing
-from twoloop.joints import Joint
+from twoloop.checks.arguments import check_finite, check_vector
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import GROUND, BodyPoints
-from twoloop.mechanisms.problem import Array, Problem, Reference
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.description import body_names
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint
+from twoloop.problem.problem import Array, Problem, Reference
+from twoloop.problem.system import ConstrainedSystem
 
 GRAVITY = 9.81  # m/s^2
 DENSITY = 1.0  # kg/m

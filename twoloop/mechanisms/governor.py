@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Problem
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.problem.problem import Problem
 
 GRAVITY = 9.81  # m/s^2, along -z
 DENSITY = 3000.0  # kg/m^3

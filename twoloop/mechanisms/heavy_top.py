@@ -3,9 +3,9 @@
 import numpy as np
 
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Problem, Reference
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.problem.problem import Problem, Reference
 
 GRAVITY = 9.81
 MASS, LENGTH = 15.0, 1.0  # kg; m from the fixed point to the centre of mass, along y

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.callbacks import callback
-from twoloop.drawing import Drawing
-from twoloop.joints import Joint
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import BodyPoints
-from twoloop.mechanisms.problem import Array, Problem, Reference
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint
+from twoloop.problem.problem import Array, Problem, Reference
+from twoloop.problem.system import ConstrainedSystem
 
 GRAVITY = 9.81
 MASS, INERTIA, SLOPE, SPIN = 1.3, 0.2, 0.4, 1.7  # kg, kg m^2, rad, rad/s

@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import ellipj, ellipk
 
-from twoloop.checks import check_size
-from twoloop.description import body_names
+from twoloop.checks.arguments import check_size
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
-from twoloop.mechanisms.problem import Array, Condition, Problem, Reference
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.problem.description import body_names
+from twoloop.problem.problem import Array, Condition, Problem, Reference
 
 GRAVITY = 9.81
 SETS = ("tips", "bodies")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ellipj, ellipk
 
-from twoloop.checks import check_finite
-from twoloop.mechanisms.problem import Array, Condition, Problem, Reference
+from twoloop.checks.arguments import check_finite
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.problem.problem import Array, Condition, Problem, Reference
 
 CVODE_GRAVITY = 13.7503716360407456549801915596211144  # (2 K(m = 1/2))^2: a quarter of the period is 1/2
 

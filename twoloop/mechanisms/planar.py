@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.caches import helper
-from twoloop.callbacks import callback
-from twoloop.drawing import Drawing
-from twoloop.joints import Joint, unused
+from twoloop.kernels.compile.caches import helper
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import Sketch
-from twoloop.mechanisms.problem import Array
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint, unused
+from twoloop.problem.problem import Array
+from twoloop.problem.system import ConstrainedSystem
 
 PIN = 0.0  # both points coincide: two rows
 DISTANCE = 1.0  # half the squared distance of the points is `value`: one row

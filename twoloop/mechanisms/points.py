@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.drawing import Drawing
-from twoloop.mechanisms.problem import Array
 from twoloop.mechanisms.rotation import rotated
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.problem import Array
 
 GROUND = -1
 

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.caches import helper
-from twoloop.callbacks import callback
-from twoloop.drawing import Drawing
-from twoloop.joints import Joint
+from twoloop.kernels.compile.caches import helper
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import LinearPoints
-from twoloop.mechanisms.problem import Array
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint
+from twoloop.problem.problem import Array
+from twoloop.problem.system import ConstrainedSystem
 
 Scalar = Mapping[int | None, float]  # coordinate to coefficient; None: a constant
 ONE: Scalar = {None: 1.0}

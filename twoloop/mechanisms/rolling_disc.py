@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.callbacks import callback
-from twoloop.drawing import Drawing
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Array, Problem
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.problem import Array, Problem
+from twoloop.problem.system import ConstrainedSystem
 
 GRAVITY = 9.81
 MASS, RADIUS = 2.0, 0.4  # kg, m

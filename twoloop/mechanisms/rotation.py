@@ -8,8 +8,8 @@ Systems (1988), Sect. 6.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.caches import helper
-from twoloop.mechanisms.problem import Array
+from twoloop.kernels.compile.caches import helper
+from twoloop.problem.problem import Array
 
 
 @helper

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twoloop.description import body_names
 from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
-from twoloop.mechanisms.problem import Array, Problem, Reference
+from twoloop.problem.description import body_names
+from twoloop.problem.problem import Array, Problem, Reference
 
 GRAVITY = 9.81
 CRANK, ROD = 0.5, 1.2  # m

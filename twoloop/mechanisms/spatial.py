@@ -13,8 +13,8 @@ body -1. The mass matrix has the rank 6 of 7 for each body, 4 G^T J G being of r
 
 import numpy as np
 
-from twoloop.caches import helper
-from twoloop.callbacks import callback
+from twoloop.kernels.compile.caches import helper
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.rotation import half_spin, pulled, rotated, rotated_rate
 
 POINT = 0.0  # point a of body i is point b of body j: three rows

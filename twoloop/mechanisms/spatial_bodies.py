@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.drawing import Drawing
-from twoloop.joints import Joint, unused
 from twoloop.mechanisms import spatial
 from twoloop.mechanisms.points import Sketch
-from twoloop.mechanisms.problem import Array
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint, unused
+from twoloop.problem.problem import Array
+from twoloop.problem.system import ConstrainedSystem
 
 NAMES = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
 

@@ -9,9 +9,9 @@ import math
 import numpy as np
 
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Array, Problem
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81  # m/s^2, along -z
 CRANK, ROCKER = 0.3, 0.7  # m

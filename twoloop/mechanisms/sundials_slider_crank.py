@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.callbacks import callback
-from twoloop.drawing import Drawing
+from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
-from twoloop.mechanisms.problem import Array, Problem, Reference
-from twoloop.system import ConstrainedSystem
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.problem import Array, Problem, Reference
+from twoloop.problem.system import ConstrainedSystem
 
 # p = [a, J1, m2, J2, k, c, l0, F]: half of the crank's length over the rod's, and so on; all in units of the example
 PARAMETERS = {"a": 0.5, "J1": 1.0, "m2": 1.0, "J2": 2.0, "k": 1.0, "c": 1.0, "l0": 1.0, "F": 1.0}

@@ -12,13 +12,13 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 from sympy import Basic
 
-from twoloop.checks import check_flag, check_text, check_vector
-from twoloop.generated import GeneratedCode, GeneratedEnergy
-from twoloop.mechanisms.problem import Problem
-from twoloop.projection import consistent_state
+from twoloop.checks.arguments import check_flag, check_text, check_vector
+from twoloop.problem.generated import GeneratedCode, GeneratedEnergy
+from twoloop.problem.problem import Problem
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.projection import consistent_state
 from twoloop.symbolic.equations import Equations
 from twoloop.symbolic.reading import Reader, number
-from twoloop.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
-from twoloop.callbacks import KINDS
+from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.symbolic.differentiation import Entries
 
 # SymPy's functions that the equations may have, with their names in math and numpy

@@ -9,7 +9,7 @@ from sympy import Derivative, Expr, Symbol
 from sympy.core.function import AppliedUndef
 from sympy.core.relational import Equality
 
-from twoloop.checks import check_number
+from twoloop.checks.arguments import check_number
 from twoloop.symbolic.differentiation import Differentiation
 from twoloop.symbolic.printing import FUNCTIONS
 

@@ -1,0 +1,156 @@
+"""No compiled callback goes out of the bounds of its arrays: machine code would read or write other memory.
+
+Each callback first runs once in Python, its compiled helpers too, where an index too large is an `IndexError`; what
+runs only compiled is compiled a second time with numba's own check. Branches that are not taken then are not seen.
+"""
+
+import linecache
+import types
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from twoloop.kernels.compile.caches import names_in, of_library
+from twoloop.kernels.compile.callbacks import KINDS
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+OWN = {"twoloop.checks.bounds", "twoloop.generate.tracing", "twoloop.generate.calls_on_symbols"}
+MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
+
+
+def check_bounds(system: "ConstrainedSystem", t: float, q: Array, v: Array) -> None:
+    """Run every compiled callback of a system once at (t, q, v) where bounds are watched; later calls do nothing.
+
+    Raises
+    ------
+    ValueError
+        Naming the callback, the index and the sizes of its arrays.
+    """
+    state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
+    for kind, entry in KINDS.items():
+        check_callback(system, kind, t, [state[name] for name in entry.state])
+
+
+def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list[Array]) -> None:
+    """Run one callback as `check_bounds` does all."""
+    if system.called_in_python or kind in system.within_bounds:
+        return
+    function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
+    changed: list[int] = []
+    error = _index_error(function, t, state, p, out, changed)
+    if changed:
+        names = " and ".join([*KINDS[kind].state, "p"][i] for i in changed)
+        raise ValueError(
+            f"{kind} of {system.name!r} must not change the arrays that it is given: it changes {names}. Copy first"
+        )
+    if error is not None:
+        longer = np.concatenate([p, np.ones(MANY)])
+        too_short = _index_error(function, t, state, longer, out) is None
+        filled = ", ".join(f"{name} has shape {x.shape}" for (name, _), x in zip(KINDS[kind].outputs, out, strict=True))
+        sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
+        raise ValueError(
+            f"{kind} of {system.name!r} goes out of bounds: {error}{place_of(error)}. {', '.join(sizes)}, p has "
+            f"{p.size}, {filled} (n_q = {system.n_q}, n_c = {system.n_c})"
+            + (". Give more `parameters`: it reads more of them than there are" if too_short else "")
+        )
+    system.within_bounds.add(kind)
+
+
+def _index_error(
+    function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array], changed: list[int] | None = None
+) -> IndexError | None:
+    """The first index out of bounds, if there is one. To `changed` goes which of `state` and `p` a callback changes."""
+    for wrap in (_in_python, _with_bounds_checked):
+        given = [array.copy() for array in (*state, p)]
+        try:
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
+                warnings.simplefilter("ignore")
+                Rewritten(wrap).value(function)(t, *given, *(array.copy() for array in out))
+        except IndexError as error:
+            return error
+        except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called
+            continue
+        if changed is not None:
+            changed += [
+                i for i, (one, other) in enumerate(zip(given, (*state, p), strict=True)) if (one != other).any()
+            ]
+        return None
+    return None
+
+
+def _in_python(function: types.FunctionType) -> Any:
+    return function
+
+
+def _with_bounds_checked(function: types.FunctionType) -> Any:
+    return njit(boundscheck=True, error_model="numpy")(function)
+
+
+class Rewritten:
+    """Copies of functions with other ones in the place of the compiled helpers that they name or enclose."""
+
+    functions: tuple[type, ...] = (Dispatcher,)  # what is copied
+
+    def __init__(self, wrap: Callable[[types.FunctionType], Any]):
+        self.wrap = wrap
+        self.known: dict[Any, Any] = {}
+
+    def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
+        """What stands in the place of a value; `names` are those in the code that names it."""
+        if isinstance(value, self.functions):
+            if id(value) not in self.known:
+                self._rewrite(value)
+            return self.known[id(value)]
+        if type(value) is tuple:
+            return tuple(self.value(each, names) for each in value)
+        if isinstance(value, types.ModuleType) and not of_library(value.__name__):
+            return self._module(value, names)
+        return value
+
+    def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
+        """A copy of a module with other functions in the place of those of these names."""
+        key = (id(module), names)
+        if key not in self.known:
+            self.known[key] = copy = types.ModuleType(module.__name__)
+            vars(copy).update(vars(module))
+            vars(copy).update({name: self.value(vars(module)[name], names) for name in names & set(vars(module))})
+        return self.known[key]  # type: ignore[no-any-return]
+
+    def _rewrite(self, helper: Any) -> None:
+        function = getattr(helper, "py_func", helper)
+        names = frozenset(names_in(function.__code__))
+        cells = tuple(types.CellType() for _ in function.__closure__ or ())
+        own_globals = dict(function.__globals__)
+        copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
+        copy.__kwdefaults__ = function.__kwdefaults__
+        self.known[id(helper)] = self.wrap(copy)  # before what it names, which may be itself
+        for name in names & set(own_globals):
+            own_globals[name] = self.value(own_globals[name], names)
+        if function.__defaults__ is not None:
+            copy.__defaults__ = self.value(function.__defaults__, names)
+        for cell, original in zip(cells, function.__closure__ or (), strict=True):
+            cell.cell_contents = self.value(original.cell_contents, names)
+
+
+def place_of(error: BaseException) -> str:
+    """The line of a callback in which an error arose, where Python knows it; its file, but for an index."""
+    trace, frames = error.__traceback__, []
+    while trace is not None:
+        module = trace.tb_frame.f_globals.get("__name__") or ""
+        if module not in OWN and not of_library(module):
+            frames.append((trace.tb_frame.f_code.co_filename, trace.tb_lineno))
+        trace = trace.tb_next
+    if not frames:
+        return ""
+    file, line = frames[-1]
+    source = linecache.getline(file, line).strip()
+    return f", in `{source}` ({file}, line {line})" if source else ""

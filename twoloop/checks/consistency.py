@@ -1,0 +1,242 @@
+"""The check of a start: consistent, of full rank, finite; and what is wrong with a system at a point."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space, qr
+
+from twoloop.checks.bounds import check_bounds
+from twoloop.checks.derivatives import check_derivatives, unsymmetric_mass
+from twoloop.checks.scales import EPS, Scales, scales_of
+from twoloop.kernels.compile.callbacks import KINDS
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
+CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
+ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+
+
+class ConstraintWarning(UserWarning):
+    """Constraints of a system depend on one another: those left out are checked, and multipliers are not unique."""
+
+
+def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, derivatives: bool = True) -> None:
+    """Call every callback once at the start and check shapes, finiteness, rank, consistency and, if asked, derivatives.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Naming the callback or the argument, what was found and what to do.
+    """
+    check_bounds(system, t0, q0, v0)
+    system.check_returned(t0, q0, v0)
+    jacobian = system.jacobian(t0, q0)
+    rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
+    reason = not_finite(system, t0, q0, v0)
+    if reason is not None:
+        raise ValueError(f"at the start, t = {t0:g}, {reason}")
+    unsymmetric = unsymmetric_mass(system, t0, q0)
+    if unsymmetric is not None:
+        raise ValueError(unsymmetric)
+    if system.n_c > 0:
+        scales = scales_of(system, t0, q0, jacobian)
+        Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")
+    if derivatives:
+        check_derivatives(system, t0, q0)
+    empty = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) == 0.0).tolist()
+    if empty:
+        raise ValueError(
+            f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "
+            "there. Leave these constraints out, or start from another position"
+        )
+    if system.n_a > 0:
+        scales = scales_of(system, t0, q0, rows)
+    if len(rows) > 0:
+        Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
+
+
+class Violation:
+    """What a state violates, as the change of coordinates (or velocities) that would put it right.
+
+    Attributes
+    ----------
+    correction : ndarray (n_q,)
+        The Newton correction, by least squares with C_q, coordinates weighted by their scales.
+    allowed : ndarray (n_q,)
+        How much of it is accepted: 1e-8 of the mechanism's size, and rounding.
+    left : ndarray (n_c,)
+        What the correction leaves, where rows of C_q depend on one another or are zero; `allowed_left` with it.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t: float,
+        equation: str,
+        values: Array,
+        terms: Array,
+        jacobian: Array,
+        scales: Scales,
+        per_row: Array,
+        spacing: Array,
+    ):
+        self.system, self.t, self.equation, self.values = system, t, equation, values
+        scaled = scales.scaled(jacobian)
+        inverse = np.linalg.pinv(scaled, rcond=1e-10)
+        self.correction = -scales.columns * (inverse @ (values / scales.rows))
+        by_rounding = scales.columns * (np.abs(inverse) @ (terms / scales.rows)) + spacing
+        self.allowed = CONSISTENT * scales.by_coordinate(per_row, jacobian) + ROUNDING * EPS * by_rounding
+        self.left = np.abs(values + jacobian @ self.correction) / scales.rows
+        self.allowed_left = CONSISTENT * per_row + ROUNDING * EPS * terms / scales.rows
+
+    @classmethod
+    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
+        """C(t, q) at a position."""
+        terms = np.abs(jacobian) @ np.abs(q)
+        values = system.constraint(t, q)
+        return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
+
+    @classmethod
+    def of_velocity(
+        cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
+    ) -> Violation:
+        """C_q v + C_t and A v + b, beside what is fast there: velocities, drives, what forces can bring about."""
+        rate = system.rates(t, q)
+        fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+        mass, force = system.mass(t, q), system.force(t, q, v)
+        try:
+            np.linalg.cholesky(mass)
+            pull = np.linalg.solve(mass, force)
+        except np.linalg.LinAlgError:  # no inertia in some directions, which the constraints exclude
+            pull = np.linalg.lstsq(mass, force, rcond=1e-12)[0]
+        falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
+        speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
+        terms = np.abs(jacobian) @ np.abs(v) + np.abs(rate)
+        values = jacobian @ v + rate
+        return cls(
+            system,
+            t,
+            "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)",
+            values,
+            terms,
+            jacobian,
+            scales,
+            speeds,
+            np.abs(v),
+        )
+
+    @property
+    def excess(self) -> float:
+        """The largest correction over what is accepted; at most 1 where the state is consistent."""
+        parts = [(np.abs(self.correction), self.allowed), (self.left, self.allowed_left)]
+        return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
+
+    def refuse(self, name: str) -> None:
+        """Raise unless the state is consistent."""
+        with np.errstate(divide="ignore"):
+            excess = self.excess
+        if excess <= 1.0:
+            return
+        row = int(np.abs(self.values).argmax())
+        j = int((np.abs(self.correction) / np.maximum(self.allowed, 1e-300)).argmax())
+        of = "coordinate" if name == "q0" else "the velocity of coordinate"
+        raise ValueError(
+            f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
+            f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; to put it right {of} {j} has to change by "
+            f"{abs(self.correction[j]):.3g}, and at most {self.allowed[j]:.1g} is accepted. Project it with "
+            "twoloop.consistent_state(system, t, q, v)"
+        )
+
+
+def redundant_rows(scaled: Array) -> list[int]:
+    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    if scaled.size == 0:
+        return []
+    R, order = qr(scaled.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diagonal(R))
+    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
+    return sorted(order[rank:].tolist())
+
+
+def in_words(jacobian: Array, redundant: list[int]) -> str:
+    """Which rows depend on which others, with the coefficients."""
+    others = [i for i in range(len(jacobian)) if i not in redundant]
+    equations = []
+    for i in redundant[:5]:
+        factors = np.linalg.lstsq(jacobian[others].T, jacobian[i], rcond=None)[0] if others else np.zeros(0)
+        share = np.abs(factors) * np.linalg.norm(jacobian[others], axis=1) if others else np.zeros(0)
+        terms = [
+            f"{factor:.4g} row {k}"
+            for k, factor, part in zip(others, factors, share, strict=True)
+            if part > 1e-9 * np.linalg.norm(jacobian[i])
+        ]
+        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
+    more = ", ..." if len(redundant) > 5 else ""
+    return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
+
+
+def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
+    """Which rows of C_q(t, q) depend on the others, in words."""
+    jacobian = system.rows(t, q)
+    rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
+    if rows:
+        return in_words(jacobian, rows)
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    return (
+        "or so nearly that Newton cannot tell: its smallest singular value at the last state is "
+        f"{values[-1] / values[0]:.1g} of the largest"
+    )
+
+
+def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float, str]:
+    """Smallest over largest eigenvalue of T^T M T, and which coordinates move in the motion that it belongs to."""
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    free = null_space(rows) if len(rows) > 0 else np.eye(system.n_q)
+    if free.shape[1] == 0:
+        return 1.0, "the constraints allow no motion"
+    energies, motions = np.linalg.eigh(free.T @ mass @ free)
+    motion = np.abs(free @ motions[:, 0])
+    coordinates = np.flatnonzero(motion > 0.1 * motion.max()).tolist()
+    return float(energies[0] / max(energies[-1], np.finfo(np.float64).tiny)), (
+        f"a motion of coordinate(s) {coordinates}, which the constraints allow, has next to no inertia, or a negative "
+        f"one: the smallest eigenvalue of T^T M T is {energies[0]:.3g}, the largest {energies[-1]:.3g}"
+    )
+
+
+def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q)."""
+    found = np.zeros((system.n_c + system.n_a, system.n_q))
+    size = np.maximum(np.abs(q), np.abs(q).max())
+    for share, direction in zip(NEARBY, _directions(system.n_q), strict=True):
+        try:
+            found[system.rows(t, q + share * size * direction) != 0.0] = 1.0
+        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
+            continue
+    return found
+
+
+@cache
+def _directions(n_q: int) -> Array:
+    """Ways in which positions near one lie, (len(NEARBY), n_q): always the same."""
+    return np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+
+
+def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
+    """Which callbacks give values that are not finite at (t, q, v); None: all are."""
+    state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
+    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in system.given}
+    wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in _parts(value))]
+    return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None

@@ -1,0 +1,428 @@
+"""Is what a system says about itself true? C_q, C_t, Q_d and tangents against differences, M symmetric, bandwidth.
+
+A wrong sign in one of them often runs to the end and looks like a motion. Every entry is compared at the start, and
+along a run one direction through all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
+from twoloop.checks.scales import column_scales, sizes
+from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+ANYWHERE = (0, 1, -1)  # around the place; where the callbacks are not defined there, after it or before it
+FORWARD = (1, -1)  # for times at the start: callbacks need not work before it
+TIME = 0.1  # s: first guess at how fast constraints move
+NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
+FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
+ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
+UNSYMMETRIC = 1e-10  # of the largest entry of M
+SAME = 1e-11  # relative: values that two callbacks must share
+ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
+
+WHAT = {
+    "jacobian": "the derivative of constraint with respect to q",
+    "constraint_rate": "the derivative of constraint with respect to t",
+    "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = gamma",
+    "nonholonomic_gamma": "-((A v)_q v + A_t v + b_q v + b_t), the right-hand side of A a = nonholonomic_gamma",
+    "force_by_q": "the derivative of force with respect to q",
+    "force_by_v": "the derivative of force with respect to v",
+    "reaction_by_q": "the derivative of C_q^T lam with respect to q",
+}
+HINTS = {
+    "constraint_rate": ", or give constraint_rate: the constraints depend on time",
+    "gamma": ", or leave gamma out to have it differenced",
+    "nonholonomic_gamma": ", or leave nonholonomic_gamma out to have it differenced",
+    "force_by_q": ", or leave all tangents out to have the force differenced",
+    "reaction_by_q": ", or leave reaction_by_q out to have it differenced",
+}
+
+
+def check_derivatives(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare the callbacks of a system with one another near (t, q), at velocities that stand for any.
+
+    Every entry is compared on its own, with a displacement that suits it; one that differences cannot decide is
+    accepted. C_q comes first, then C_t, then gamma, whose check relies on both. A few dozen calls of each callback for
+    each coordinate, once for each system.
+
+    Raises
+    ------
+    ValueError
+        Naming the callback, the entry, the value given and the one differenced.
+    """
+    if system.checked:
+        return
+    wrong = _wrong_constraint(system, t, q, FORWARD) or _wrong_tangent(system, t, q) or _unsymmetric_near(system, t, q)
+    if wrong is not None:
+        raise ValueError(wrong)
+    _check_kinematics(system, t, q)
+    _check_constant_mass(system, t, q)
+    if system.bandwidth is not None:
+        _check_bandwidth(system, system.bandwidth, t, q)
+    system.checked = True
+
+
+def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
+    """Say which of C_q, C_t, gamma and M is wrong at a state of a run, or None: formulas may hold near the start only.
+
+    One direction through all coordinates and time stands for all entries, so that this costs as a rule nine calls of
+    `constraint`, ten of `jacobian` and of `constraint_rate` and one of `gamma`, whatever n_q. Only where the direction
+    shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they decide
+    whether Newton's method converges, not what it converges to.
+    """
+    unsymmetric = None if system.constant_mass else unsymmetric_mass(system, t, q)
+    if unsymmetric is not None:
+        return unsymmetric
+    jacobian, rate = system.rows(t, q), system.rates(t, q)
+    if jacobian.size == 0 or not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+        return None
+    n_c = system.n_c
+    generic = _generic_velocities(jacobian, rate, q)[-1]
+    generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
+    scale = min(TIME, _time_scale(q, generic))
+    noise = EPS * (np.abs(jacobian) @ np.abs(q))[:n_c]
+    given = (jacobian @ generic + rate)[:n_c]
+    spacing = _spacing(t, q, generic)
+    suspicious = False
+    if n_c > 0:
+        found = _along_a_run(_along(system, t, q, generic), scale, noise, given, spacing)
+        suspicious = found.disagrees(given, EPS * (np.abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
+    for kind, rows in _gammas(system):
+        if suspicious:
+            break
+        right = _defined(lambda kind=kind: system.evaluate(kind, t, q, generic))  # type: ignore[misc]
+        if right is None:
+            return None
+        given = -right
+        noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
+        rate_along = _along_a_line(system, t, q, generic, rows)
+        found = _along_a_run(rate_along, scale, noise, given, spacing)
+        suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
+    return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
+
+
+def _along_a_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
+    largest = np.abs(given)
+    return differentiate(function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ANYWHERE, most=ALONG_A_RUN)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """One column of what a callback gives, and the function whose derivative it should be."""
+
+    system: ConstrainedSystem
+    kind: str
+    t: float
+    function: Function
+    place: float
+    given: Array
+    column: int | None = None
+    spacing: float = 0.0
+
+    def wrong(self, scale: float, noise: Array, largest: Array, rounding: Array, sides: tuple[int, ...]) -> str | None:
+        """Say which entry is wrong, or None."""
+        best = differentiate(
+            self.function, self.place, scale, noise, self.given, largest, spacing=self.spacing, sides=sides
+        )
+        ratio = best.disagrees(self.given, rounding)
+        for entry in np.argsort(-ratio):
+            if ratio[entry] <= 1.0:
+                return None
+            given = float(self.given[entry])
+            if confirms(self.function, self.place, int(entry), best, given, noise, self.spacing):
+                return self._message(int(entry), best)
+        return None
+
+    def _message(self, row: int, best: Estimate) -> str:
+        entry = row if self.column is None else (row, self.column)
+        hint = HINTS.get(self.kind, "")
+        if self.kind == "force_by_v" and self.system.functions.flags[FORCE_BY_V_GIVEN] == 0:
+            hint = ", that is, give force_by_v: beside force_by_q the force may depend on v only with it"
+        given, found = _as_far_as_they_differ(float(self.given[row]), float(best.slope[row]))
+        return (
+            f"{self.kind} of {self.system.name!r} is not {WHAT[self.kind]}: entry {entry} is {given}, by "
+            f"differences it is {found} with an error of about {best.error[row]:.1g} (near t = "
+            f"{self.t:.10g}; velocities are chosen at random). Correct its formula{hint}"
+        )
+
+
+def _as_far_as_they_differ(one: float, other: float) -> tuple[str, str]:
+    """Two numbers, to the third digit of their difference: those behind it are rounding, or of no interest."""
+    if not 0.0 < abs(one - other) < np.inf:
+        return f"{one:.3g}", f"{other:.3g}"
+    places = 2 - math.floor(math.log10(abs(one - other)))
+    return f"{round(one, places) + 0.0:.16g}", f"{round(other, places) + 0.0:.16g}"
+
+
+def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
+    """Which entry of C_q, C_t or gamma is wrong: the first of them that is, because each relies on those before."""
+    wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
+    if wrong is not None:
+        return wrong
+    jacobian, rate = system.rows(t, q), system.rates(t, q)
+    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+        return None
+    for kind, rows in _gammas(system):
+        for v in _generic_velocities(jacobian, rate, q):
+            given = _defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
+            if given is None:
+                continue
+            noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
+            rounding = _rounding(lambda x, kind=kind, v=v: system.evaluate(kind, t, x, v), given, q)  # type: ignore[misc]
+            turned = _minus(_along_a_line(system, t, q, v, rows))
+            compared = _Comparison(system, kind, t, turned, 0.0, given, spacing=_spacing(t, q, v))
+            wrong = compared.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
+            if wrong is not None:
+                return wrong
+    return None
+
+
+def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """Say which entry of M is not that of its transpose, or None."""
+    mass = system.mass(t, q)
+    off = np.abs(mass - mass.T)
+    if not off.max() > UNSYMMETRIC * np.abs(mass).max():
+        return None
+    i, j = sorted(int(each) for each in np.unravel_index(int(off.argmax()), off.shape))
+    return (
+        f"mass of {system.name!r} must be symmetric; at t = {t:.10g} its entry {(i, j)} is {mass[i, j]:.9g} and its "
+        f"entry {(j, i)} is {mass[j, i]:.9g}"
+    )
+
+
+def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """The same a little off the start, where what is zero there shows."""
+    near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
+    if system.constant_mass or _defined(lambda: system.mass(t, near)) is None:
+        return None
+    wrong = unsymmetric_mass(system, t, near)
+    return None if wrong is None else f"{wrong} (near the start: at q = {near})"
+
+
+def _gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
+    """The right-hand sides of the acceleration constraints that are given, and the rows they belong to."""
+    rows = {"gamma": slice(0, system.n_c), "nonholonomic_gamma": slice(system.n_c, None)}
+    return [(kind, part) for kind, part in rows.items() if kind in system.given]
+
+
+def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
+    """Which entry of C_q or C_t is wrong."""
+    jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
+    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+        return None  # outside what they are made for; at a state of the run consistency.py names it
+    wrong = _wrong_column(system, "jacobian", t, q, lambda x: system.constraint(t, x), lambda x: system.jacobian(t, x))
+    if wrong is not None:
+        return wrong
+    noise = EPS * (np.abs(jacobian) @ np.abs(q))
+    rounding = _rounding(lambda x: system.constraint_rate(t, x), rate, q)
+    in_t = _Comparison(system, "constraint_rate", t, lambda s: system.constraint(t + s, q), t, rate)
+    return in_t.wrong(TIME, noise, np.abs(rate), rounding, sides)
+
+
+def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """Which entry of the tangents that are given is wrong."""
+    if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
+        return None
+    generic = np.random.default_rng(1)
+    v = sizes(q) * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    if _defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
+        q = q + NEAR_START * v
+
+    def force_in_q(x: Array) -> Array:
+        return system.force(t, x, v)
+
+    def force_in_v(x: Array) -> Array:
+        return system.force(t, q, x)
+
+    wrong = _wrong_column(system, "force_by_q", t, q, force_in_q, lambda x: system.force_by_q(t, x, v))
+    if wrong is None and (system.functions.flags[FORCE_BY_V_GIVEN] == 1 or _varies(force_in_v, v)):
+        wrong = _wrong_column(system, "force_by_v", t, v, force_in_v, lambda x: system.force_by_v(t, q, x))
+    if wrong is not None or system.functions.flags[REACTION_BY_Q_GIVEN] == 0:
+        return wrong
+    lam = np.linspace(1.0, 2.0, system.n_c)
+
+    def reaction_in_q(x: Array) -> Array:
+        return lam @ system.jacobian(t, x)
+
+    return _wrong_column(system, "reaction_by_q", t, q, reaction_in_q, lambda x: system.reaction_by_q(t, x, lam))
+
+
+def _defined(function: Callable[[], Array]) -> Array | None:
+    """What a callback gives away from the state, or None: there it may be outside what it is made for."""
+    try:
+        value = function()
+    except Exception:
+        return None
+    return value if np.isfinite(value).all() else None
+
+
+def _varies(function: Callable[[Array], Array], x: Array) -> bool:
+    """Whether a function changes along one direction, which is cheaper to see than by all columns."""
+    values = [_defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
+    known = [value for value in values if value is not None]
+    return any(bool((value != known[0]).any()) for value in known)
+
+
+def _wrong_column(
+    system: ConstrainedSystem,
+    kind: str,
+    t: float,
+    x: Array,
+    function: Callable[[Array], Array],
+    derivative: Callable[[Array], Array],
+) -> str | None:
+    """Displace one coordinate (or velocity) after another and compare the columns of a matrix."""
+    given = _defined(lambda: derivative(x))
+    if given is None:
+        return None
+    noise = EPS * (np.abs(given) @ np.abs(x))
+    largest = np.abs(given).max(axis=1)
+    rounding = _rounding(derivative, given, x)
+    scales = sizes(x)
+    for j in range(len(x)):
+        unit = np.zeros(len(x))
+        unit[j] = 1.0
+
+        def displaced(shift: float, unit: Array = unit) -> Array:
+            return function(x + shift * unit)
+
+        column = _Comparison(system, kind, t, displaced, float(x[j]), given[:, j], j)
+        wrong = column.wrong(float(scales[j]), noise, largest, rounding[:, j], ANYWHERE)
+        if wrong is not None:
+            return wrong
+    return None
+
+
+def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> Array:
+    """What rounding of the arguments does to the values given."""
+    largest = EPS * np.abs(given)
+    for signs in np.random.default_rng(2).choice((-2.0, 2.0), (3, len(x))):
+        try:
+            moved = np.abs(derivative(x * (1.0 + EPS * signs)) - given)
+        except Exception:  # the place is the edge of what the callbacks are made for
+            continue
+        largest = np.fmax(largest, moved)
+    return largest
+
+
+def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
+    """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
+    generic = np.random.default_rng(1)
+    v = column_scales(jacobian, sizes(q)) * generic.uniform(0.5, 1.5, len(q)) * generic.choice((-1.0, 1.0), len(q))
+    v = v / float(np.median(np.abs(v) / sizes(q)))
+    driven, moved = rate != 0.0, np.abs(jacobian) @ np.abs(v)
+    if not (driven & (moved > 0.0)).any():
+        return [v]
+    faster = float(np.median(np.abs(rate[driven & (moved > 0.0)]) / moved[driven & (moved > 0.0)]))
+    return [v, min(faster, FASTEST) * v]
+
+
+def _time_scale(q: Array, v: Array) -> float:
+    """Time in which no coordinate moves by more than its size, s."""
+    return float((sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
+
+
+def _spacing(t: float, q: Array, v: Array) -> float:
+    """Time from which on a straight motion moves every coordinate by more than rounding, s."""
+    return max(float(np.spacing(abs(t))), float((np.spacing(np.abs(q)) / np.maximum(np.abs(v), 1e-300)).max()))
+
+
+def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
+    """C along a straight motion."""
+    return lambda s: system.constraint(t + s, q + s * v)
+
+
+def _along_a_line(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
+    """Rows of C_q v + C_t and A v + b along a straight motion."""
+    return lambda s: system.velocity_constraint(t + s, q + s * v, v)[rows]
+
+
+def _minus(function: Function) -> Function:
+    return lambda s: -function(s)
+
+
+def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare the fused callback with the separate ones, which were compared with differences before."""
+    if "kinematics" not in system.given:
+        return
+    v = _generic_velocities(system.jacobian(t, q), system.constraint_rate(t, q), q)[-1]
+    for place in (q, q + NEAR_START * v):
+        separate = {
+            "constraint": system.constraint(t, place),
+            "jacobian": system.jacobian(t, place),
+            "constraint_rate": system.constraint_rate(t, place),
+            "gamma": system.gamma(t, place, v),
+        }
+        size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # of the terms in a constraint
+        for fused, (kind, given) in zip(system.kinematics(t, place, v), separate.items(), strict=True):
+            off = np.abs(fused - given)
+            level = SAME * np.abs(given).max(initial=0.0) + (100.0 * size if kind == "constraint" else 0.0)
+            if (off > level).any():
+                entry = np.unravel_index(int((off - level).argmax()), off.shape)
+                where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
+                here, there = _as_far_as_they_differ(float(fused[entry]), float(given[entry]))
+                raise ValueError(
+                    f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
+                    f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
+                )
+
+
+def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
+    if not system.constant_mass:
+        return
+    shift = 0.1 * sizes(q) * np.random.default_rng(1).choice((-1.0, 1.0), system.n_q)
+    there = _defined(lambda: system.mass(t + 1.0, q + shift))
+    if there is not None and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
+        raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+
+
+def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
+    """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
+    places = np.arange(system.n_q)
+    farthest, where = bandwidth, ""
+    size = float(np.abs(q).max()) or 1.0
+    generic = np.random.default_rng(1)
+    v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    q, shift = q + 1e-3 * v, 1e-3 * size
+
+    def look(what: str, j: int, column: Array, level: float) -> None:
+        nonlocal farthest, where
+        distances = np.where(np.isfinite(column) & (np.abs(column) > level), np.abs(places - j), 0)
+        if distances.max() > farthest:
+            i = int(distances.argmax())
+            farthest, where = int(distances[i]), f"{what} has the entry ({i}, {j}) = {column[i]:.6g}"
+
+    for j, column in enumerate(system.mass(t, q).T):
+        look("M", j, column, 0.0)
+    for j in range(system.n_q):
+        step = np.where(places == j, shift, 0.0)
+        try:
+            force, jacobian = system.force(t, q, v), system.jacobian(t, q)
+            by_q, by_v = system.force(t, q + step, v) - force, system.force(t, q, v + step) - force
+            change = system.jacobian(t, q + step) - jacobian
+        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
+            continue
+        level = ROUNDING * float(np.abs(force).max()) / shift
+        look("the derivative of force by q", j, by_q / shift, level)
+        look("the derivative of force by v", j, by_v / shift, level)
+        level = ROUNDING * float(np.abs(jacobian).max(initial=0.0)) / shift
+        for k in range(system.n_c):
+            look(f"the second derivative of constraint {k} by q", j, change[k] / shift, level)
+    if where:
+        raise ValueError(
+            f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "
+            "coordinates otherwise, or leave bandwidth out"
+        )

@@ -1,0 +1,54 @@
+"""Sine and cosine as LLVM code without a call, so that those of several angles are computed side by side."""
+
+from llvmlite import ir
+
+from twoloop.generate.llvm_code import DOUBLE, INTEGER, Emitter, Value
+
+# sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
+# sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
+LARGEST_ANGLE = 1e6  # beyond, the sum is not enough
+HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
+SINES = (
+    -1.66666666666666307295e-1,
+    8.33333333332211858878e-3,
+    -1.98412698295895385996e-4,
+    2.75573136213857245213e-6,
+    -2.50507477628578072866e-8,
+    1.58962301576546568060e-10,
+)
+COSINES = (
+    4.16666666666665929218e-2,
+    -1.38888888888730564116e-3,
+    2.48015872888517045348e-5,
+    -2.75573141792967388112e-7,
+    2.08757008419747316778e-9,
+    -1.13585365213876817300e-11,
+)
+
+
+def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
+    """Both, right to rounding for angles up to LARGEST_ANGLE."""
+    builder = emit.builder
+    turns = emit.function("rint", builder.fmul(x, DOUBLE(1.0 / HALF_PI[0])))
+    rest = x
+    for part in HALF_PI:
+        rest = builder.fma(turns, DOUBLE(-part), rest)
+    square = builder.fmul(rest, rest)
+    sine = builder.fma(builder.fmul(square, rest), _polynomial(emit, square, SINES), rest)
+    cosine = builder.fma(square, DOUBLE(-0.5), DOUBLE(1.0))
+    cosine = builder.fma(builder.fmul(square, square), _polynomial(emit, square, COSINES), cosine)
+    quarter = builder.fptosi(turns, INTEGER)
+    odd, following = builder.trunc(quarter, ir.IntType(1)), builder.add(quarter, INTEGER(1))
+    made = []
+    for one, other, number in ((cosine, sine, quarter), (sine, cosine, following)):
+        sign = builder.shl(builder.and_(number, INTEGER(2)), INTEGER(62))
+        bits = builder.bitcast(builder.select(odd, one, other), INTEGER)
+        made.append(builder.bitcast(builder.xor(bits, sign), DOUBLE))
+    return made[0], made[1]
+
+
+def _polynomial(emit: Emitter, x: Value, coefficients: tuple[float, ...]) -> Value:
+    total: Value = DOUBLE(coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = emit.builder.fma(total, x, DOUBLE(coefficient))
+    return total

@@ -1,0 +1,298 @@
+"""The program by which the Taylor series of a mechanism's motion is found, made of its callbacks once.
+
+What each order needs, see taylor_step.py: G = [C_q; A] and its rates, M and Q. The entries of G and M are forms of
+quantities that depend on time and coordinates ("early"); Q may depend on velocities too ("late"). G v and
+G^T lam + M a are written as few products: terms that share a factor are one product.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.traced_values import Traced
+from twoloop.generate.tracing import COSINE, PENDING, SINE, Form, Graph, Untraceable, symbols
+from twoloop.kernels.data.common import GIVEN
+from twoloop.problem.system import ConstrainedSystem
+
+Integers = NDArray[np.int64]
+Array = NDArray[np.float64]
+
+MOST = 20_000  # operations; with more the program would take longer to make than a run
+
+
+class Sums(NamedTuple):
+    """Forms: each its first term, then what more there is, row by row."""
+
+    column: Integers  # of the first term
+    coefficient: Array
+    constant: Array
+    row: Integers  # of the further terms
+    more_column: Integers
+    more_coefficient: Array
+
+
+@dataclass(frozen=True)
+class Table:
+    """Operations in an order in which they can be done; their results are quantities side by side.
+
+    Attributes
+    ----------
+    groups : ndarray (n, 7)
+        Kind, first and end of operations that do not depend on one another, and of the further terms of their first and
+        second forms. Sines are followed by the cosines of the same angles, in one group. The last group are products
+        that wait for the solution of an order.
+    first, second : Sums
+        Arguments of the operations.
+    """
+
+    groups: Integers
+    first: Sums
+    second: Sums
+
+
+@dataclass(frozen=True)
+class SeriesProgram:
+    """See the head of this file. Quantities: t, q, v, a, lam, results of `early`, results of `late`.
+
+    Attributes
+    ----------
+    n_q, n_rows : int
+    early : Table
+        Ends with the products of G v.
+    late : Table
+        Ends with those of G^T lam + M a.
+    rows, row_places : Sums, ndarray
+        G v + G_t, but for multiples of v: those that are not zero, and which they are.
+    balance, balance_places : Sums, ndarray
+        Q - G^T lam - M a, but for multiples of lam and a, likewise.
+    traced : Traced or None
+        What the callbacks gave.
+    """
+
+    n_q: int
+    n_rows: int
+    early: Table
+    late: Table
+    rows: Sums
+    row_places: Integers
+    balance: Sums
+    balance_places: Integers
+    traced: Traced | None = None
+
+    @property
+    def n_operations(self) -> int:
+        """Number of operations, products of G v and G^T lam + M a among them."""
+        return len(self.early.first.column) + len(self.late.first.column)
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of quantities."""
+        return 1 + 3 * self.n_q + self.n_rows + self.n_operations
+
+    @cached_property
+    def digest(self) -> str:
+        """That of all its numbers."""
+        digest = hashlib.sha256(repr((self.n_q, self.n_rows)).encode())
+        tables = [each for table in (self.early, self.late) for each in (table.groups, *table.first, *table.second)]
+        for array in (*tables, *self.rows, self.row_places, *self.balance, self.balance_places):
+            digest.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
+        return digest.hexdigest()
+
+
+def series_program(system: ConstrainedSystem) -> SeriesProgram:
+    """The program of a system, of callbacks that do not branch on t, q or v.
+
+    Raises
+    ------
+    Untraceable
+        Naming the callback, and why its equations cannot be had.
+    """
+    for kind, size in (("jacobian", system.n_c), ("nonholonomic", system.n_a)):
+        if size and not system.functions.flags[GIVEN[kind]]:
+            raise Untraceable(f"{system.name!r} does not give {kind}, which is needed")
+    graph, n, n_rows = Graph(), system.n_q, system.n_c + system.n_a
+    (t,), q = graph.inputs(1, False), graph.inputs(n, False)
+    v, a, lam = graph.inputs(n, True), graph.inputs(n, True), graph.inputs(n_rows, True)
+    made = {}
+    for kind, shape, state in (
+        ("mass", (n, n), (q,)),
+        ("force", (n,), (q, v)),
+        ("jacobian", (system.n_c, n), (q,)),
+        ("constraint_rate", (system.n_c,), (q,)),
+        ("nonholonomic", (system.n_a, n), (q,)),
+        ("nonholonomic_rate", (system.n_a,), (q,)),
+    ):
+        made[kind] = on_symbols(system, graph, kind, shape, t, *state)
+    G = np.vstack([made["jacobian"], made["nonholonomic"]])
+    rates = [*made["constraint_rate"], *made["nonholonomic_rate"]]
+    row_products: dict[Any, Any] = {}
+    rows = [_sum_of_products(graph, G[i], v, rates[i], row_products) for i in range(n_rows)]
+    reaction_products: dict[Any, Any] = {}
+    balance = []
+    for i in range(n):
+        factors, others = [-each for each in G[:, i]], list(lam)
+        factors += [-each for each in made["mass"][i]]
+        balance.append(_sum_of_products(graph, factors, [*others, *a], made["force"][i], reaction_products))
+    program = _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
+    return replace(program, traced=Traced(system, graph))
+
+
+def on_symbols(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any) -> Any:
+    """What a callback makes of symbols, as an array of forms.
+
+    Raises
+    ------
+    Untraceable
+        If it does not run on them.
+    """
+    out = np.full(shape, 0.0, dtype=object)
+    arrays, p = [symbols(each) for each in state], system.parameters.copy()
+    if 0 not in shape:
+        try:
+            if not system.called_in_python:
+                trace(getattr(system.functions, kind), t, *arrays, p, out)
+            elif kind in system.python_functions:
+                out = np.array(trace(system.python_functions[kind], t, *arrays), dtype=object)
+            out = as_forms(graph, out)
+            if out.shape != shape:
+                raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
+        except Untraceable as error:
+            raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
+    graph.traced.setdefault(kind, out.copy())
+    return out
+
+
+def _sum_of_products(
+    graph: Graph, factors: Sequence[Form], others: Sequence[Form], rest: Form, known: dict[Any, Any]
+) -> Form:
+    """rest + sum_i factors[i] others[i] with few products, which go into `known`: by factor, or by what is in these."""
+    total = rest
+    by_factor: dict[Any, tuple[Form, Form]] = {}
+    by_quantity: dict[Any, tuple[Form, Form]] = {}
+    for factor, other in zip(factors, others, strict=True):
+        if factor.constant != 0.0:
+            total = total + other.times(factor.constant)
+        if not factor.terms:
+            continue
+        varying = Form(graph, 0.0, factor.terms)
+        scale, form = varying.normalised()
+        _collect(by_factor, form, other.times(scale))
+        for i, c in factor.terms.items():
+            _collect(by_quantity, Form(graph, 0.0, {i: 1.0}), other.times(c))
+    groups = by_factor if len(by_factor) <= len(by_quantity) else by_quantity
+    for factor, other in groups.values():
+        if other.terms:
+            scale, other = other.normalised()
+            key = (factor.key, other.key)
+            if key not in known:
+                known[key] = (*graph.inputs(1, True), factor, other)
+            total = total + known[key][0].times(scale)
+    return total
+
+
+def _collect(groups: dict[Any, tuple[Form, Form]], factor: Form, other: Form) -> None:
+    before = groups.get(factor.key)
+    groups[factor.key] = (factor, other if before is None else before[1] + other)
+
+
+def _assembled(
+    graph: Graph,
+    n: int,
+    n_rows: int,
+    rows: list[Form],
+    balance: list[Form],
+    row_products: dict[Any, Any],
+    reaction_products: dict[Any, Any],
+) -> SeriesProgram:
+    early: list[Any] = []
+    late: list[Any] = []
+    for i, operation in enumerate(graph.operations):
+        if operation is not None:
+            (late if graph.late[i] else early).append((i, *operation))
+    if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST:
+        raise Untraceable(f"its equations are more than {MOST} operations")
+    tables = [
+        [*_ordered(operations), (PENDING, [(next(iter(form.terms)), *factors) for form, *factors in products.values()])]
+        for operations, products in ((early, row_products), (late, reaction_products))
+    ]
+    n_inputs = 1 + 3 * n + n_rows
+    place = {i: i for i in range(n_inputs)}
+    for groups in tables:
+        for _, members in groups:
+            for node, *_ in members:
+                place[node] = len(place)
+    v_and_a = range(1 + n, 1 + 3 * n)
+    return SeriesProgram(
+        n,
+        n_rows,
+        _table(tables[0], place),
+        _table(tables[1], place),
+        *_scattered([_without(form, v_and_a) for form in rows], place),
+        *_scattered([_without(form, range(1 + 2 * n, n_inputs)) for form in balance], place),
+    )
+
+
+def _scattered(forms: list[Form], place: dict[int, int]) -> tuple[Sums, Integers]:
+    """Those forms that are not zero, and which they are."""
+    kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
+    sums = _sums([forms[k] for k in kept], place)
+    places = np.array(kept, dtype=np.int64)
+    return sums._replace(row=places[sums.row]), places
+
+
+def _without(form: Form, inputs: range) -> Form:
+    """A form less its multiples of inputs whose coefficients of the order in question are not known yet."""
+    return Form(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
+
+
+def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
+    """Operations in groups by level and kind: what a group depends on is made by groups before it."""
+    own = {node for node, *_ in operations}
+    level: dict[int, int] = {}
+    groups: dict[tuple[int, int], list[Any]] = {}
+    for node, kind, first, second in operations:  # made in an order in which they can be done
+        used = [i for form in (first, second) if form is not None for i in form.terms if i in own]
+        level[node] = 1 + max((level[i] for i in used), default=0)
+        if second is None:
+            second = Form(first.graph, 0.0, {})
+        groups.setdefault((level[node], kind), []).append((node, first, second))
+    ordered = []
+    for (number, kind), members in sorted(groups.items()):
+        if kind == COSINE:
+            continue
+        if kind == SINE:
+            cosines = {first.key: node for node, first, _ in groups[number, COSINE]}
+            members += [(cosines[first.key], first, second) for _, first, second in members]
+        ordered.append((kind, members))
+    return ordered
+
+
+def _table(groups: list[tuple[int, list[Any]]], place: dict[int, int]) -> Table:
+    members = [each for _, group in groups for each in group]
+    sums = [_sums([each[k] for each in members], place) for k in (1, 2)]
+    rows, begin = [], 0
+    for kind, group in groups:
+        end = begin + len(group)
+        more = [bound for each in sums for bound in np.searchsorted(each.row, [begin, end])]
+        rows.append([kind, begin, end, *more])
+        begin = end
+    return Table(np.array(rows, dtype=np.int64), *sums)
+
+
+def _sums(forms: list[Form], place: dict[int, int]) -> Sums:
+    terms = [[(place[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
+    more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
+    return Sums(
+        np.array([each[0][0] for each in terms], dtype=np.int64),
+        np.array([each[0][1] for each in terms], dtype=float),
+        np.array([form.constant for form in forms], dtype=float),
+        np.array([each[0] for each in more], dtype=np.int64),
+        np.array([each[1] for each in more], dtype=np.int64),
+        np.array([each[2] for each in more], dtype=float),
+    )

@@ -1,0 +1,523 @@
+"""The equations of one mechanism as straight-line code: what it would take to write them down, without loops.
+
+The callbacks run once in Python on symbols (`twoloop.generate.tracing`). The matrix of
+
+    [M  G^T] [a  ]   [Q    ]
+    [G  0  ] [lam] = [Gamma]
+
+with G = [C_q; A] is eliminated symbolically, without what is zero by its structure, in an order found once: a row of G
+after all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search. A
+row is nearly a combination of others where its pivot is small against the one that it has without them; there the code
+is not to be used. The same factors give the nearest position and velocity on the constraints, in the metric of M. Where
+M is singular, rows g of G are added, M + g^T g, which changes neither. Of redundant rows those that count are kept.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.series import on_symbols
+from twoloop.generate.traced_values import Traced
+from twoloop.generate.tracing import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    LOGARITHM,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+    SUM,
+    Form,
+    Graph,
+    Untraceable,
+)
+from twoloop.kernels.data.common import GIVEN
+from twoloop.kernels.evaluation.inner import CONTRADICTS
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
+RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
+NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
+ROUNDING = 1e-8  # smallest pivot that is not nearly lost to rounding
+MOST = 20_000  # operations
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What code is to compute from t, q and v: arrays, and conditions that are to hold.
+
+    Attributes
+    ----------
+    arrays : dict
+        Forms, for each array by its name.
+    conditions : list of (Form, Form)
+        The first is to be larger than the second.
+    """
+
+    arrays: dict[str, list[Form]]
+    conditions: list[tuple[Form, Form]]
+
+    def quantities(self, graph: Graph) -> list[int]:
+        """What all of this is made of, inputs apart, in an order in which it can be computed."""
+        forms = [*(form for array in self.arrays.values() for form in array)]
+        return graph.needed_by([*forms, *(form for condition in self.conditions for form in condition)])
+
+
+class Block(NamedTuple):
+    """One or two places that are eliminated together, which takes one division."""
+
+    places: tuple[int, ...]
+    inverse: list[list[Form]]  # of the pivots
+    below: list[tuple[int, list[Form]]]  # rows of L
+
+
+class Factors:
+    """L D L^T of a symmetric matrix of forms, by an order that a definite matrix of this pattern allows.
+
+    Attributes
+    ----------
+    blocks : list of Block
+        In the order of elimination.
+    conditions : list of (Form, Form)
+        Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
+    positive : list of Form
+        Numbers that are positive where the matrix of the first `n` is definite.
+    """
+
+    def __init__(self, matrix: dict[tuple[int, int], Form], size: int, n: int):
+        rows: list[dict[int, Form]] = [{} for _ in range(size)]
+        for (i, j), value in matrix.items():
+            rows[i][j] = value
+        self.blocks: list[Block] = []
+        self.conditions: list[tuple[Form, Form]] = []
+        self.positive: list[Form] = []
+        alone: dict[int, Any] = {}
+        for places in _order(rows, n):
+            pivots = [[rows[i].pop(j).value() for j in places] for i in places]
+            inverse = self._inverse(pivots, [alone.get(i) for i in places])
+            entries = [(j, [rows[i][j].value() for i in places]) for j in rows[places[0]]]
+            below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
+            for j, multiples in below:
+                for k, values in entries:
+                    change = _dot(multiples, values)
+                    if j == k >= n > places[0]:
+                        alone[j] = alone.get(j, 0.0) - change
+                    rows[j][k] = rows[j][k] - change if k in rows[j] else -change
+                for i in places:
+                    del rows[j][i]
+            self.blocks.append(Block(places, inverse, below))
+
+    def _inverse(self, pivots: list[list[Form]], alone: list[Any]) -> list[list[Form]]:
+        """The inverse of one or two pivots; of rows of G, conditions too."""
+        own = [None if each is None else each.value() for each in alone]
+        a = pivots[0][0]
+        if own[0] is None:
+            self.positive.append(a)
+        else:
+            self.conditions.append((-a, -own[0]))
+        if len(pivots) == 1:
+            return [[a.reciprocal()]]
+        b, c = pivots[0][1], pivots[1][1]
+        determinant = (a * c - b * b).value()
+        if own[1] is None:
+            self.positive.append(determinant)
+        else:
+            self.conditions.append((determinant, (a * own[1]).value()))
+        inverse = determinant.reciprocal()
+        return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
+
+    def solve(self, right: Sequence[Form]) -> list[Form]:
+        """The solution for a right-hand side."""
+        return solve(self.blocks, right)
+
+
+def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
+    total = one[0] * other[0]
+    for x, y in zip(one[1:], other[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def solve(blocks: Sequence[Block], right: Sequence[Form]) -> list[Form]:
+    """The solution for a right-hand side."""
+    solution = list(right)
+    for places, _, below in blocks:
+        for i in places:
+            solution[i] = solution[i].value()
+        for j, multiples in below:
+            solution[j] = solution[j] - _dot(multiples, [solution[i] for i in places])
+    for places, inverse, below in reversed(blocks):
+        known = [solution[i] for i in places]
+        for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
+            total = _dot(row, known)
+            for j, multiples in below:
+                total = total - multiples[place] * solution[j]
+            solution[i] = total.value()
+    return solution
+
+
+def _order(rows: list[dict[int, Form]], n: int) -> list[tuple[int, ...]]:
+    """Least degree first; a row from n on only after all that it has below n; in pairs where their neighbours agree.
+
+    Among equals those first that wait for the fewest divisions: what does not depend on one another runs side by side.
+    """
+    neighbours = [set(row) - {i} for i, row in enumerate(rows)]
+    waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
+    left, order, depth = set(range(len(rows))), [], [0] * len(rows)
+    while left:
+        i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
+        ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
+        alike = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
+        places = (i, *sorted(alike)[:1])
+        order.append(places)
+        left -= set(places)
+        for j in neighbours[i] - set(places):
+            neighbours[j] = (neighbours[j] | neighbours[i]) - {*places, j}
+            waits[j] -= set(places)
+            depth[j] = max(depth[j], depth[i] + 1)
+    return order
+
+
+class StraightLine:
+    """The equations of a system, with rows G = [C_q; A].
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    choice : Choice
+        What numbers decide.
+
+    Attributes
+    ----------
+    graph : Graph
+        Its first quantities are t, q and v.
+    there : Outputs
+        "a" (n_q,), the accelerations at (q, v) as they stand.
+    closer : Outputs or None
+        "q" (n_q,), moved by a step of Newton's method towards the constraints, and "moved" (n_q,), by how much. None:
+        there are rows of A, which leave positions free.
+    nearer : Outputs or None
+        The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c,) for these.
+    redundant : Outputs
+        No arrays; its conditions are that the rows of C_q that do not count hold, too.
+    traced : Traced
+        What the callbacks gave.
+
+    Raises
+    ------
+    Untraceable
+        Saying why the equations cannot be had.
+    """
+
+    def __init__(self, system: ConstrainedSystem, choice: "Choice"):
+        given = system.functions.flags
+        for kind, size in (("jacobian", system.n_c), ("nonholonomic", system.n_a)):
+            if size and not given[GIVEN[kind]]:
+                raise Untraceable(f"{system.name!r} does not give {kind}, which is needed")
+        self.system, self.choice, self.graph = system, choice, Graph()
+        self.nothing = Form(self.graph, 0.0, {})
+        n, n_c, n_a = system.n_q, system.n_c, system.n_a
+        (self.t,) = self.graph.inputs(1, False)
+        self.q, self.v = self.graph.inputs(n, False), self.graph.inputs(n, True)
+        self.mass = self._made("mass", (n, n), self.q)
+        rows = [self._made("jacobian", (n_c, n), self.q), self._made("nonholonomic", (n_a, n), self.q)]
+        rates = [self._made("constraint_rate", (n_c,), self.q), self._made("nonholonomic_rate", (n_a,), self.q)]
+        self.all_rows, counting = np.vstack(rows), list(choice.rows)
+        self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
+        self.factors = Factors(self._matrix(), n + len(self.rows), n)
+        self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
+        self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
+        self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions)
+        self.redundant = self._redundant(np.concatenate(rates))
+        self.closer: Outputs | None = None
+        self.nearer: Outputs | None = None
+        if n_a == 0:
+            self._add_projection()
+        if len(self.graph.operations) > MOST:
+            raise Untraceable(f"its equations are more than {MOST} operations")
+        self.traced = Traced(system, self.graph)
+
+    def _made(self, kind: str, shape: tuple[int, ...], *state: Sequence[Form]) -> Any:
+        made = on_symbols(self.system, self.graph, kind, shape, self.t, *state)
+        for place in np.ndindex(shape):
+            made[place] = made[place].value()
+        return made
+
+    def _redundant(self, rates: Any) -> Outputs:
+        left = [k for k in range(self.system.n_c) if k not in self.choice.rows]
+        off = self._made("constraint", (self.system.n_c,), self.q)
+        one, conditions = Form(self.graph, 1.0, {}), []
+        size, speed = (sum((x * x for x in state), one) for state in (self.q, self.v))
+        for k in left:
+            row, rate = self.all_rows[k], rates[k]
+            faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
+            allowed = sum((entry * entry for entry in row), self.nothing).times(CONTRADICTS**2)
+            for what, scale in ((off[k], size), (faster, speed)):
+                conditions.append((allowed * scale, what * what))
+        return Outputs({"": []}, conditions)
+
+    def _matrix(self) -> dict[tuple[int, int], Form]:
+        n = self.system.n_q
+        matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not _is_zero(self.mass[i, j])}
+        for i, j in matrix:
+            if (j, i) not in matrix:
+                name = self.system.name
+                raise Untraceable(
+                    f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
+                )
+        for k in self.choice.added:
+            places = [i for i in range(n) if not _is_zero(self.all_rows[k, i])]
+            for i in places:
+                for j in places:
+                    term = (self.all_rows[k, i] * self.all_rows[k, j]).times(self.choice.scale)
+                    matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
+        for k, row in enumerate(self.rows):
+            for i in range(n):
+                if not _is_zero(row[i]):
+                    matrix[n + k, i] = matrix[i, n + k] = row[i]
+        return matrix
+
+    def _accelerations(self, v: Sequence[Form]) -> list[Form]:
+        """a and the multipliers of the rows that count, at velocities v."""
+        gamma = self._gamma(v)
+        right = list(self._made("force", (self.system.n_q,), self.q, v))
+        for k in self.choice.added:
+            for i, entry in enumerate(self.all_rows[k]):
+                right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
+        return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
+
+    def _gamma(self, v: Sequence[Form]) -> list[Form]:
+        """The right-hand side of the constraints on accelerations: as given, else -(dG/dt v + dG_t/dt) by the rules."""
+        n_c, n_a, gamma = self.system.n_c, self.system.n_a, []
+        for kind, size, first in (("gamma", n_c, 0), ("nonholonomic_gamma", n_a, n_c)):
+            if self.system.functions.flags[GIVEN[kind]]:
+                gamma += [*self._made(kind, (size,), self.q, v)]
+            elif size:
+                rate = "constraint_rate" if first == 0 else "nonholonomic_rate"
+                rates = self._made(rate, (size,), self.q)
+                gamma += self._differentiated(self.all_rows[first : first + size], rates, v)
+        return gamma
+
+    def _differentiated(self, rows: Any, rates: Any, v: Sequence[Form]) -> list[Form]:
+        along = {_only(self.t): Form(self.graph, 1.0, {}), **{_only(q): u for q, u in zip(self.q, v, strict=True)}}
+        derivative, made = Derivative(self.graph, along), []
+        for row, rate in zip(rows, rates, strict=True):
+            total = derivative.of(rate)
+            for entry, u in zip(row, v, strict=True):
+                total = total + derivative.of(entry) * u
+            made.append((-total).value())
+        return made
+
+    def _add_projection(self) -> None:
+        n = self.system.n_q
+        off = self._made("constraint", (self.system.n_c,), self.q)[list(self.choice.rows)]
+        moved = self.factors.solve([*([self.nothing] * n), *(-each for each in off)])[:n]
+        faster = []
+        for row, rate in zip(self.rows, self.rates, strict=True):
+            total = rate
+            for entry, u in zip(row, self.v, strict=True):
+                total = total + entry * u
+            faster.append(-total)
+        change = self.factors.solve([*([self.nothing] * n), *faster])[:n]
+        v = [(one + other).value() for one, other in zip(self.v, change, strict=True)]
+        solution = self._accelerations(v)
+        position = {"moved": moved, "q": [one + other for one, other in zip(self.q, moved, strict=True)]}
+        self.closer = Outputs(position, self.conditions)
+        lam = self._of_least_norm(solution[n:])
+        self.nearer = Outputs({"a": solution[:n], **position, "v": v, "lam": lam}, self.conditions)
+
+    def _of_least_norm(self, known: Sequence[Form]) -> list[Form]:
+        """Multipliers of all rows from those of the rows that count.
+
+        A row that does not is a combination of these, by the numbers Z; less its part in the null space of G^T, spanned
+        by e_i - sum_k Z_ik e_k, lam has least norm.
+        """
+        n, rows = self.system.n_q, self.choice.rows
+        lam = [self.nothing] * len(self.all_rows)
+        for k, value in zip(rows, known, strict=True):
+            lam[k] = value
+        others = [k for k in range(len(lam)) if k not in rows]
+        Z = [self.factors.solve([*self.all_rows[k], *([self.nothing] * len(rows))])[n:] for k in others]
+        gram = {
+            (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Form(self.graph, float(i == j), {}))
+            for i, one in enumerate(Z)
+            for j, other in enumerate(Z)
+        }
+        parts = [sum((-(x * y) for x, y in zip(one, known, strict=True)), self.nothing) for one in Z]
+        for row, one, part in zip(others, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
+            lam[row] = lam[row] - part
+            for k, x in zip(rows, one, strict=True):
+                lam[k] = lam[k] + part * x
+        return lam
+
+
+class Solution:
+    """M a + G^T lam = r with G a = c, by the factors of a position that are kept.
+
+    Attributes
+    ----------
+    kept, n_kept : Outputs, int
+        Of the equations: what is to be kept, and how many numbers.
+    graph : Graph
+        Its inputs are r (n_q,), c (n_c + n_a,) and what was kept.
+    solved : Outputs
+        "a" (n_q,) and "lam" (n_c + n_a,); 0 for rows that do not count.
+    """
+
+    def __init__(self, equations: StraightLine):
+        factors, choice = equations.factors, equations.choice
+        added = [form for k in choice.added for form in equations.all_rows[k]]
+        forms = [*added, *(form for block in factors.blocks for row in block.inverse for form in row)]
+        forms += [form for block in factors.blocks for _, row in block.below for form in row]
+        known = sorted({i for form in forms for i in form.terms})
+        self.n_kept = len(known)
+        self.kept = Outputs({"kept": [Form(equations.graph, 0.0, {i: 1.0}) for i in known]}, equations.conditions)
+        self.graph, n = Graph(), equations.system.n_q
+        r, c = self.graph.inputs(n, False), self.graph.inputs(len(equations.all_rows), False)
+        places = dict(zip(known, (_only(form) for form in self.graph.inputs(len(known), False)), strict=True))
+
+        def here(form: Form) -> Form:
+            return Form(self.graph, form.constant, {places[i]: x for i, x in form.terms.items()})
+
+        for k in choice.added:
+            r = [one + (here(x) * c[k]).times(choice.scale) for one, x in zip(r, equations.all_rows[k], strict=True)]
+        blocks = [
+            Block(
+                places, [[here(x) for x in row] for row in inverse], [(j, [here(x) for x in row]) for j, row in below]
+            )
+            for places, inverse, below in factors.blocks
+        ]
+        solution = solve(blocks, [*r, *(c[k] for k in choice.rows)])
+        lam = [Form(self.graph, 0.0, {})] * len(c)
+        for k, value in zip(choice.rows, solution[n:], strict=True):
+            lam[k] = value
+        self.solved = Outputs({"a": solution[:n], "lam": lam}, [])
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is decided by numbers at a position.
+
+    Attributes
+    ----------
+    rows : tuple of int
+        Rows of G of full rank.
+    added, scale : tuple of int, float
+        Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
+    least : float
+        What the pivot of a row must be, of what it is without the others, a power of ten.
+    """
+
+    rows: tuple[int, ...]
+    added: tuple[int, ...]
+    scale: float
+    least: float
+
+    @classmethod
+    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
+        """The choice at a position.
+
+        Raises
+        ------
+        Untraceable
+            If M is singular on velocities that the constraints allow.
+        """
+        mass, G = system.mass(t, q), system.rows(t, q)
+        rows = _independent(G)
+        if not rows:
+            return cls((), (), 1.0, 0.0)
+        scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
+        added = _rows_for_mass(mass, G, scale, system.name)
+        mass = mass + scale * G[list(added)].T @ G[list(added)]
+        S = G[rows] @ np.linalg.solve(mass, G[rows].T)
+        size = np.sqrt(np.diag(S))
+        smallest = float(np.linalg.eigvalsh(S / np.outer(size, size))[0])  # no pivot is smaller, in any order
+        return cls(
+            tuple(rows), added, scale if added else 1.0, 10.0 ** np.floor(np.log10(max(NEAR * smallest, ROUNDING)))
+        )
+
+
+def _is_zero(form: Form) -> bool:
+    return not form.terms and form.constant == 0.0
+
+
+def _only(form: Form) -> int:
+    (quantity,) = form.terms
+    return quantity
+
+
+def _independent(G: Array) -> list[int]:
+    """The first rows that no rows before add up to."""
+    kept: list[int] = []
+    basis = np.zeros((0, G.shape[1]))
+    for k, row in enumerate(G):
+        rest = row - (basis @ row) @ basis
+        rest -= (basis @ rest) @ basis
+        if np.linalg.norm(rest) > RANK * np.linalg.norm(row):
+            kept.append(k)
+            basis = np.vstack([basis, rest / np.linalg.norm(rest)])
+    return kept
+
+
+def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int, ...]:
+    """Rows of G with which M is definite, those of few entries first."""
+    added: list[int] = []
+    while True:
+        values, vectors = np.linalg.eigh(mass)
+        weak = values < SINGULAR_MASS * values[-1]
+        if not weak.any():
+            return tuple(added)
+        helps = np.linalg.norm(G @ vectors[:, weak], axis=1) > SINGULAR_MASS**0.5 * np.linalg.norm(G, axis=1)
+        free = [k for k in np.argsort(np.count_nonzero(G, axis=1), kind="stable") if helps[k] and k not in added]
+        if not free:
+            raise Untraceable(f"the mass of {name!r} stays singular with constraints added")
+        added.append(int(free[0]))
+        mass = mass + scale * np.outer(G[free[0]], G[free[0]])
+
+
+class Derivative:
+    """Derivatives of quantities along a direction in which the inputs change, by the rules of differentiation."""
+
+    def __init__(self, graph: Graph, direction: dict[int, Form]):
+        self.graph = graph
+        self._known = dict(direction)
+
+    def of(self, form: Form) -> Form:
+        """The derivative of a form."""
+        total = Form(self.graph, 0.0, {})
+        for i, c in form.terms.items():
+            total = total + self._of_quantity(i).times(c)
+        return total
+
+    def _of_quantity(self, i: int) -> Form:
+        if i not in self._known:
+            operation = self.graph.operations[i]
+            change = Form(self.graph, 0.0, {}) if operation is None else self._of_operation(i, *operation)
+            self._known[i] = change.value()
+        return self._known[i]
+
+    def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:
+        result, change = Form(self.graph, 0.0, {i: 1.0}), self.of(first)
+        if kind == PRODUCT:
+            assert second is not None
+            return change * second + first * self.of(second)
+        if kind == SUM:
+            return change
+        if kind == RECIPROCAL:
+            return -(change * result * result)
+        if kind == SQUARE_ROOT:
+            return change * result.reciprocal() * 0.5
+        if kind == EXPONENTIAL:
+            return change * result
+        if kind == SINE:
+            return change * first.cosine()
+        if kind == COSINE:
+            return -(change * first.sine())
+        assert kind in (LOGARITHM, ARCTANGENT) and second is not None
+        return change * second.reciprocal()

@@ -1,0 +1,211 @@
+"""What callbacks were traced to, compared in numbers with what they give when they are called.
+
+A callback that branches where nothing shows it, keeps something from call to call, or reads what changes beside its
+arguments (a global that numba froze when it compiled it) is not what it was traced to. At the start both are compared
+at states spread over the time of the run and about its start, later at states of the run itself.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.scales import sizes
+from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.kernels.compile.linking import direct
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+# those that are traced, in the order in which the kernel calls them
+KINDS = (
+    *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
+    *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
+)
+AROUND = 8  # states about the start, beside it
+AWAY = 0.3  # of the size of coordinates: how far these are from it
+EACH, MOST = 32, 64  # states of a part of a run, and of a run ...
+FEW = 9  # ... if callbacks are called in Python
+ENTRIES = 20_000  # of all callbacks at all states of a run, about: fewer states of large systems
+LOST = 16.0 * np.finfo(float).eps  # of the largest term of all entries: rounding of what operations cancel exactly
+CLEAR = 1e-6  # of the largest term: a smaller difference is no rounding of the callback's if it stays ...
+NEXT = 1e-7  # ... where the state changes by so little
+NEIGHBOURS = 12
+
+
+class Traced:
+    """The operations that callbacks were traced to, as a program for numbers.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    graph : Graph
+        On whose first quantities, t, q and v, the callbacks ran.
+    """
+
+    def __init__(self, system: ConstrainedSystem, graph: Graph):
+        known = [kind for kind in KINDS if kind in graph.traced and kind in system.given and graph.traced[kind].size]
+        self.places = [(kind, place) for kind in known for place in np.ndindex(graph.traced[kind].shape)]
+        self.which = np.array([kind in known for kind in KINDS], dtype=np.int64)
+        self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
+        self.name = system.name
+        self.trusted = False
+        self._write(graph, [graph.traced[kind][place] for kind, place in self.places])
+
+    def _write(self, graph: Graph, results: list[Form]) -> None:
+        from twoloop.kernels.evaluation import traced as kernels
+
+        n_inputs = 1 + 2 * int(self.sizes[0])
+        needed = graph.needed_by(results)
+        node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
+        nothing = Form(graph, 0.0, {})
+        rows: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
+        rows += [(kernels.RESULT, form, None, k) for k, form in enumerate(results)]
+        terms: list[tuple[int, float]] = []
+        program, constants = [], []
+        for kind, one, other, made in rows:
+            begin = len(terms)
+            other = nothing if other is None else other
+            terms += [(node[i], c) for i, c in one.terms.items()]
+            program.append((kind, made, begin, len(terms), len(terms) + len(other.terms)))
+            terms += [(node[i], c) for i, c in other.terms.items()]
+            constants.append((one.constant, other.constant))
+        self.program = np.array(program, dtype=np.int64).reshape(-1, kernels.N_COLUMNS)
+        self.columns = np.array([i for i, _ in terms], dtype=np.int64)
+        self.coefficients = np.array([c for _, c in terms], dtype=float)
+        self.constants = np.array(constants, dtype=float).reshape(-1, 2)
+        self.n_nodes = len(node)
+
+    def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
+        """Compare at states about the start, spread over the time of a run.
+
+        Raises
+        ------
+        Untraceable
+            Naming a callback and an entry.
+        """
+        if self.trusted:
+            return
+        wrong = None
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            around = _around(t0, t1, q, v)
+            for states in (around, *around[:, None, :]):  # all at once, or one by one
+                try:
+                    wrong = wrong or self.wrong(system, states, everywhere=False)
+                except Exception:  # outside what the callbacks are made for
+                    continue
+                if states is around:
+                    break
+        if wrong is not None:
+            raise Untraceable(wrong)
+        self.trusted = not system.called_in_python  # whose compiled callbacks do not change any more
+
+    def wrong(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
+        """Say which callback does not give at states [t, q, v] what it was traced to, or None.
+
+        `everywhere`: whether what is not finite counts.
+        """
+        from twoloop.kernels.evaluation import traced as kernels
+
+        most = FEW if system.called_in_python else MOST
+        states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // ENTRIES)]
+        n_different, called, traced, bounds = self._both(system, states)
+        if n_different == 0:
+            return None
+        finite = np.isfinite(called)
+        with np.errstate(all="ignore"):
+            largest = np.abs(np.where(finite, called, 0.0)).max(axis=0)
+            off = np.abs(called - traced)
+            same = off <= kernels.SAME * largest + kernels.ROUNDED * bounds
+        if everywhere:
+            same |= ~finite & ~np.isfinite(traced)
+        else:
+            same |= ~finite
+        for k, entry in np.argwhere(~same):
+            kind = [place for place, (each, _) in enumerate(self.places) if each == self.places[entry][0]]
+            size = np.nanmax(np.where(np.isfinite(bounds[:, kind]), bounds[:, kind], 0.0))
+            if off[k, entry] <= LOST * size:
+                continue
+            if not off[k, entry] <= CLEAR * size or self._stays(system, states[k], int(entry)):
+                return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
+        return None
+
+    def _both(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
+        from twoloop.kernels.data.common import Kit
+        from twoloop.kernels.evaluation import traced as kernels
+
+        called, traced, bounds = np.zeros((3, len(states), len(self.places)))
+        n_different = direct(kernels.compare)(
+            Kit(system.functions),
+            self.sizes,
+            self.which,
+            np.ascontiguousarray(states),
+            self.program,
+            self.columns,
+            self.coefficients,
+            self.constants,
+            np.zeros((2, self.n_nodes)),
+            called,
+            traced,
+            bounds,
+        )
+        return n_different, called, traced, bounds
+
+    def _stays(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
+        """Whether a difference is the same at neighbouring states, as rounding is not."""
+        parts = np.random.default_rng(5).uniform(-1.0, 1.0, (NEIGHBOURS, len(state)))
+        _, called, traced, _ = self._both(system, state * (1.0 + NEXT * parts))
+        off = (called - traced)[:, entry]
+        return bool(np.abs(off).min() > 0.5 * np.abs(off).max() and np.abs(off.sum()) == np.abs(off).sum())
+
+    def _message(self, state: Array, entry: int, called: float, traced: float) -> str:
+        kind, place = self.places[entry]
+        where = place[0] if len(place) == 1 else tuple(place)
+        return (
+            f"{kind} of {self.name!r} does not give what its operations give, which were recorded once: at t = "
+            f"{state[0]:.10g} entry {where} is {called:.9g}, and by these {traced:.9g}. It depends on more than its "
+            "arguments (a variable outside that changed after numba compiled it, random numbers, what it keeps from "
+            "call to call), or branches unseen"
+        )
+
+
+class Sample:
+    """Some states [t, q, v] of a run, from its start to where it has come to."""
+
+    def __init__(self, t0: float, state: Array):
+        self.n = len(state)
+        self.states = [np.concatenate([[t0], state])[None, :]]
+
+    def add(self, t: Array, rows: Array) -> None:
+        """Take some of the states [q, v, ...] of a part of the run."""
+        stride = 1 + len(t) // EACH
+        self.states.append(np.column_stack([t[::stride], rows[::stride, : self.n]]))
+        if len(self.states) > MOST:
+            self.states = self.states[::2]
+
+    def up_to(self, end: float) -> Array:
+        """All of them, the last first."""
+        states = np.concatenate(self.states)
+        states = states[states[:, 0] <= end]
+        return states[::-1]
+
+
+Check = Callable[[Traced], None]
+
+
+def unchecked(traced: Traced) -> None:
+    """No check: of what is not to be run."""
+
+
+def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
+    """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
+    generic = np.random.default_rng(6)
+    size = sizes(q)
+    speed = np.maximum(size, np.abs(v))
+    times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)[:, None]
+    parts = generic.uniform(-1.0, 1.0, (2, AROUND, len(q)))
+    around = np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])
+    return np.vstack([np.concatenate([[t0], q, v]), around])

@@ -1,0 +1,1 @@
+"""Matrices: dense, banded, sparse; factors and solutions in place."""

@@ -1,0 +1,158 @@
+"""Banded matrices by LAPACK: the constant mass matrix, and systems with a border of constraints.
+
+A band is kept as LAPACK wants it, entry (i, j) at [j, top + i - j] of a C-ordered array: top = b for the upper triangle
+of M, 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
+"""
+
+import numpy as np
+
+from twoloop.kernels.algebra.lapack import DPBTRF, DPBTRS, NO_TRANSPOSE, UPPER, call
+from twoloop.kernels.algebra.linalg import lu_factor, lu_solve
+from twoloop.kernels.data.common import (
+    BANDWIDTH,
+    DIAGONAL_MASS,
+    DONE,
+    MASS_NOT_DEFINITE,
+    SINGULAR,
+    compiled,
+    inlined,
+    merged,
+)
+
+# From so many coordinates on a Newton step by banded algebra is the faster one: measured 36 to 75, on chains of
+# bandwidth 1 to 11 and on beams. Evaluations alone, as a fixed-point iteration makes them, gain from about 150 on and
+# lose a third here
+BANDED_FROM = 56
+
+
+def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
+    """Whether banded linear algebra is faster than dense, and fits into the memory that is there for the dense."""
+    return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
+
+
+@merged
+def banded_mass(f):
+    """Whether M is factored as a band (a diagonal M is simpler still)."""
+    return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
+
+
+@inlined
+def _mass_band(w, b):
+    n = w.Q.size
+    return w.L.reshape(n * n)[: n * (b + 1)].reshape((n, b + 1))
+
+
+@inlined
+def _mass_diagonals(w, b):
+    """Entry (i, i + k) of M at [k, i]; behind the factor."""
+    n = w.Q.size
+    return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
+
+
+@compiled
+def factor_banded_mass(f, w):
+    """The Cholesky factor of w.M and its diagonals, kept in the memory of w.L."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    band = _mass_band(w, b)
+    for j in range(n):
+        for i in range(max(0, j - b), j + 1):
+            band[j, b + i - j] = w.M[j, i]
+    diagonals = _mass_diagonals(w, b)
+    for k in range(b + 1):
+        for i in range(n - k):
+            diagonals[k, i] = w.M[i, i + k]
+    return DONE if call(w.lapack[DPBTRF], (UPPER, n, b, band, b + 1)) == 0 else MASS_NOT_DEFINITE
+
+
+@merged
+def solve_banded_mass(f, w, x):
+    """x becomes M^-1 x."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    call(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
+
+
+@compiled
+def add_banded_mass_times(f, w, x, y):
+    """y += M x, along the diagonals: rows of a band are too short to be fast."""
+    n = w.Q.size
+    for i in range(n):
+        y[i] += w.M[i, i] * x[i]
+    if f.flags[DIAGONAL_MASS] == 1:
+        return
+    b = f.flags[BANDWIDTH]
+    diagonals = _mass_diagonals(w, b)
+    for k in range(1, b + 1):
+        for i in range(n - k):
+            y[i] += diagonals[k, i] * x[i + k]
+        for i in range(n - k):
+            y[i + k] += diagonals[k, i] * x[i]
+
+
+# The system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], B of bandwidth b, is solved by mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r. Its
+# `numbers`, real or complex: the LU of B, then B^-1 Cq^T as rows, Cq B^-1 Cq^T, and a vector (n_c).
+
+
+@inlined
+def lu_band(numbers, n, b):
+    """The part of `numbers` that holds B, and then its LU: entry (i, j) at [j, 2 b + i - j]."""
+    return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
+
+
+@inlined
+def _border(numbers, n, n_c, b):
+    start = n * (3 * b + 1)
+    return numbers[start : start + n_c * n].reshape((n_c, n))
+
+
+@inlined
+def _complement(numbers, n, n_c, b):
+    start = n * (3 * b + 1) + n_c * n
+    return numbers[start : start + n_c * n_c].reshape((n_c, n_c))
+
+
+@inlined
+def _scratch(numbers, n, n_c, b):
+    start = n * (3 * b + 1) + n_c * (n + n_c)
+    return numbers[start : start + n_c]
+
+
+@compiled
+def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
+    """Factor the system whose B stands in lu_band(numbers); the routines are xGBTRF and xGBTRS of its kind."""
+    n_c, n = Cq.shape
+    band = lu_band(numbers, n, b)
+    rows = pivots[: n - n_c].view(np.int32)
+    if call(w.lapack[factorize], (n, n, b, b, band, 3 * b + 1, rows)) != 0:
+        return SINGULAR
+    border = _border(numbers, n, n_c, b)
+    for i in range(n_c):
+        for j in range(n):
+            border[i, j] = Cq[i, j]
+    call(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, rows, border, n))
+    S = _complement(numbers, n, n_c, b)
+    for i in range(n_c):
+        for k in range(n_c):
+            S[i, k] = 0.0
+            for j in range(n):
+                S[i, k] += Cq[i, j] * border[k, j]
+    return DONE if lu_factor(S, pivots[n - n_c :]) > 0.0 else SINGULAR
+
+
+@compiled
+def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
+    """Solve with the factors of `factor_bordered`; x (n_q) is overwritten."""
+    n_c, n = Cq.shape
+    band, rows = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
+    call(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, rows, x, n))
+    mu = _scratch(numbers, n, n_c, b)
+    for i in range(n_c):
+        mu[i] = 0.0
+        for j in range(n):
+            mu[i] += Cq[i, j] * x[j]
+    lu_solve(_complement(numbers, n, n_c, b), pivots[n - n_c :], mu)
+    border = _border(numbers, n, n_c, b)
+    for i in range(n_c):
+        for j in range(n):
+            x[j] -= border[i, j] * mu[i]

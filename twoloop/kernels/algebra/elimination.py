@@ -1,0 +1,290 @@
+"""The order in which a sparse matrix is eliminated, and the program of its factors, see factors.py.
+
+Entries stand in lists by row and by column, and a step of the elimination looks at the lists it changes alone: ordering
+takes work in proportion to size times entries, where full matrices would take the third power of the size.
+"""
+
+from twoloop.kernels.data.common import compiled, inlined, merged
+
+THRESHOLD = 0.1  # of the largest entry in its column, which a pivot must have
+FULL = 0.5  # of the subtractions of a full matrix, from which on factors are dense
+SMALL = 3  # rows up to which they never are
+ZERO = 1e-11  # a pivot below this fraction of the largest one counts as zero
+LONGEST, PER_ROW = 2000, 100  # a list has at most LONGEST + PER_ROW r subtractions: what memory there is
+WIDEST = 64  # entries that a row or a column of the factors may have
+
+ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # what `order` finds; the last: too many entries to be worth it
+
+# places in `index`: the size r, whether the factors are dense, the sign of the permutations, how many entries the
+# factors have, the first that is L's, and the columns of the Jacobian; then rows (r), columns (r), row exchanges of
+# dense factors (r), where rows of U begin (r) and end (r) and where rows of L begin (r + 1); then of every entry its
+# row, its column, and where it comes from; then the targets of the subtractions. Entries: the diagonal, U from its last
+# row up, L from its first. Behind that, lists for the time of ordering
+SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
+# of every row and column of the matrix: entries in its list, from which a column loses those of eliminated rows; of a
+# row, entries that are left; places in the order so far; and of a row where in the list of a column it is, from 1 on
+ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_PLACE, COLUMN_PLACE, FOUND, N_COUNTS = range(7)
+COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # of a row: columns and sources of its entries; of a column: rows
+
+
+def index_size(r: int) -> int:
+    """Length of `index` for r rows."""
+    return N_HEAD + 6 * r + 1 + (3 + N_LISTS) * r * min(r, WIDEST) + longest_list(r) + N_COUNTS * r
+
+
+def values_size(r: int, may_be_dense: bool = True) -> int:
+    """Length of `values` for r rows."""
+    return r * (r if may_be_dense else min(r, WIDEST)) + r
+
+
+def longest_list(r: int) -> int:
+    """How many subtractions a program may have."""
+    return min(r * r * (r + 1) // 2, LONGEST + PER_ROW * r)
+
+
+@inlined
+def rows_of(index):
+    """Rows of the matrix in the order of elimination."""
+    return index[N_HEAD : N_HEAD + index[SIZE]]
+
+
+@inlined
+def columns_of(index):
+    """Columns of the matrix in the order of elimination."""
+    return index[N_HEAD + index[SIZE] : N_HEAD + 2 * index[SIZE]]
+
+
+@inlined
+def pivots_of(index):
+    """Row exchanges of dense factors."""
+    return index[N_HEAD + 2 * index[SIZE] : N_HEAD + 3 * index[SIZE]]
+
+
+@merged
+def begin_upper(r):
+    """Where it stands where the rows of U begin."""
+    return N_HEAD + 3 * r
+
+
+@merged
+def end_upper(r):
+    """... where they end."""
+    return N_HEAD + 4 * r
+
+
+@merged
+def begin_lower(r):
+    """... where the rows of L begin, and the last one ends."""
+    return N_HEAD + 5 * r
+
+
+@merged
+def slots(r):
+    """Where rows, columns and sources of the entries stand."""
+    return N_HEAD + 6 * r + 1
+
+
+@inlined
+def lists_of(index, values):
+    """Where a matrix to be ordered stands: (N_COUNTS, r), (N_LISTS, r, entries), and the entries of each column."""
+    r = index[SIZE]
+    width = min(r, WIDEST)
+    counts = index[index.size - N_COUNTS * r :].reshape((N_COUNTS, r))
+    lists = index[index.size - (N_COUNTS + N_LISTS * width) * r : index.size - N_COUNTS * r]
+    return counts, lists.reshape((N_LISTS, r, width)), values[r : r + r * width].reshape((r, width))
+
+
+@compiled
+def begin(index, r):
+    """Empty lists for a matrix of r rows."""
+    index[SIZE] = r
+    index[DENSE] = 0
+    for k in range(index.size - N_COUNTS * r, index.size):
+        index[k] = 0
+
+
+@compiled
+def put(matrix, i, j, number, source):
+    """Add entry (i, j), which is not there yet; False: there is no room."""
+    counts, lists, numbers = matrix
+    n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
+    if n == numbers.shape[1] or m == numbers.shape[1]:
+        return False
+    lists[COLUMNS, i, n], lists[SOURCES, i, n] = j, source
+    lists[ROWS, j, m], numbers[j, m] = i, number
+    counts[ROW_SIZE, i] += 1
+    counts[COLUMN_SIZE, j] += 1
+    counts[ROW_LEFT, i] += 1
+    return True
+
+
+@compiled
+def _choose_pivot(matrix, rows, columns, k):
+    """Row and column of pivot k: that with the least fill among those large enough; (-1, -1): none.
+
+    Among equals it is the largest, then the first in the order so far.
+    """
+    counts, lists, numbers = matrix
+    r = rows.size
+    least = r
+    for p in range(k, r):
+        least = min(least, counts[ROW_LEFT, rows[p]])
+    best_cost, best_size, best_place, row, column = r * r + 1, 0.0, r * r, -1, -1
+    for p in range(k, r):
+        j = columns[p]
+        others = counts[COLUMN_SIZE, j] - 1
+        if others * (least - 1) > best_cost:
+            continue
+        largest = 0.0
+        for m in range(others + 1):
+            largest = max(largest, abs(numbers[j, m]))
+        for m in range(others + 1):
+            i, size = lists[ROWS, j, m], abs(numbers[j, m])
+            if size > 0.0 and size >= THRESHOLD * largest:
+                cost = (counts[ROW_LEFT, i] - 1) * others
+                place = counts[ROW_PLACE, i] * r + p
+                better = cost < best_cost or (cost == best_cost and size > best_size)
+                if better or (cost == best_cost and size == best_size and place < best_place):
+                    best_cost, best_size, best_place, row, column = cost, size, place, i, j
+    return row, column
+
+
+@merged
+def _exchange(order, place, k, chosen):
+    """Bring what is chosen to place k; -1, or 1 where it is there already."""
+    p, other = place[chosen], order[k]
+    order[k], order[p] = chosen, other
+    place[chosen], place[other] = k, p
+    return 1 if p == k else -1
+
+
+@compiled
+def _subtract(matrix, row, column, pivot, j, nothing):
+    """Subtract the row of the pivot from the others in column j, and take it away there; False: there is no room."""
+    counts, lists, numbers = matrix
+    for m in range(counts[COLUMN_SIZE, j]):
+        counts[FOUND, lists[ROWS, j, m]] = m + 1
+    place = counts[FOUND, row] - 1
+    number = numbers[j, place]
+    done = True
+    for m in range(counts[COLUMN_SIZE, column]):
+        i = lists[ROWS, column, m]
+        if i == row:
+            continue
+        change, found = numbers[column, m] / pivot * number, counts[FOUND, i]
+        if found > 0:
+            numbers[j, found - 1] -= change
+        else:
+            done = done and put(matrix, i, j, -change, nothing)
+    last = counts[COLUMN_SIZE, j] - 1
+    for m in range(last + 1):
+        counts[FOUND, lists[ROWS, j, m]] = 0
+    lists[ROWS, j, place], numbers[j, place] = lists[ROWS, j, last], numbers[j, last]
+    counts[COLUMN_SIZE, j] = last
+    return done
+
+
+@compiled
+def order(index, matrix, nothing, zero):
+    """Eliminate the entries in the lists with full freedom of choice, and write the program of that order.
+
+    What comes in is gathered from `nothing`, where there is a zero. A pivot of at most `zero` of the largest counts as
+    none. Returns ORDERED, with rows and columns of the matrix in `index`, SINGULAR_MATRIX or TOO_MANY.
+    """
+    counts, lists, numbers = matrix
+    r = index[SIZE]
+    rows, columns = rows_of(index), columns_of(index)
+    for k in range(r):
+        rows[k] = columns[k] = counts[ROW_PLACE, k] = counts[COLUMN_PLACE, k] = k
+    index[SIGN] = 1
+    first = 0.0
+    for k in range(r):
+        i, j = _choose_pivot(matrix, rows, columns, k)
+        if i < 0:
+            return SINGULAR_MATRIX
+        index[SIGN] *= _exchange(rows, counts[ROW_PLACE], k, i) * _exchange(columns, counts[COLUMN_PLACE], k, j)
+        pivot = 0.0
+        for m in range(counts[COLUMN_SIZE, j]):
+            counts[ROW_LEFT, lists[ROWS, j, m]] -= 1
+            if lists[ROWS, j, m] == i:
+                pivot = numbers[j, m]
+        first = max(first, abs(pivot))
+        if not abs(pivot) > zero * first:
+            return SINGULAR_MATRIX
+        for n in range(counts[ROW_SIZE, i]):
+            other = lists[COLUMNS, i, n]
+            if counts[COLUMN_PLACE, other] > k and not _subtract(matrix, i, j, pivot, other, nothing):
+                return TOO_MANY
+    return ORDERED if _write(index, counts, lists) else TOO_MANY
+
+
+@compiled
+def _sort(columns, sources, size, place):
+    """Sort the list of a row by the order of elimination."""
+    for n in range(1, size):
+        column, source, k = columns[n], sources[n], n
+        while k > 0 and place[columns[k - 1]] > place[column]:
+            columns[k], sources[k] = columns[k - 1], sources[k - 1]
+            k -= 1
+        columns[k], sources[k] = column, source
+
+
+@compiled
+def _size_of_program(rows, counts, lists):
+    """How many entries the factors have, and how many subtractions make them; sorts the lists of the rows.
+
+    Leaves how many entries of U are in the row at each place in counts[ROW_LEFT].
+    """
+    place = counts[COLUMN_PLACE]
+    entries, subtractions = 0, 0
+    for k in range(rows.size):
+        i = rows[k]
+        _sort(lists[COLUMNS, i], lists[SOURCES, i], counts[ROW_SIZE, i], place)
+        entries += counts[ROW_SIZE, i]
+        lower = 0
+        while place[lists[COLUMNS, i, lower]] < k:
+            subtractions += counts[ROW_LEFT, place[lists[COLUMNS, i, lower]]]
+            lower += 1
+        counts[ROW_LEFT, k] = counts[ROW_SIZE, i] - lower - 1
+    return entries, subtractions
+
+
+@compiled
+def _write(index, counts, lists):
+    """Write the program; False: one for a full matrix would be quicker, or it is too long."""
+    r = index[SIZE]
+    rows = rows_of(index)
+    n_slots, subtractions = _size_of_program(rows, counts, lists)
+    full = (r * (r - 1) * (2 * r - 1)) / 6.0
+    if subtractions > LONGEST + PER_ROW * r or (r > SMALL and subtractions > FULL * full):
+        return False
+    in_row, in_column = slots(r), slots(r) + n_slots
+    source, target = in_column + n_slots, in_column + 2 * n_slots
+    slot = r
+    for k in range(r - 1, -1, -1):
+        index[begin_upper(r) + k] = slot
+        slot += counts[ROW_LEFT, k]
+        index[end_upper(r) + k] = slot
+    index[N_SLOTS], index[FIRST_LOWER] = n_slots, slot
+    for k in range(r):
+        i = rows[k]
+        index[begin_lower(r) + k] = slot
+        next_upper = index[begin_upper(r) + k]
+        for n in range(counts[ROW_SIZE, i]):
+            j = counts[COLUMN_PLACE, lists[COLUMNS, i, n]]
+            s = k
+            if j < k:
+                s = slot
+                slot += 1
+            elif j > k:
+                s = next_upper
+                next_upper += 1
+            counts[FOUND, j] = s
+            index[in_row + s], index[in_column + s], index[source + s] = k, j, lists[SOURCES, i, n]
+        for s in range(index[begin_lower(r) + k], slot):
+            j = index[in_column + s]
+            for u in range(index[begin_upper(r) + j], index[end_upper(r) + j]):
+                index[target] = counts[FOUND, index[in_column + u]]
+                target += 1
+    index[begin_lower(r) + r] = slot
+    return True

@@ -1,0 +1,171 @@
+"""Small dense factorisations, in place and without allocation.
+
+All run along rows and skip zero factors: constraint Jacobians are sparse even where they are small.
+"""
+
+from twoloop.kernels.data.common import merged
+
+
+@merged
+def copy(source, target):
+    """Element by element: numba's slice assignment allocates."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@merged
+def copy_matrix(source, target):
+    """Row by row, as far as both have them."""
+    for i in range(min(source.shape[0], target.shape[0])):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@merged
+def _size(x):
+    """|x|, or of a complex number the sum of its parts' as LAPACK has it: no square root."""
+    return abs(x.real) + abs(x.imag)
+
+
+@merged
+def lu_factor(A, pivots):
+    """LU factors of A, real or complex, with row exchanges, in place, 1/u_kk on the diagonal.
+
+    Returns min|u_kk| / max|u_kk|; 0 for a singular matrix or one with values that are not finite.
+    """
+    n = A.shape[0]
+    smallest = 1e300
+    largest = 0.0
+    for k in range(n):
+        p = k
+        top = _size(A[k, k])
+        for i in range(k + 1, n):
+            size = _size(A[i, k])
+            if size > top:
+                top = size
+                p = i
+        pivots[k] = p
+        if not top > 0.0:  # also true for NaN
+            return 0.0
+        smallest = min(smallest, top)
+        largest = max(largest, top)
+        if p != k:
+            for j in range(n):
+                A[k, j], A[p, j] = A[p, j], A[k, j]
+        inverse = 1.0 / A[k, k]
+        A[k, k] = inverse
+        for i in range(k + 1, n):
+            if A[i, k] != 0.0:
+                factor = A[i, k] * inverse
+                A[i, k] = factor
+                for j in range(k + 1, n):
+                    A[i, j] -= factor * A[k, j]
+    return smallest / largest if n > 0 else 1.0
+
+
+@merged
+def lu_sign(A, pivots):
+    """Sign of the determinant of a real matrix, from the factors of `lu_factor`."""
+    sign = 1.0
+    for k in range(A.shape[0]):
+        if (A[k, k] < 0.0) != (pivots[k] != k):
+            sign = -sign
+    return sign
+
+
+@merged
+def lu_solve(A, pivots, x):
+    """Solve with the factors of `lu_factor`; x is overwritten."""
+    n = A.shape[0]
+    for k in range(n):
+        p = pivots[k]
+        if p != k:
+            x[k], x[p] = x[p], x[k]
+    for i in range(1, n):
+        total = x[i]
+        for j in range(i):
+            total -= A[i, j] * x[j]
+        x[i] = total
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for j in range(i + 1, n):
+            total -= A[i, j] * x[j]
+        x[i] = total * A[i, i]
+
+
+@merged
+def ldl_factor(A):
+    """Factors U^T D^-1 U of a symmetric A from its upper triangle, in place: 1/d_k on the diagonal, U above it.
+
+    Returns False if A is not positive definite or has values that are not finite.
+    """
+    n = A.shape[0]
+    for k in range(n):
+        if not A[k, k] > 0.0:
+            return False
+        inverse = 1.0 / A[k, k]
+        A[k, k] = inverse
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                factor = A[k, i] * inverse
+                for j in range(i, n):
+                    A[i, j] -= factor * A[k, j]
+    return True
+
+
+@merged
+def invert_definite(A):
+    """A symmetric positive definite A becomes its inverse, by Gauss and Jordan's elimination.
+
+    Returns False if A is not positive definite or has values that are not finite.
+    """
+    n = A.shape[0]
+    for k in range(n):
+        if not A[k, k] > 0.0:
+            return False
+        inverse = 1.0 / A[k, k]
+        A[k, k] = 1.0
+        for j in range(n):
+            A[k, j] *= inverse
+        for i in range(n):
+            if i != k and A[i, k] != 0.0:
+                factor = A[i, k]
+                A[i, k] = 0.0
+                for j in range(n):
+                    A[i, j] -= factor * A[k, j]
+    return True
+
+
+@merged
+def ldl_solve(A, x):
+    """Solve with the factors of `ldl_factor`; x is overwritten."""
+    n = A.shape[0]
+    for k in range(n):
+        if x[k] != 0.0:
+            factor = x[k] * A[k, k]
+            for j in range(k + 1, n):
+                x[j] -= factor * A[k, j]
+    for k in range(n - 1, -1, -1):
+        total = x[k]
+        for j in range(k + 1, n):
+            total -= A[k, j] * x[j]
+        x[k] = total * A[k, k]
+
+
+@merged
+def ldl_solve_rows(A, B):
+    """Solve with the factors of `ldl_factor` for all columns of B at once, row by row; B is overwritten."""
+    n, m = B.shape
+    for k in range(n):
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                factor = A[k, i] * A[k, k]
+                for j in range(m):
+                    B[i, j] -= factor * B[k, j]
+    for k in range(n - 1, -1, -1):
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                for j in range(m):
+                    B[k, j] -= A[k, i] * B[i, j]
+        for j in range(m):
+            B[k, j] *= A[k, k]

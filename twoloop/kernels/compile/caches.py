@@ -1,0 +1,378 @@
+"""Machine code on disk: where numba keeps it, when it is out of date, and what happens where it cannot be kept.
+
+Everything that touches numba's private parts is in this file. Numba watches the file in which a function stands, and
+nothing else: not the helpers in other files, and not the values of globals, which it freezes. It raises when no folder
+can be written and when a file is damaged, and runs what others have put into one.
+"""
+
+import enum
+import glob
+import hashlib
+import inspect
+import pickle
+import sys
+import types
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba import njit
+from numba.core.caching import FunctionCache, NullCache, UserProvidedCacheLocator
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+from numba.core.types import Type
+from numba.misc.appdirs import AppDirs
+
+from twoloop.kernels.compile.ownership import make_own, own_folder, read_own, write_own
+
+UNWRITABLE = (
+    "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
+    "that you can write, and nobody else can"
+)
+MOST_KEPT = 500  # functions made for single mechanisms, of each kind, on disk ...
+MOST_HELD = 50  # ... and in memory; their machine code, some 50 kB, stays there as long as the process lives
+CHECKSUM = hashlib.sha256().digest_size
+
+# libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
+LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
+
+
+def compile_kept(
+    function: Callable[..., Any],
+    signature: Any,
+    watched: tuple[str, str] | None,
+    *,
+    announcement: str = "",
+    folder: Path | None = None,
+    **options: Any,
+) -> Dispatcher:
+    """Compile a function for one signature, or read its machine code from the disk.
+
+    Parameters
+    ----------
+    function : callable
+        What numba compiles.
+    signature : numba signature
+        The only one that it will have.
+    watched : (str, str) or None
+        What the machine code depends on beside the file of the function, see `watch`: when the first changes, all is
+        compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
+    announcement : str
+        Said on stderr, once a process, before it compiles.
+    folder : Path, optional
+        Where the machine code is kept, of the newest MOST_KEPT functions of this name; None: where numba keeps it.
+    **options
+        Of numba.njit.
+    """
+    dispatcher = njit(**options)(named_apart(function, watched))
+    function = dispatcher.py_func
+    if watched is not None:
+        try:
+            dispatcher._cache = _Cache(function, *watched, announcement, folder)
+        except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
+            if Path(inspect.getfile(function)).exists():
+                say_once(UNWRITABLE)
+    dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    _N_MADE[0] += 1
+    return dispatcher
+
+
+class Newest(dict[str, Any]):
+    """What was made for single mechanisms, by digests: the newest MOST_HELD, as a sweep makes one for each run."""
+
+    def __setitem__(self, key: str, made: Any) -> None:
+        super().__setitem__(key, made)
+        for old in list(self)[:-MOST_HELD]:
+            self.pop(old, None)
+
+
+_N_MADE = [0]
+
+
+def n_made() -> int:
+    """How many functions this process has compiled, or read from the disk."""
+    return _N_MADE[0]
+
+
+def folder_of(package: types.ModuleType) -> Path | None:
+    """Where numba keeps the machine code of a package; None where no folder can be written."""
+
+    def anything() -> None:
+        pass
+
+    code = anything.__code__.replace(co_filename=str(package.__file__))
+    anything.__code__ = code
+    try:
+        return own_folder(Path(FunctionCache(anything).cache_path))
+    except RuntimeError:
+        return None
+
+
+def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
+    """A function within a function, or a lambda, under a name that no other has; any other function as it is.
+
+    Numba's symbols are made of the qualified name and of a number that counts within a process. Two closures of one
+    name whose machine code comes from different processes may share a symbol: the one that is loaded first is then
+    called in the place of both.
+    """
+    if watched is None or "<" not in function.__qualname__:
+        return function
+    code = function.__code__
+    copy = types.FunctionType(
+        code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__kwdefaults__, copy.__module__ = function.__kwdefaults__, function.__module__
+    apart = hashlib.sha256(repr((watched, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
+    copy.__qualname__ = f"{function.__qualname__}.{apart[:16]}"
+    return copy
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of one function, with our stamp; what goes wrong in it costs time and raises nothing."""
+
+    def __init__(
+        self, function: Callable[..., Any], stamp: str, key: str, announcement: str, folder: Path | None = None
+    ):
+        chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+        if chosen:  # numba would make it as the umask has it
+            with suppress(OSError):
+                make_own(Path(chosen, UserProvidedCacheLocator.get_suitable_cache_subpath(inspect.getfile(function))))
+        super().__init__(function)
+        source = self._cache_file._source_stamp
+        own = own_folder(Path(self._cache_path)) if folder is None else folder
+        self._cache_path = str(own)
+        self._cache_file = _Files(own, self._impl.filename_base, (source, stamp), folder is not None)
+        self._key, self._announcement = key, announcement
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return sig, codegen.magic_tuple(), self._key
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            found = super().load_overload(sig, target_context)
+        except Exception:  # a file of another installation; it is compiled again and overwritten
+            found = None
+        if found is None and self._announcement:
+            say_once(self._announcement)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError:
+            say_once(UNWRITABLE)
+
+
+class _Files:
+    """The files of one function, one for each key, each behind its checksum, and in the hands of the user alone.
+
+    A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
+    write at the same time may lead one function to the machine code of another.
+    """
+
+    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool):
+        self.folder, self.name, self.limited = folder, name, limited
+        self.made_of = numba.__version__, stamp
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write what numba made for a key, in the place of what was there."""
+        content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
+        path = self._path(key)
+        unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
+        make_own(self.folder)
+        try:
+            write_own(unfinished, hashlib.sha256(content).digest() + content)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+        if self.limited:
+            kept = sorted(self.folder.glob(f"{glob.escape(self._kind)}*.nbc"), key=_written)
+            for old in kept[:-MOST_KEPT]:
+                old.unlink(missing_ok=True)
+
+    @property
+    def _kind(self) -> str:
+        """What the names of functions that differ in what they enclose alone have in common."""
+        return self.name.partition(".locals.")[0] + ".locals."
+
+    def load(self, key: Any) -> Any:
+        """What numba made for a key; None if it is missing."""
+        try:
+            content = read_own(self._path(key))
+        except OSError:
+            return None
+        if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
+            return None
+        made_of, data = pickle.loads(content[CHECKSUM:])
+        return pickle.loads(data) if made_of == repr((*self.made_of, key)) else None
+
+    def flush(self) -> None:
+        """Remove the files of all keys."""
+        for path in self.folder.glob(f"{glob.escape(self.name)}.*.nbc"):
+            path.unlink(missing_ok=True)
+
+    def _path(self, key: Any) -> Path:
+        return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+
+
+def _written(path: Path) -> float:
+    """When a file was written; 0 if another process has removed it."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def sources_folder() -> Path:
+    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are.
+
+    Where others can write there, it is a folder in which they cannot.
+    """
+    chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
+    return own_folder(Path(folder) / "equations")
+
+
+@cache
+def say_once(text: str) -> None:
+    """Print a line on stderr, once a process."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
+    """Digests of all that the machine code of a function depends on, and of what it encloses.
+
+    The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
+    names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
+    """
+    code, enclosed = Digest(), Digest()
+    try:
+        code.add_function(function, enclosed=False)
+        enclosed.add(_enclosed(function))
+    except CannotBeWatched:
+        return None
+    return code.hash.hexdigest(), enclosed.hash.hexdigest()
+
+
+def helper(function: Callable[..., Any]) -> Any:
+    """A decorator for what compiled callbacks call: numba's, with our cache."""
+    dispatcher = njit(function)
+    dispatcher.enable_caching()
+    _take_over(dispatcher)
+    return dispatcher
+
+
+def _take_over(helper: Any) -> None:
+    """Put our cache in the place of one of numba, which does not see what a helper calls in other files."""
+    if not isinstance(helper._cache, FunctionCache) or isinstance(helper._cache, _Cache):
+        return
+    watched = watch(helper.py_func)
+    try:
+        helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
+    except RuntimeError:
+        helper._cache = NullCache()
+    if helper.stats.cache_hits:  # what numba has read already may be out of date
+        helper.recompile()
+
+
+def _enclosed(function: Any) -> list[Any]:
+    return [cell.cell_contents for cell in function.__closure__ or ()]
+
+
+class CannotBeWatched(Exception):
+    """A value that may change unseen."""
+
+
+class Digest:
+    """A hash that takes values of many types, and follows functions to whatever they name."""
+
+    def __init__(self) -> None:
+        self.hash = hashlib.sha256(np.__version__.encode())
+        self.names: set[str] = set()  # of globals and attributes in the code that is being looked at
+        self.seen: set[tuple[int, str]] = set()
+
+    def add(self, value: Any) -> None:
+        """Add a value."""
+        self.hash.update(f"<{type(value).__qualname__}>".encode())
+        if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
+            self.hash.update(repr(value).encode())
+        elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
+            self.hash.update(f"{value.dtype.descr}{value.shape}".encode() + value.tobytes())
+        elif isinstance(value, (tuple, list)):
+            self.hash.update(f"{len(value)}{getattr(value, '_fields', '')}".encode())
+            for each in value:
+                self.add(each)
+        elif isinstance(value, (set, frozenset)):
+            self.hash.update(repr(sorted(map(repr, value))).encode())
+        elif isinstance(value, dict):
+            self.add(list(value.items()))
+        elif isinstance(value, enum.Enum):
+            self.add((value.name, value.value))
+        elif isinstance(value, types.CodeType):
+            self.hash.update(value.co_code + value.co_exceptiontable)
+            self.add([value.co_consts, value.co_names, value.co_freevars])
+        elif isinstance(value, types.ModuleType):
+            self._add_module(value)
+        elif isinstance(value, Dispatcher):
+            self._add_helper(value)
+        else:
+            self._add_name(value)
+
+    def add_function(self, function: Any, enclosed: bool = True) -> None:
+        """Add the code of a function, its defaults, and the values of the globals that it names."""
+        outer, self.names = self.names, names_in(function.__code__)
+        self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
+        if enclosed:
+            self.add(_enclosed(function))
+        for name in sorted(self.names & set(function.__globals__)):
+            self.add([name, function.__globals__[name]])
+        self.names = outer
+
+    def _add_helper(self, helper: Dispatcher) -> None:
+        if self._is_new(helper):
+            _take_over(helper)
+            self.add(sorted(helper.targetoptions.items()))
+            self.add_function(helper.py_func)
+
+    def _add_module(self, module: types.ModuleType) -> None:
+        self.hash.update(module.__name__.encode())
+        if not of_library(module.__name__):
+            for name in sorted(self.names & set(vars(module))):
+                if self._is_new(module, name):
+                    self.add([name, vars(module)[name]])
+
+    def _add_name(self, value: Any) -> None:
+        """Functions and types of the libraries stand for themselves by their names; nothing else does."""
+        if isinstance(value, type) and hasattr(value, "_fields"):
+            self.hash.update(f"{value.__qualname__}{value._fields}".encode())
+            return
+        module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
+        if type(value) is np.ufunc:
+            module, name = "numpy", value.__name__
+        if module is None or name is None or not of_library(module):
+            raise CannotBeWatched
+        self.hash.update(f"{module}.{name}".encode())
+
+    def _is_new(self, value: Any, name: str = "") -> bool:
+        key = (id(value), name)
+        if key in self.seen:
+            return False
+        self.seen.add(key)
+        return True
+
+
+def names_in(code: types.CodeType) -> set[str]:
+    """Names of globals and attributes in a code and the functions within it."""
+    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    return set(code.co_names).union(*map(names_in, inner))
+
+
+def of_library(module: str) -> bool:
+    """Whether a module is of Python, or of a package that is told by its version."""
+    return module.partition(".")[0] in LIBRARIES

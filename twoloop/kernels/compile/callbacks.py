@@ -1,0 +1,294 @@
+"""The kinds of callback that a mechanism may have, in one table, and the decorator that compiles one.
+
+All that is said of a kind anywhere follows from its entry in `KINDS`: the signature that numba compiles, the fields of
+`Functions` that the kernels see, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain
+Python functions.
+"""
+
+import inspect
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numba
+from numba.core.dispatcher import Dispatcher
+
+from twoloop.kernels.compile.caches import compile_kept, watch
+
+f8 = numba.types.float64
+VECTOR = numba.types.float64[::1]
+MATRIX = numba.types.float64[:, ::1]
+
+# what callbacks depend on beside t and p, and the size of each
+STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}  # of the multipliers those of C alone
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is known of one kind of callback.
+
+    Attributes
+    ----------
+    state : tuple of str
+        What it depends on beside t and p, keys of `STATE`.
+    output : str
+        Name of the array that it fills.
+    shape : tuple of str
+        Sizes of that array: attributes of a system.
+    meaning : str
+        What it fills the array with, in a few words, for messages.
+    note : str
+        What else there is to know, for the documentation.
+    absent : str
+        What is in its place where it is left out. "": it must be given; "zeros": a callback that leaves zeros;
+        "differences": one that differences C, see `jacobian.py`; "kernels": nothing that could be called, as the
+        kernels take differences of their own.
+    needed_by : str
+        The size of the system, "n_c" or "n_a", above zero of which it must be given.
+    more : tuple
+        Name and shape of further arrays that it fills. Such a callback must be compiled.
+    """
+
+    state: tuple[str, ...]
+    output: str
+    shape: tuple[str, ...]
+    meaning: str
+    note: str = ""
+    absent: str = ""
+    needed_by: str = ""
+    more: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    @property
+    def optional(self) -> bool:
+        """Whether it may be left out."""
+        return self.absent != ""
+
+    @property
+    def outputs(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """Names and sizes of all arrays that it fills."""
+        return ((self.output, self.shape), *self.more)
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Names of the arguments of a callback that works in place."""
+        return ("t", *self.state, "p", *(name for name, _ in self.outputs))
+
+    @property
+    def signature(self) -> Any:
+        """What numba compiles a callback for."""
+        filled = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
+        return numba.types.void(f8, *[VECTOR] * len(self.state), VECTOR, *filled)
+
+    @property
+    def size(self) -> str:
+        """The shapes of the arrays, in words."""
+        return ", ".join(f"({', '.join(shape)}{',' if len(shape) == 1 else ''})" for _, shape in self.outputs)
+
+
+KINDS = {
+    "mass": Kind(
+        ("q",),
+        "M",
+        ("n_q", "n_q"),
+        "the mass matrix M",
+        "Symmetric; positive definite on the velocities that the constraints allow.",
+    ),
+    "force": Kind(("q", "v"), "Q", ("n_q",), "the force Q"),
+    "constraint": Kind(("q",), "C", ("n_c",), "the constraints C", "None: n_c is 0.", absent="zeros", needed_by="n_c"),
+    "jacobian": Kind(
+        ("q",),
+        "Cq",
+        ("n_c", "n_q"),
+        "C_q, the derivative of constraint with respect to q",
+        "None: by differences of C, of order 8. That costs 8 n_q calls of constraint for each Jacobian (more where the "
+        "constraint bends on a scale far below max(1, |q_j|)), and constraint must be defined within 1/16 of "
+        "max(1, |q_j|) about q. Entries are good to about 1e-13 of the largest term in the constraint; differences of "
+        "differences, that is, gamma left out too, to about 1e-9.",
+        absent="differences",
+    ),
+    "constraint_rate": Kind(
+        ("q",),
+        "Ct",
+        ("n_c",),
+        "C_t, the derivative of constraint with respect to t",
+        "None: the constraints do not depend on time.",
+        absent="zeros",
+    ),
+    "gamma": Kind(
+        ("q", "v"),
+        "Qd",
+        ("n_c",),
+        "Q_d = -((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = Q_d",
+        "None: by differences of C_q and C_t along the motion.",
+        absent="kernels",
+    ),
+    "force_by_q": Kind(
+        ("q", "v"),
+        "K",
+        ("n_q", "n_q"),
+        "dQ/dq, the derivative of force with respect to q",
+        "A tangent for Newton's method as the outer loop, as are the two that follow. With it the force is not "
+        "differenced; it must not depend on v then unless force_by_v is given too. None: all by differences. What the "
+        "stiff part does not need is left out then (how M, and the directions that constraints allow, change with q): "
+        "at a tolerance steps are the same, but fixed steps in which bodies turn far may fail to converge.",
+        absent="zeros",
+    ),
+    "force_by_v": Kind(
+        ("q", "v"),
+        "D",
+        ("n_q", "n_q"),
+        "dQ/dv, the derivative of force with respect to v",
+        "None beside force_by_q: the force does not depend on v.",
+        absent="zeros",
+    ),
+    "reaction_by_q": Kind(
+        ("q", "lam"),
+        "R",
+        ("n_q", "n_q"),
+        "d(C_q^T lam)/dq with lam held, the derivative of the reactions with respect to q",
+        "None: by differences of C_q, none where C_q does not change.",
+        absent="zeros",
+    ),
+    "nonholonomic": Kind(
+        ("q",),
+        "A",
+        ("n_a", "n_q"),
+        "A of the non-holonomic constraints A v + b = 0",
+        "None: n_a is 0.",
+        absent="zeros",
+        needed_by="n_a",
+    ),
+    "nonholonomic_rate": Kind(
+        ("q",), "b", ("n_a",), "b of the non-holonomic constraints A v + b = 0", "None: zero.", absent="zeros"
+    ),
+    "nonholonomic_gamma": Kind(
+        ("q", "v"),
+        "Qa",
+        ("n_a",),
+        "-((A v)_q v + A_t v + b_q v + b_t), the right-hand side of A a = Q_a",
+        "None: by differences of A and b along the motion.",
+        absent="kernels",
+    ),
+    "kinematics": Kind(
+        ("q", "v"),
+        "C",
+        ("n_c",),
+        "C, C_q, C_t and Q_d together",
+        "They share sines: one call instead of four. Goes with constraint, jacobian and gamma, and must agree.",
+        absent="zeros",
+        more=(("Cq", ("n_c", "n_q")), ("Ct", ("n_c",)), ("Qd", ("n_c",))),
+    ),
+}
+OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
+
+
+def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
+    """Compile one callback of a mechanism with the signature that its kind has.
+
+    The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,) or the
+    multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros (a tangent's of a
+    system with a bandwidth only within the band: add to it)::
+
+        @callback("jacobian")
+        def jacobian(t, q, p, Cq):
+            Cq[0, 0] = q[0]
+            Cq[0, 1] = q[1]
+
+    Its machine code is kept on disk until it, a helper that it calls, or a global that one of them names, changes.
+
+    Parameters
+    ----------
+    kind : str
+        {kinds}.
+
+    Raises
+    ------
+    ValueError
+        If `kind` is unknown.
+    TypeError
+        If the function has other arguments, or numba cannot compile it.
+    """
+    if callable(kind):
+        raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {kind!r}")
+
+    def decorate(function: Callable[..., None]) -> Dispatcher:
+        wanted, given = KINDS[kind].arguments, tuple(inspect.signature(function).parameters)
+        if given != wanted:
+            raise TypeError(
+                f"{function.__name__} is declared as the callback {kind!r}, whose arguments are "
+                f"({', '.join(wanted)}); it has ({', '.join(given)})"
+            )
+        return compile_callback(kind, function, watch(function))
+
+    return decorate
+
+
+if callback.__doc__:  # not so with python -OO
+    callback.__doc__ = callback.__doc__.format(
+        kinds=",\n        ".join(f'"{name}" ({", ".join(kind.arguments)})' for name, kind in KINDS.items())
+    )
+
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # of numba: a division by zero is an infinity, as in the kernels
+
+
+def compile_callback(
+    kind: str, function: Callable[..., Any], watched: tuple[str, str] | None, named: Callable[..., Any] | None = None
+) -> Dispatcher:
+    """Compile a function that works in place for the signature of its kind, or say in two lines why it cannot be.
+
+    `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
+    """
+    if watched is not None:
+        watched = f"{watched[0]} {_OPTIONS}", watched[1]
+    try:
+        return compile_kept(function, KINDS[kind].signature, watched, **_OPTIONS)
+    except Exception as error:  # numba lets some of its own assertions through
+        raise TypeError(_why_not(kind, named or function, error)) from None
+
+
+@cache
+def stand_in(kind: str) -> Dispatcher:
+    """What stands in the place of an optional callback that is not given: it leaves zeros."""
+
+    def leaves_zeros(t, q, p, out):
+        pass
+
+    def leaves_zeros_too(t, q, x, p, out):
+        pass
+
+    def leaves_four(t, q, v, p, C, Cq, Ct, Qd):
+        pass
+
+    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_four if KINDS[kind].more else leaves_zeros_too
+    return compile_callback(kind, function, ("leaves zeros", ""))
+
+
+def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
+    """Which function numba cannot compile, and the line of numba's message that says most."""
+    name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
+    where = f" ({code.co_filename}, line {code.co_firstlineno})" if code else ""
+    return (
+        f"{kind}: numba cannot compile the function {name!r}{where}; it must use numbers, numpy arrays of one type and "
+        f"of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
+        f"Numba says: {_telling_line(error)}"
+    )
+
+
+# lines of numba's messages that only lead to another, or show source
+_LEADING = re.compile(
+    r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
+    r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|\^|Enable logging"
+)
+
+
+def _telling_line(error: Exception) -> str:
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    plain = re.sub(r":\s*>>> ", ": ", plain)  # a signature that was not found
+    lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
+    telling = [line for line in lines if line and not _LEADING.match(line) and not line.startswith("def ")]
+    return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"

@@ -1,0 +1,1 @@
+"""What steps share beside their formulas: prediction, switching, defects."""

@@ -1,0 +1,354 @@
+"""Two methods in one run: an explicit one, and Newton's where stiffness would make its steps tiny.
+
+Now and then the largest rate of the motion, rho, the root of the largest eigenvalue of dF/dq or that of dF/dv, F being
+the accelerations, is found by a few power iterations, one evaluation each. While the explicit method takes steps of
+h rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be
+the reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
+second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows:
+what decays so fast may keep the estimate of the error from longer steps. A trial that may be in vain waits until the
+run has cost a few times as much. Costs are counted in evaluations of the explicit method; with code made for the
+mechanism one of the implicit method counts several times. This is left in the same way, after a trial of the explicit
+method, where its own steps have come below that limit. What is not kept is next tried after twice as many looks.
+
+Both methods are called by their addresses, f.first and f.second, and are compiled once, where they are.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.data.common import (
+    DONE,
+    ESTIMATE,
+    EXPLICIT_STEP,
+    FORCE_BY_Q_GIVEN,
+    GAP,
+    N_EVALUATIONS,
+    N_JACOBIANS,
+    OUTER_DIVERGED,
+    REUSE,
+    ROUNDED,
+    STEP,
+    STEP_FACTOR,
+    STRAIGHT,
+    compiled,
+    inlined,
+    kernel,
+)
+from twoloop.kernels.evaluation.calls import PROJECT, evaluate, renew_partition
+
+KEPT = 1.2  # see advance.py
+EARLY = 100.0  # evaluations before the first look at the rate
+INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
+ITERATIONS = 4
+DISPLACEMENT = 1e-6  # of the largest coordinate, for derivatives along a direction
+INNER_TOL = 1e-8  # of the positions; their error is squared
+NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
+SEED = 1e-3  # what a component of a direction begins with, of the largest
+SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
+EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
+TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
+AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain
+APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
+WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
+INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
+BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
+STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
+MEAN = 0.8  # weight of the steps before in the mean step
+SETTLE = 5.0  # accepted steps of a trial before its price is taken
+WINDOW = 10.0  # accepted steps over which it is
+SAME = 1e-9  # relative: steps that are of one length but for rounding
+GAIN = 1.2  # what a method on trial must be cheaper by
+PATIENCE = 4.0  # looks before the next trial
+
+EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
+
+# places in `options`: of the pair, then SAFETY ... REUSE_OF of the first and of the second method; then their options
+# LIMIT: h rho from which on the implicit method is tried, found at so many LOOKS in a row
+# DEARER: evaluations of the first method that one of the second costs
+LIMIT, LOOKS, MATRIX_COST, DEARER, SIZE_1, N_PAIR = range(6)
+SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, LEAST_ERROR, N_OF_EACH = range(7)  # LEAST_ERROR 0: no trend
+N_OPTIONS = N_PAIR + 2 * N_OF_EACH
+
+# places in `memory`: advance() sets LAST_ACCEPTED; behind the scalars two directions (n_q), then the two memories
+(
+    LAST_ACCEPTED,
+    PHASE,
+    STEPS,  # accepted in this phase
+    LOOK_AT,  # evaluations at which to look again
+    LOOKS_TO_WAIT,
+    WAIT,
+    T_BEGIN,
+    COST_BEGIN,
+    PRICE,  # of the method before the trial
+    RATE,  # the last one found, 1 / s
+    FIRST_MEMORY,
+    H_MEAN,
+    H_BEFORE,  # size and error of the last accepted step of this phase
+    ERROR_BEFORE,
+    H_TRIED,
+    ERROR_TRIED,
+    N_TRIALS,
+    NEAR,  # looks in a row at which h rho was above LIMIT
+    N_SCALARS,
+) = range(19)
+
+
+def switching_options(
+    limit: float,
+    looks: int,
+    matrix_cost: float,
+    dearer: float,
+    each: ArrayLike,
+    first: ArrayLike,
+    second: ArrayLike,
+) -> NDArray[np.float64]:
+    """`options`: of the pair, see LIMIT and what follows; then six numbers of each; then their own."""
+    first = np.asarray(first, dtype=np.float64)
+    scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
+    return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
+
+
+def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+    """`memory` for methods with these memories."""
+    first, second = np.asarray(first), np.asarray(second)
+    scalars = np.zeros(N_SCALARS)
+    scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
+    directions = np.concatenate([0.3 + 0.1 * (np.arange(n_q) % 7)] * 2)
+    return np.concatenate([scalars, directions, first, second])
+
+
+@inlined
+def _memories(memory, n):
+    split = N_SCALARS + 2 * n + int(memory[FIRST_MEMORY])
+    return memory[N_SCALARS + 2 * n : split], memory[split:]
+
+
+@compiled
+def _evaluate(f, w, t, Q, V, A):
+    """Accelerations A at a state (Q, V) near the constraints, which is moved there."""
+    if f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size:  # cheaper, to the nearest state on the constraints
+        return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
+    return evaluate(f, w, t, Q, V, INNER_TOL, A)
+
+
+@compiled
+def _along(f, w, t, state, direction, by_v, Q, V, A):
+    """How much larger dF/dq or dF/dv makes a direction of the independents, whose image of length 1 replaces it."""
+    n = Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    places = w.independent_v if by_v else w.independent
+    largest = 1.0
+    for m in range(n):
+        largest = max(largest, abs(v[m]) if by_v else abs(q[m]))
+    size = DISPLACEMENT * largest
+    copy(q, Q)
+    copy(v, V)
+    moved = V if by_v else Q
+    for i in places:
+        moved[i] += size * direction[i]
+    if _evaluate(f, w, t, Q, V, A) != DONE:
+        return 0.0
+    image, size = 0.0, 0.0
+    for i in places:
+        image = max(image, abs(A[i] - a[i]))
+        size = max(size, abs(V[i] - v[i]) if by_v else abs(Q[i] - q[i]))
+    if not (image > 0.0 and np.isfinite(image) and size > 0.0):
+        return 0.0
+    for i in places:
+        direction[i] = (A[i] - a[i]) / image
+    return image / size
+
+
+@compiled
+def _largest_rate(f, w, memory, t, state, new_state):
+    """The largest rate at a state, 1/s; `new_state` is scratch."""
+    n = w.Q.size
+    by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
+    Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
+    squared = damping = 0.0
+    # code made for the mechanism has no use for the partition, which may be an old one whose independents hardly move
+    explicit = memory[PHASE] == EXPLICIT
+    if explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
+        return 0.0
+    for _ in range(ITERATIONS):
+        squared = _along(f, w, t, state, by_q, False, Q, V, A)
+    for _ in range(ITERATIONS):
+        damping = _along(f, w, t, state, by_v, True, Q, V, A)
+        if damping * memory[H_MEAN] < NEGLIGIBLE:
+            break
+    for m in range(n):  # coordinates that were independent at no look, or have no part in it, are begun anew
+        if by_q[m] == 0.0:
+            by_q[m] = SEED
+        if by_v[m] == 0.0:
+            by_v[m] = SEED
+    return max(np.sqrt(squared), damping)
+
+
+@compiled
+def _shown_rate(f, w, t, state, rate, Q, V, A):
+    """The rate at which the motion changes its velocities, or its accelerations, 1/s; infinite where it is unknown."""
+    n = Q.size
+    instant = INSTANT / rate
+    fastest = largest = change = 0.0
+    for m in range(n):
+        Q[m] = state[m] + instant * state[n + m]
+        V[m] = state[n + m] + instant * state[2 * n + m]
+    if _evaluate(f, w, t + instant, Q, V, A) != DONE:
+        return np.inf
+    for i in w.independent_v:
+        fastest = max(fastest, abs(state[n + i]))
+        largest = max(largest, abs(state[2 * n + i]))
+        change = max(change, abs(A[i] - state[2 * n + i]))
+    if fastest == 0.0 or largest == 0.0:
+        return np.inf
+    return max(largest / fastest, change / (instant * largest))
+
+
+@compiled
+def _cost(w, options):
+    """What the run has cost so far, in evaluations."""
+    return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
+
+
+@compiled
+def _price(w, options, memory, t):
+    """What a second of motion has cost since the price was last begun, in evaluations of the first method."""
+    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    return price if memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL) else options[DEARER] * price
+
+
+@compiled
+def _enter(w, options, memory, n, phase, t):
+    """Begin another phase; its method knows nothing of the steps before."""
+    memory[PHASE] = phase
+    memory[STEPS] = 0.0
+    memory[ERROR_BEFORE] = 0.0
+    memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
+
+
+@compiled
+def _settle_trial(w, options, memory, n, t):
+    """Whether the method on trial is kept; returns the phase to begin, or -1."""
+    if memory[STEPS] == SETTLE:
+        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+    if memory[STEPS] < SETTLE + WINDOW:
+        return -1
+    price = _price(w, options, memory, t)
+    keeps = price * GAIN <= memory[PRICE]
+    memory[WAIT] = PATIENCE if keeps else 2.0 * memory[WAIT]
+    memory[LOOKS_TO_WAIT] = memory[WAIT]
+    if memory[PHASE] == ON_TRIAL:
+        return IMPLICIT if keeps else EXPLICIT
+    return EXPLICIT if keeps else IMPLICIT
+
+
+@compiled
+def _look(f, w, options, memory, t, state, new_state):
+    """Whether the other method is due for a trial; returns the phase to begin, or -1."""
+    n = w.Q.size
+    memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
+    price, cost = _price(w, options, memory, t), _cost(w, options)
+    memory[T_BEGIN], memory[COST_BEGIN] = t, cost
+    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
+    memory[LOOKS_TO_WAIT] -= 1.0
+    share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
+    if share > 1.0:
+        memory[NEAR] += 1.0
+    if memory[LOOKS_TO_WAIT] > 0.0:
+        return -1
+    # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
+    trial = TRIAL * options[DEARER]
+    cheap = cost > AFFORDED * trial and (f.flags[FORCE_BY_Q_GIVEN] == 1 or cost > EARN * w.independent.size)
+    hidden = False
+    if memory[PHASE] == EXPLICIT and cheap and share > WORTH:
+        Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
+        hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
+    due = share > SURELY or hidden or (memory[NEAR] >= options[LOOKS] and cheap)
+    if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
+        memory[NEAR] = 0.0
+    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
+        memory[PRICE] = price
+        memory[N_TRIALS] += 1.0
+        return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
+    return -1
+
+
+@compiled
+def _restart(memory):
+    """A method's memory as at the beginning of a run."""
+    for i in range(memory.size):
+        memory[i] = 0.0
+
+
+@compiled
+def _factor(memory, each, h, error):
+    """The step factor as advance() would choose it for the method alone, from the error and its trend."""
+    if error == 0.0:
+        return each[FACTOR_MAX]
+    factor = each[SAFETY] * error ** -each[EXPONENT]
+    if error <= 1.0 and each[LEAST_ERROR] > 0.0 and memory[ERROR_BEFORE] > 0.0:
+        trend = h / memory[H_BEFORE] * (memory[ERROR_BEFORE] / error) ** each[EXPONENT]
+        factor = min(factor, factor * trend)
+    factor = min(each[FACTOR_MAX], max(each[FACTOR_MIN], factor))
+    return 1.0 if each[LEAST_ERROR] > 0.0 and error <= 1.0 and 1.0 <= factor <= KEPT else factor
+
+
+@kernel(STEP)
+def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt by one of the two, and the step that it asks for next, as advance() would choose it.
+
+    A method of the second kind begins anew each time; its memory is all zeros then.
+    """
+    n = w.Q.size
+    first, second = _memories(memory, n)
+    if np.isnan(memory[T_BEGIN]):  # of a run, or of what is left of it beyond a singular position
+        memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
+        memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY
+    memory[STEPS] += memory[LAST_ACCEPTED]
+    if memory[LAST_ACCEPTED] == 1.0:
+        memory[H_BEFORE], memory[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
+    if memory[LAST_ACCEPTED] == 1.0 and tolerances[ESTIMATE] == 1.0:
+        phase = -1
+        if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
+            phase = _settle_trial(w, options, memory, n, t)
+        elif w.counters[N_EVALUATIONS] >= memory[LOOK_AT]:
+            phase = _look(f, w, options, memory, t, state, new_state)
+        if phase >= 0:
+            was_explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
+            is_explicit = phase in (EXPLICIT, BACK_ON_TRIAL)
+            _enter(w, options, memory, n, phase, t)
+            if was_explicit != is_explicit:
+                _restart(first if is_explicit else second)
+    explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
+    w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
+    begin = N_OPTIONS + int(options[SIZE_1])
+    each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
+    w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
+    if explicit:
+        first[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
+        code, error = f.first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
+        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0:  # a constant step cannot become shorter
+            _enter(w, options, memory, n, IMPLICIT, t)
+            _restart(second)
+            w.notes[EXPLICIT_STEP] = 0.0
+            code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
+    else:
+        # only steps of the first method may look at the equations within them; others have to be short
+        if tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + SAME):
+            w.notes[STEP_FACTOR] = tolerances[GAP] / h
+            return DONE, 1.0 + SAME
+        second[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
+        code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
+    memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
+    if code != DONE or not np.isfinite(error):
+        return code, error
+    if memory[PHASE] == ON_TRIAL:
+        error *= STRICT
+    memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
+    if w.notes[STEP_FACTOR] == 0.0:  # else the method knows better
+        w.notes[STEP_FACTOR] = _factor(memory, each, h, error)
+    if not explicit:
+        w.notes[STEP_FACTOR] = min(w.notes[STEP_FACTOR], max(tolerances[GAP] / h, 1.0))
+    return code, error

@@ -1,0 +1,1 @@
+"""The arrays and numbers that all kernels share."""

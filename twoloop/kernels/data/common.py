@@ -1,0 +1,328 @@
+"""What every kernel shares: signatures, the workspace, return codes, counters and the compiling decorator.
+
+Every callback of a mechanism has one fixed signature and works in place, so that the integrator is compiled once
+and takes any mechanism (and any method) as a first-class function.
+"""
+
+import hashlib
+import inspect
+import re
+from collections import namedtuple
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numba import njit, types
+from numba.core.dispatcher import Dispatcher
+from numba.extending import typeof_impl
+
+from twoloop.kernels.compile.caches import compile_kept
+from twoloop.kernels.compile.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
+from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
+from twoloop.kernels.compile.reference import Reference
+
+i8 = types.int64
+INTEGERS = types.int64[::1]
+
+# the callbacks of a mechanism, its parameters and its flags
+Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore[misc]
+
+
+# places in Functions.flags; BANDWIDTH is -1 where linear algebra is not banded; FORM: how accelerations
+# are found, see accelerations.py; DENSE_FORM: what it becomes where sparse factors have too many entries;
+# STRAIGHT: 1 where the inner loop is code made for the mechanism, see straight_code.py
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
+MULTIPLIERS, NULL_SPACE, AUGMENTED = range(3)  # forms
+GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
+N_FLAGS = FIRST_GIVEN + len(GIVEN)
+CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
+    GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")
+)
+NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
+    GIVEN[name] for name in ("nonholonomic_rate", "nonholonomic_gamma")
+)
+
+
+class Work(NamedTuple):
+    """Arrays that an evaluation writes; made once a run.
+
+    Sizes: n_q coordinates; n_c + n_a rows of C_q and A, of which r_v have full rank, among them r of C_q; n_dof = n_q -
+    r_v. Fields that end in _v belong to velocities; without rows of A they are the same arrays as those of positions.
+    """
+
+    M: Any  # (n_q, n_q) mass matrix
+    L: Any  # (n_q, n_q) of a constant M the inverse, else its factors, see ldl_factor; or banded ones
+    G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
+    entries: Any  # the same numbers as a vector
+    augmented: Any  # the same, and those of M behind
+    S: Any  # (r_v, r_v) G M^-1 G^T of the rows that count, and its factors
+    W: Any  # (r_v, n_q) its rows G M^-1
+    A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
+    MT: Any  # (n_q, n_dof) M T
+    D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0: in order of elimination
+    Gx: Any  # (n_c + n_a, n_q) rows at a displaced point (Q_d by differences); scratch for full pivoting
+    G_of_S: Any  # (n_c + n_a, n_q) the G that S and W belong to, where M is constant, not diagonal; NaN: none
+    pattern: Any  # (n_c + n_a, n_q) 1 where G was ever seen to have an entry
+    mass_pattern: Any  # (n_q, n_q) the same of M; empty without the augmented form
+    places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
+    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see kinks.py
+    Q: Any  # (n_q) force
+    x: Any  # (n_q) scratch
+    y: Any  # (n_q) scratch
+    C: Any  # (n_c) constraint, and corrections
+    Rate: Any  # (n_c + n_a) C_t and b
+    Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma
+    g: Any  # (n_c + n_a) scratch
+    z: Any  # (r_v) scratch
+    lam: Any  # (n_c + n_a) multipliers of an evaluation that is not kept
+    minimum: Any  # room for the multipliers of least norm
+    rows: Any  # (r) rows of C that count
+    dependent: Any  # (r) columns of the coordinates that they determine
+    independent: Any  # (n_q - r) columns of the others
+    index: Any  # program of the factors of C_qd, see factors.py
+    values: Any  # the factors
+    rows_v: Any  # (r_v) rows of G that count
+    dependent_v: Any  # (r_v)
+    independent_v: Any  # (n_dof)
+    index_v: Any
+    values_v: Any
+    index_a: Any  # program and factors of the augmented matrix; size 0: none yet. Empty without this form
+    values_a: Any
+    right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
+    order: Any  # (n_q) scratch: column order of the full pivoting
+    row_order: Any  # (n_c + n_a) scratch: row order
+    counters: Any  # (N_COUNTERS) see below
+    lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
+    predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
+    notes: Any  # (N_NOTES) see below
+
+    address: Any = 0  # of the table by which kernels find these arrays
+    table: Any = None
+
+
+_INTEGER_FIELDS = {
+    *("rows", "dependent", "independent", "index", "rows_v", "dependent_v", "independent_v", "index_v"),
+    *("index_a", "places", "order", "row_order", "counters", "lapack"),
+}
+_MATRIX_FIELDS = {
+    *("M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried", "rates")
+}
+WORK = Reference(
+    "Work",
+    {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-2]},
+)
+
+
+@typeof_impl.register(Work)
+def _type_of_work(value: Any, context: Any) -> Any:
+    return WORK
+
+
+# places in Work.counters
+(
+    N_ACCEPTED,
+    N_REJECTED_ERROR,
+    N_REJECTED_CONVERGENCE,
+    N_OUTER,
+    N_INNER,
+    N_EVALUATIONS,
+    N_PARTITIONS,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    N_COUNTERS,
+) = range(10)
+
+# places in Work.notes
+(
+    SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
+    DEPARTURE,  # how far the predicted dependents were off in this attempt, see predictor.py
+    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
+    ORIENTATION_NEW,  # ... and at the end of this attempt
+    FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
+    FAULT_TIME,  # ... and when
+    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see differences.py
+    GAMMA_SHARE,  # of the longest length over which to difference
+    GAMMA_ACCURACY,  # reached when that share was chosen
+    GAMMA_SCALE,  # largest entry of Q_d so far
+    REUSE,  # correction of a position below which the Jacobian before it serves for velocities and accelerations
+    ROUNDED,  # the same at a state that may be accepted: rounding of the positions
+    GENERATION,  # how many partitions there were
+    RANK,  # of C_q, and of C_q and A, where they are not what the workspace is made for
+    RANK_V,
+    CONTRADICTION,  # row that was taken for redundant and is violated
+    PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
+    STEP_FACTOR,  # the step that a method asks for next, over this one; 0: advance() chooses it from the error
+    MASS_SCALE,  # s of the augmented matrix, see augmented.py
+    FACTORED,  # 1: its factors belong to w.M and w.G
+    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
+    BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
+    EXPLICIT_STEP,  # 1: a method that switches took an explicit step
+    DEFECT,  # largest that this attempt found of itself, over what the tolerances allow; -1: it did not look
+    LARGEST_DEFECT,  # of the accepted steps
+    UNCHECKED,  # accepted steps that did not look
+    WIDEST_GAP,  # between two places at which accepted steps looked at the equations, s
+    KINK_BEFORE,  # times between which no jump of C_t or b is known
+    KINK_AFTER,
+    LEANING,  # largest share of a row that counts in a redundant one, as at the first look under this partition
+    N_NOTES,
+) = range(32)
+
+# what a kernel returns: DONE, or why it could not
+(
+    DONE,
+    OUTER_DIVERGED,
+    INNER_DIVERGED,
+    SINGULAR,
+    NOT_FINITE,
+    MASS_NOT_DEFINITE,
+    GAMMA_INACCURATE,
+    RANK_DIFFERS,
+    ROWS_CONTRADICT,
+) = range(9)
+
+
+class Kit:
+    """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
+
+    The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
+    chooses between two others has these as `first` and `second`. An inner loop made for the mechanism leaves to
+    `general` what it does not do itself; `own` is a part of the step made for it, Taylor series or stages, and
+    `instead` what is called where that does not serve.
+    """
+
+    def __init__(
+        self,
+        functions: Any,
+        inner: Any = None,
+        step: Any = None,
+        first: Any = None,
+        second: Any = None,
+        general: Any = None,
+        own: Any = None,
+        instead: Any = None,
+    ):
+        self.functions, self.inner, self.step, self.first, self.second = functions, inner, step, first, second
+        self.general, self.own, self.instead = general, own, instead
+        self.table = KIT.table(self)
+        self.address = self.table.ctypes.data
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.functions, name)
+
+
+KIT = Reference("Kit", {"p": VECTOR, "flags": INTEGERS})
+for _name, _kind in KINDS.items():
+    KIT.add_function(_name, _kind.signature)
+# (kit, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
+INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
+for _name in ("inner", "general"):
+    KIT.add_function(_name, INNER)
+# (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
+STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
+for _name in ("step", "first", "second", "own", "instead"):
+    KIT.add_function(_name, STEP)
+
+
+@typeof_impl.register(Kit)
+def _type_of_kit(value: Any, context: Any) -> Any:
+    return KIT
+
+
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP
+# the time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of
+# each coordinate and its velocity
+RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
+
+
+_FOLDER = Path(__file__).parents[1]  # of the kernels
+
+
+def _path(module: str) -> Path:
+    return _FOLDER / f"{module.replace('.', '/')}.py"
+
+
+@cache
+def _text(module: str) -> str:
+    path = _path(module)
+    return path.read_text() if path.exists() else ""
+
+
+def _imports(text: str) -> set[str]:
+    """Names of the kernels' modules that a source imports, such as "steps.stages"."""
+    names = set()
+    for room, several, one in re.findall(
+        r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE
+    ):
+        if _path(room[1:]).exists():
+            names.add(room[1:])
+        else:
+            modules = (name.split(" as ")[0].strip() for name in (several or one).split(","))
+            names |= {f"{room}.{module}"[1:] for module in modules if module}
+    return names
+
+
+@cache
+def stamp(module: str) -> str:
+    """A digest of what the kernels of a module, such as "steps.stages", depend on: sources, and the callbacks."""
+    known: set[str] = set()
+    found = {module}
+    while found:
+        known |= found
+        found = {name for each in found for name in _imports(_text(each)) if name not in known}
+    digest = hashlib.sha256(repr((KIT.functions, GIVEN)).encode())
+    for each in sorted(known):
+        digest.update(_text(each).encode())
+    return digest.hexdigest()
+
+
+def _module(function: Callable[..., Any]) -> str:
+    """The module of a kernel, such as "steps.stages"."""
+    path = Path(inspect.getfile(function)).with_suffix("")
+    return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
+
+
+_ANNOUNCEMENT = "twoloop: compiling the integrator, about a minute; later processes read it from the disk"
+
+
+def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """Compile a function of the integrator, and keep the machine code until a file that it needs changes."""
+
+    def compile_now(function: Callable[..., Any]) -> Dispatcher:
+        return compile_kept(
+            function,
+            signature,
+            (stamp(_module(function)), ""),
+            announcement=_ANNOUNCEMENT,
+            pipeline_class=VectorizingCompiler if vectorized else KernelCompiler,
+            **OPTIONS,
+        )
+
+    return compile_now
+
+
+# NaN and infinity keep their meaning. Without numba's runtime no array can be allocated, so a step that would does not
+# compile, and none is reference-counted, which costs an evaluation of the four-bar a third of its time
+OPTIONS: dict[str, Any] = {
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+    "nogil": True,
+    "_nrt": False,
+}
+
+
+def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """A decorator for what kernels call; such a function must not be called from Python."""
+    wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
+
+
+# Flags are said outright, because a callee inherits its caller's: what a merged helper calls would be merged, too.
+# A helper whose floating-point operations keep their order
+exact = _helper(fastmath=False, forceinline=False)
+compiled = _helper(forceinline=False)  # a helper that kernels call; one copy, unless LLVM finds it short
+inlined = _helper(inline="always")  # one that vanishes in its caller; only such a one can return views of arrays
+# the same later, by LLVM, and so typed once: for what is short, or called in every evaluation; each call is a copy
+merged = _helper(forceinline=True)

@@ -1,0 +1,214 @@
+"""The inner loop as the steps call it: one compiled function, so that no step compiles it again.
+
+A step gets a `Kit`, the callbacks and this function; the helpers here name its tasks.
+"""
+
+from twoloop.kernels.data.common import (
+    DONE,
+    INNER,
+    INNER_DIVERGED,
+    KNOWN,
+    REUSE,
+    ROUNDED,
+    SINGULAR,
+    compiled,
+    kernel,
+    merged,
+)
+from twoloop.kernels.evaluation.accelerations import accelerate, acceleration_constraint, equilibrate, factor_mass
+from twoloop.kernels.evaluation.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
+from twoloop.kernels.evaluation.onto_constraints import accelerate_there, to_constraints
+from twoloop.kernels.evaluation.partition import (
+    has_new_entries,
+    note_entries,
+    partition_of_midpoint,
+    renew,
+    write_programs,
+)
+
+(
+    EVALUATE,
+    EVALUATE_STATE,
+    RESTORE,
+    POSITIONS,
+    ACCELERATIONS,
+    MULTIPLIERS,
+    EVALUATE_THERE,
+    PROJECT,
+    TANGENTS,
+    GAMMA,
+    MASS,
+    RENEW,
+    MIDPOINT,
+    PATTERN,
+    REDUNDANT,
+) = range(15)
+
+ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
+ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
+
+
+@merged
+def _verify_pattern(w):
+    """Where the Jacobian has an entry for the first time, what was evaluated on the way is wrong."""
+    if not note_entries(w):
+        return DONE
+    return INNER_DIVERGED if write_programs(w) else SINGULAR
+
+
+@compiled
+def _other_task(f, w, task, t, q, v):
+    if task == TANGENTS:
+        code = factor_dependent(f, w, t, q)
+        if code == DONE:
+            tangents(f, w, t, q)
+        return code
+    if task == GAMMA:
+        w.notes[KNOWN] = 0.0
+        return acceleration_constraint(f, w, t, q, v)
+    if task == MASS:
+        return factor_mass(f, w, t, q)
+    if task == RENEW:
+        return renew(f, w, t, q)
+    if task == MIDPOINT:
+        return partition_of_midpoint(f, w, t, q, v)
+    if task == PATTERN:
+        return _verify_pattern(w)
+    return redundant_rows_hold(f, w, t, q, v)
+
+
+@merged
+def _all_coordinates(f, w, task, t, q, v, tolerance, a, lam):
+    """Tasks of methods that integrate all coordinates."""
+    if task == EVALUATE_THERE:
+        return accelerate_there(f, w, t, q, v, a)
+    return to_constraints(f, w, t, q, v, tolerance, a, lam)
+
+
+@kernel(INNER)
+def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
+    """What the names of the tasks say, at (t, q, v); see the helpers below."""
+    if task >= TANGENTS:
+        return _other_task(f, w, task, t, q, v)
+    if task >= EVALUATE_THERE:
+        return _all_coordinates(f, w, task, t, q, v, tolerance, a, lam)
+    code = DONE
+    if task <= POSITIONS:
+        reuse = w.notes[REUSE] if task == EVALUATE else w.notes[ROUNDED]
+        code = positions(f, w, t, q, v, tolerance, reuse)
+        if code == DONE and task != EVALUATE:
+            code = _verify_pattern(w)
+        if code != DONE or task == POSITIONS:
+            return code
+        velocities(f, w, t, q, v, reuse)
+    if task == RESTORE:
+        return code
+    if task != MULTIPLIERS:
+        code = accelerate(f, w, t, q, v, a)
+    if code == DONE and task != EVALUATE:
+        equilibrate(f, w, a, lam)
+    return code
+
+
+@merged
+def evaluate(f, w, t, q, v, tolerance, a):
+    """One evaluation of the right-hand side: dependents of q and v from their independents, then a.
+
+    Velocities and accelerations are those of a Jacobian whose position is off by w.notes[REUSE] at most.
+    """
+    return f.inner(f, w, EVALUATE, t, q, v, tolerance, a, w.lam)
+
+
+@merged
+def evaluate_state(f, w, t, q, v, tolerance, a, lam):
+    """The same for a state that may be accepted: exact to rounding, with multipliers."""
+    return f.inner(f, w, EVALUATE_STATE, t, q, v, tolerance, a, lam)
+
+
+@merged
+def evaluate_there(f, w, t, q, v, a):
+    """Accelerations at (q, v) as they stand, which need not be on the constraints."""
+    return f.inner(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
+
+
+@merged
+def project(f, w, t, q, v, theta, a, lam):
+    """(q, v) moved to the constraints, with a and lam; the last move of a position is at most theta.
+
+    Rows of A leave positions free: with them the dependents are restored from the independents.
+    """
+    if w.Rate.size > w.C.size:
+        return evaluate_state(f, w, t, q, v, theta, a, lam)
+    code = f.inner(f, w, PROJECT, t, q, v, theta, a, lam)
+    if code == DONE and has_new_entries(w.G, w.pattern):
+        code = f.inner(f, w, PATTERN, t, q, v, theta, a, lam)
+    return code
+
+
+@merged
+def restore(f, w, t, q, v, tolerance):
+    """Dependents of q and v from their independents; leaves w ready for `accelerations` at this state."""
+    return f.inner(f, w, RESTORE, t, q, v, tolerance, w.x, w.lam)
+
+
+@merged
+def dependent_positions(f, w, t, q, v, tolerance):
+    """Dependents of q from its independents; rows and factors in w are those at q."""
+    return f.inner(f, w, POSITIONS, t, q, v, tolerance, w.x, w.lam)
+
+
+@merged
+def accelerations(f, w, t, q, v, a, lam):
+    """Eqs. (6)-(8) at a state that was restored just before: accelerations and multipliers."""
+    return f.inner(f, w, ACCELERATIONS, t, q, v, 0.0, a, lam)
+
+
+@merged
+def multipliers(f, w, t, q, v, a, lam):
+    """Those that belong to the accelerations found just before."""
+    return f.inner(f, w, MULTIPLIERS, t, q, v, 0.0, a, lam)
+
+
+@merged
+def find_tangents(f, w, t, q):
+    """Rows and factors at a position on the constraints, and the velocities that they allow, in w.D."""
+    return f.inner(f, w, TANGENTS, t, q, q, 0.0, w.x, w.lam)
+
+
+@merged
+def find_gamma(f, w, t, q, v):
+    """The right-hand side of the acceleration constraints, in w.Gamma."""
+    return f.inner(f, w, GAMMA, t, q, v, 0.0, w.x, w.lam)
+
+
+@merged
+def prepare_mass(f, w, t, q):
+    """M(t, q) and its factors, where they are needed."""
+    return f.inner(f, w, MASS, t, q, q, 0.0, w.x, w.lam)
+
+
+@merged
+def renew_partition(f, w, t, q):
+    """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
+    return f.inner(f, w, RENEW, t, q, q, 0.0, w.x, w.lam)
+
+
+@merged
+def take_midpoint(f, w, t_mid, state, new_state):
+    """The partition of the middle of a step, see partition_of_midpoint."""
+    return f.inner(f, w, MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
+
+
+@merged
+def check_redundant(f, w, t, q, v):
+    """Whether the rows that were left out hold at an accepted state."""
+    return f.inner(f, w, REDUNDANT, t, q, v, 0.0, w.x, w.lam)
+
+
+@merged
+def rounding_floor(q):
+    """Relative change below which a fixed-point iteration that stops shrinking has converged: q is rounded."""
+    size = 0.0
+    for j in range(q.size):
+        size = max(size, abs(q[j]))
+    return max(ROUNDING, ROUNDING_OF_Q * size)

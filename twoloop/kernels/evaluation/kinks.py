@@ -1,0 +1,123 @@
+"""Times at which C_t or b jumps: the end of a ramp in a drive, say, where velocities change as by an impulse.
+
+Steps see forces, and an impulse is none: at a jump of C_t methods that restore the dependents leave the independents
+as they were, which no momentum balance allows. So a step whose velocities change by more than its accelerations
+explain is looked at, C_t and b at thirteen times along a line: what a polynomial of degree 11 leaves of them is next
+to nothing where they are smooth on the scale of the step, and falls by 2^12 where an interval is halved. Of a jump it
+is the jump, in one of the halves, however short they are.
+"""
+
+import numpy as np
+
+from twoloop.kernels.data.common import ATOL, RTOL, compiled
+from twoloop.kernels.evaluation.constraints import constraint_rates
+
+PARTS = 12
+# the twelfth difference
+BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
+HALVINGS = 60
+ROUNDING = 1e-11  # of C_t: what that may be for rounding's sake
+BY_TIME = 5e3  # the same, times the rounding of t and the slope
+STEEP = 4.0  # times the mean slope over the step: a ramp that the step is too long for, unless it is at most ...
+SHORT = 0.125  # ... this share of it
+NEAREST = 8.0  # spacings of floating-point numbers: no interval is halved below this length
+SMOOTH, RAMP, JUMP = range(3)
+
+
+@compiled
+def _sample(f, w, t, q, way, begin, end):
+    """C_t and b at thirteen times from begin to end, on the line q + way (time - t), into w.rates."""
+    for k in range(PARTS + 1):
+        time = end if k == PARTS else begin + (end - begin) * (k / PARTS)
+        for m in range(q.size):
+            w.x[m] = q[m] + (time - t) * way[m]
+        constraint_rates(f, w, time, w.x, w.rates[k])
+
+
+@compiled
+def _bend(w, row):
+    total = 0.0
+    for k in range(PARTS + 1):
+        total += BINOMIAL[k] * w.rates[k, row]
+    return abs(total)
+
+
+@compiled
+def _slope_and_size(w, row, length):
+    """Mean slope of a row over the samples, its sign left out, and its largest value."""
+    change = 0.0
+    largest = abs(w.rates[0, row])
+    for k in range(PARTS):
+        change += abs(w.rates[k + 1, row] - w.rates[k, row])
+        largest = max(largest, abs(w.rates[k + 1, row]))
+    return change / length, largest
+
+
+@compiled
+def _allowed(w, tolerances, x, row):
+    """What a row may be off for the tolerances of coordinates, or velocities, x."""
+    largest = 0.0
+    for m in range(x.size):
+        tolerance = tolerances[ATOL + m] + tolerances[RTOL] * abs(x[m])
+        largest = max(largest, abs(w.G[row, m]) * tolerance)
+    return largest
+
+
+@compiled
+def unexplained(tolerances, h, state, new_state, n):
+    """Largest change of a velocity that the accelerations at both ends do not explain, over the tolerances."""
+    largest = 0.0
+    for m in range(n):
+        v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
+        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(v), abs(v1))
+        largest = max(largest, abs(v1 - v - 0.5 * h * (a + a1)) / scale)
+    return largest
+
+
+@compiled
+def find_kink(f, w, t, end, q, v, way, tolerances):
+    """SMOOTH, RAMP or JUMP, and the interval in which the row that is least smooth rises, from t to `end`.
+
+    RAMP: a step of at most that length is next. Methods whose accelerations at both ends are zero see nothing of a ramp
+    that fills their step.
+    """
+    begin = t
+    h = end - t
+    _sample(f, w, t, q, way, begin, end)
+    row, limit, mean, most = -1, 0.0, 0.0, 1.0
+    for i in range(w.Rate.size):
+        slope, size = _slope_and_size(w, i, h)
+        least = max(_allowed(w, tolerances, v, i), ROUNDING * size, BY_TIME * slope * np.spacing(abs(end)))
+        bend = _bend(w, i)
+        if bend > most * least:
+            row, limit, mean, most = i, least, slope, bend / least
+    if row < 0:
+        return SMOOTH, t, end
+    steepest, low, high = 0.0, begin, end
+    for _ in range(HALVINGS):
+        if end - begin <= NEAREST * np.spacing(abs(end)):
+            break
+        middle = begin + 0.5 * (end - begin)
+        _sample(f, w, t, q, way, middle, end)
+        above = _bend(w, row)
+        _sample(f, w, t, q, way, begin, middle)
+        below = _bend(w, row)
+        if not max(above, below) > limit:
+            break
+        if above > below:
+            begin = middle
+            _sample(f, w, t, q, way, begin, end)
+        else:
+            end = middle
+        slope, _ = _slope_and_size(w, row, end - begin)
+        if slope > steepest and end - begin <= SHORT * h and slope * (end - begin) > limit:
+            steepest, low, high = slope, begin, end
+    if end - begin <= NEAREST * np.spacing(abs(end)):
+        _sample(f, w, t, q, way, begin, end)
+        if abs(w.rates[PARTS, row] - w.rates[0, row]) > limit:
+            return JUMP, begin, end
+    if steepest > STEEP * mean:
+        return RAMP, low, high
+    if end - begin < h:  # half the step is not smooth either: a ramp as long as the step, or a kink
+        return RAMP, t, t + 0.5 * h
+    return SMOOTH, t, t + h

@@ -1,0 +1,137 @@
+"""What callbacks were traced to, in numbers, beside what they give when called: see generate/traced_values.py.
+
+With every number goes a bound of what rounding does to it, in units of EPS; it is at least the size of the terms.
+"""
+
+import math
+
+from numba import types
+
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, exact, i8, kernel
+
+# kinds of operation, as twoloop.generate.tracing has them; RESULT is the entry of a callback
+PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, _, SUM, RESULT = range(11)
+# columns of the program: kind, the node (or entry) that is made, and where the terms of two forms begin and end
+KIND, MADE, FIRST, SECOND, END, N_COLUMNS = range(6)
+VALUE, BOUND = range(2)  # rows of `nodes`
+
+EPS = 2.0**-52
+SAME = 1e-9  # relative: what is larger counts as a difference, if it is not rounding of the traced operations,
+ROUNDED = 200.0 * EPS  # times their bound
+
+
+@exact
+def _sum(columns, coefficients, constant, nodes, begin, end):
+    """A form, and its bound."""
+    total, bound = constant, abs(constant)
+    for k in range(begin, end):
+        term = coefficients[k] * nodes[VALUE, columns[k]]
+        total += term
+        bound += abs(term) + abs(coefficients[k]) * nodes[BOUND, columns[k]]
+    return total, bound
+
+
+@exact
+def _operation(kind, x, dx, y, dy):
+    """The result of an operation, and its bound."""
+    if kind == PRODUCT:
+        z = x * y
+        dz = abs(x) * dy + abs(y) * dx
+    elif kind == RECIPROCAL:
+        z = 1.0 / x
+        dz = dx * z * z
+    elif kind == SQUARE_ROOT:
+        z = math.sqrt(x)
+        dz = min(0.5 * dx / z, math.sqrt(dx / EPS)) if dx > 0.0 else 0.0
+    elif kind == EXPONENTIAL:
+        z = math.exp(x)
+        dz = dx * z
+    elif kind == SINE:
+        z, dz = math.sin(x), dx
+    elif kind == COSINE:
+        z, dz = math.cos(x), dx
+    elif kind == LOGARITHM:
+        z = math.log(x)
+        dz = dx / abs(x)
+    elif kind == ARCTANGENT:
+        z = math.atan(x)
+        dz = dx / (1.0 + x * x)
+    else:
+        z, dz = x, dx
+    dz += abs(z)
+    return z, 0.0 if math.isnan(dz) else dz
+
+
+@exact
+def _traced(program, columns, coefficients, constants, nodes, values, bounds):
+    """Run the program on what stands in the first nodes."""
+    for i in range(len(program)):
+        first, second, end = program[i, FIRST], program[i, SECOND], program[i, END]
+        x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
+        if program[i, KIND] == RESULT:
+            values[program[i, MADE]], bounds[program[i, MADE]] = x, dx
+        else:
+            y, dy = _sum(columns, coefficients, constants[i, 1], nodes, second, end)
+            z, dz = _operation(program[i, KIND], x, dx, y, dy)
+            nodes[VALUE, program[i, MADE]], nodes[BOUND, program[i, MADE]] = z, dz
+
+
+@exact
+def _differences(called, traced, bounds):
+    """How many numbers differ, rounding apart; what is not finite does."""
+    count = 0
+    for i in range(called.shape[1]):
+        largest = 0.0
+        for k in range(len(called)):
+            if math.isfinite(called[k, i]):
+                largest = max(largest, abs(called[k, i]))
+        for k in range(len(called)):
+            if not abs(called[k, i] - traced[k, i]) <= SAME * largest + ROUNDED * bounds[k, i]:
+                count += 1
+    return count
+
+
+@kernel(
+    i8(KIT, INTEGERS, INTEGERS, MATRIX, types.int64[:, ::1], INTEGERS, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
+)
+def compare(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
+    """What callbacks give at states [t, q, v] and what they were traced to, with bounds of rounding, a row a state.
+
+    Returns how many numbers differ by more than SAME of the largest at these states and ROUNDED times the bound.
+
+    `sizes`: n_q, n_c and n_a; `which`: 1 for those of KINDS in traced_values.py that are looked at. `called` has zeros.
+    """
+    n, n_c, n_a = sizes[0], sizes[1], sizes[2]
+    for k in range(len(states)):
+        t, q, v, out = states[k, 0], states[k, 1 : 1 + n], states[k, 1 + n :], called[k]
+        for i in range(1 + 2 * n):
+            nodes[VALUE, i], nodes[BOUND, i] = states[k, i], 0.0
+        _traced(program, columns, coefficients, constants, nodes, traced[k], bounds[k])
+        place = 0
+        if which[0]:
+            f.mass(t, q, f.p, out[: n * n].reshape((n, n)))
+            place += n * n
+        if which[1]:
+            f.force(t, q, v, f.p, out[place : place + n])
+            place += n
+        if which[2]:
+            f.constraint(t, q, f.p, out[place : place + n_c])
+            place += n_c
+        if which[3]:
+            f.jacobian(t, q, f.p, out[place : place + n_c * n].reshape((n_c, n)))
+            place += n_c * n
+        if which[4]:
+            f.constraint_rate(t, q, f.p, out[place : place + n_c])
+            place += n_c
+        if which[5]:
+            f.gamma(t, q, v, f.p, out[place : place + n_c])
+            place += n_c
+        if which[6]:
+            f.nonholonomic(t, q, f.p, out[place : place + n_a * n].reshape((n_a, n)))
+            place += n_a * n
+        if which[7]:
+            f.nonholonomic_rate(t, q, f.p, out[place : place + n_a])
+            place += n_a
+        if which[8]:
+            f.nonholonomic_gamma(t, q, v, f.p, out[place : place + n_a])
+    return _differences(called, traced, bounds)

@@ -1,0 +1,330 @@
+"""The solution between accepted steps: polynomials through neighbouring states, put back on the constraints.
+
+States are rows [q, v, a] at the times `t`; interval i lies between rows i and i + 1. With PARTS > 1 interior states are
+computed first, by steps of the method, and a polynomial goes through those of one interval.
+"""
+
+import numpy as np
+from numba import types
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.data.common import (
+    ATOL,
+    DONE,
+    FORM,
+    GAMMA_INACCURATE,
+    GAMMA_REQUIRED,
+    INTEGERS,
+    KIT,
+    MATRIX,
+    NULL_SPACE,
+    RTOL,
+    SINGULAR,
+    VECTOR,
+    WORK,
+    compiled,
+    f8,
+    i8,
+    kernel,
+    merged,
+)
+from twoloop.kernels.data.intervals import (
+    ACCELERATIONS,
+    APART,
+    END_TIME,
+    FIRST_OWN,
+    FIRST_TIME,
+    HIGH,
+    JUMP,
+    KIND,
+    LAST_OWN,
+    LOW,
+    VELOCITIES,
+    WINDOW,
+)
+from twoloop.kernels.evaluation.calls import accelerations, find_tangents, renew_partition, restore
+from twoloop.kernels.evaluation.partition import partition_is_poor
+
+TABLE = types.int64[:, ::1]
+PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
+LOOKS = len(PLACES)
+EPS = 2.0**-52
+EVEN = 8.0  # longest over shortest
+NOISY = 10.0  # of the tolerances of velocities
+
+
+@merged
+def _window(low, high, i, last):
+    """First and last of the rows that the polynomial of the interval from row i goes through: centred but at ends."""
+    if last > i + 1:  # the interval has states of its own
+        return i, last
+    size = min(WINDOW, high - low + 1)
+    lo = max(low, min(i + 1 - size // 2, high + 1 - size))
+    return lo, lo + size - 1
+
+
+@compiled
+def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
+    """Newton's form of the Hermite polynomial through rows lo to hi, in (time - t[i]) / h; its number of coefficients.
+
+    For the block of columns from `place` on, less row i of them, with `order` values at each node: the blocks behind it
+    are its derivatives.
+    """
+    n = c.shape[1]
+    size = (hi - lo + 1) * order
+    for r in range(size):
+        row = lo + r // order
+        z[r] = (t[row] - t[i]) / h
+        for m in range(n):
+            c[r, m] = states[row, place + m] - states[i, place + m]
+    for j in range(1, size):
+        for r in range(size - 1, j - 1, -1):
+            row, gap = lo + r // order, z[r] - z[r - j]
+            if (r - j) // order == r // order:
+                scale = h if j == 1 else 0.5 * h * h
+                for m in range(n):
+                    c[r, m] = scale * states[row, place + j * n + m]
+            else:
+                for m in range(n):
+                    c[r, m] = (c[r, m] - c[r - 1, m]) / gap
+    return size
+
+
+@merged
+def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
+    """q and v as the polynomials have them, by Horner's scheme."""
+    n = q.size
+    for m in range(n):
+        value, slope = c[size - 1, m], 0.0
+        for r in range(size - 2, -1, -1):
+            slope = slope * (s - z[r]) + value
+            value = value * (s - z[r]) + c[r, m]
+        q[m], v[m] = value + states[i, m], slope / h
+    if kind == APART:
+        for m in range(n):
+            value = c_v[size_v - 1, m]
+            for r in range(size_v - 2, -1, -1):
+                value = value * (s - z_v[r]) + c_v[r, m]
+            v[m] = value + states[i, n + m]
+
+
+@merged
+def _kind(kind, tolerances, h, states, i):
+    """APART also where an interval is so short that rounding of q is more than the tolerances of its slope."""
+    n = tolerances.size - ATOL
+    for m in range(n):
+        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
+        if EPS * abs(states[i, m]) > NOISY * h * (atol + rtol * abs(states[i, n + m])):
+            return APART
+    return kind
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
+def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
+    """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found.
+
+    There q and v are those of the polynomials. `z` and `room` hold nodes and coefficients of two polynomials.
+    """
+    n = w.Q.size
+    half = z.size // 2
+    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    reduced = f.flags[FORM] == NULL_SPACE  # then w.D is known
+    failures = 0
+    for g in range(groups.shape[0]):
+        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        h = t[last] - t[i]
+        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
+        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
+        order = 3 if kind >= ACCELERATIONS else 2
+        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        # which coordinates are kept is to depend on the time alone, not on what else is asked for
+        chosen = False
+        for p in range(groups[g, FIRST_TIME], groups[g, END_TIME]):
+            q, v = out[p, :n], out[p, n : 2 * n]
+            if times[p] == t[i] or times[p] == t[last]:
+                copy(states[i if times[p] == t[i] else last, : 2 * n], out[p])
+                continue
+            if kind == JUMP:
+                copy(states[i, : 2 * n], out[p])
+                continue
+            s = (times[p] - t[i]) / h
+            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            code = DONE if chosen else renew_partition(f, w, t[i], states[i, :n])
+            if code == DONE:
+                code = restore(f, w, times[p], q, v, tolerance)
+            chosen = code == DONE and not (reduced and partition_is_poor(w))
+            if not chosen:
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                code = renew_partition(f, w, times[p], q)
+                if code == DONE:
+                    code = restore(f, w, times[p], q, v, tolerance)
+            if code != DONE:
+                failures += 1
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+    return failures
+
+
+@merged
+def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
+    """Largest difference of two states, in positions and velocities, over the tolerances."""
+    n = q.size
+    rtol, largest = tolerances[RTOL], 0.0
+    for m in range(n):
+        atol = tolerances[ATOL + m]
+        largest = max(largest, scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m])))
+        largest = max(largest, scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m])))
+    return largest
+
+
+@merged
+def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
+    """The accelerations that the polynomials have, into `a`."""
+    for m in range(a.size):
+        value, slope, bend = c[size - 1, m], 0.0, 0.0
+        for r in range(size - 2, -1, -1):
+            bend = bend * (s - z[r]) + 2.0 * slope
+            slope = slope * (s - z[r]) + value
+            value = value * (s - z[r]) + c[r, m]
+        a[m] = bend / (h * h)
+    if kind == APART:
+        for m in range(a.size):
+            value, slope = c_v[size_v - 1, m], 0.0
+            for r in range(size_v - 2, -1, -1):
+                slope = slope * (s - z_v[r]) + value
+                value = value * (s - z_v[r]) + c_v[r, m]
+            a[m] = slope / h
+
+
+@merged
+def _even(t, lo, hi):
+    """Whether the gaps between these times are of similar length."""
+    shortest, longest = np.inf, 0.0
+    for r in range(lo, hi):
+        shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
+    return longest <= EVEN * shortest
+
+
+@kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
+def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
+    """How far the polynomials of these intervals are off, over the tolerances, into `out`; 0 where that is soon seen.
+
+    Where its last node changes a polynomial by less than the tolerances, it is taken as it is. Else it is held against
+    the constraints and the equations, at places within the interval: what its accelerations are off, times the time in
+    which a polynomial of its degree can turn, is off in velocity. Accelerations that hold the noise of stiff modes say
+    nothing; of those the change by the last node counts alone. Methods of low order take steps that are short for their
+    polynomials, which then are off between unlike steps only.
+    """
+    n = w.Q.size
+    half = z.size // 2
+    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    q, v, q_1, v_1 = rows[0, :n], rows[0, n:], rows[1, :n], rows[1, n:]
+    for g in range(groups.shape[0]):
+        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        h = t[last] - t[i]
+        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
+        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
+        order = 3 if kind >= ACCELERATIONS else 2
+        size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        out[g] = 0.0
+        if kind < ACCELERATIONS and _even(t, lo, hi):
+            continue
+        if hi - lo > 1:
+            for k in range(LOOKS):
+                s = PLACES[k]
+                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                shorter = size_v - 2 if kind == APART else 0
+                _interpolate(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
+                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
+            if out[g] <= 1.0 or kind == VELOCITIES:
+                continue
+        out[g] = 0.0
+        for k in range(LOOKS):
+            s = PLACES[k]
+            time = t[i] + s * h
+            _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            _slope_of_velocity(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
+            copy(rows[0], rows[2])
+            code = DONE if k > 0 else renew_partition(f, w, t[i], states[i, :n])
+            if code == DONE:
+                code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+            if code != DONE:
+                copy(rows[0], rows[2])
+                code = renew_partition(f, w, time, q)
+                if code == DONE:
+                    code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
+            if code == DONE:
+                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
+                code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)
+            if code != DONE:
+                out[g] = np.inf
+                break
+            turn = h / size
+            out[g] = max(out[g], _off(tolerances, turn * turn, turn, states, i, v_1, v_1, q_1, q_1))
+        if not np.isfinite(out[g]):
+            out[g] = np.inf
+    return DONE
+
+
+@kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
+def complete(f, w, times, states, out):
+    """Rows [a, lam] of `out` at states [q, v] on the constraints; the number of those at which there are none: NaN."""
+    n = w.Q.size
+    code = SINGULAR
+    failures = 0
+    for p in range(times.size):
+        q, v = states[p, :n], states[p, n : 2 * n]
+        if code == DONE:
+            code = find_tangents(f, w, times[p], q)
+        if code != DONE or partition_is_poor(w):
+            code = renew_partition(f, w, times[p], q)
+            if code == DONE:
+                code = find_tangents(f, w, times[p], q)
+        if code == DONE:
+            code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
+        if code == GAMMA_INACCURATE:  # the best that there is, as no step depends on it
+            required = w.notes[GAMMA_REQUIRED]
+            w.notes[GAMMA_REQUIRED] = np.inf
+            code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
+            w.notes[GAMMA_REQUIRED] = required
+        if code != DONE:
+            out[p] = np.nan
+            failures += 1
+    return failures
+
+
+@kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
+def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states, intervals, out_t, out):
+    """States within intervals, by equal steps of the method; how many intervals could not be filled, their t NaN.
+
+    `out_t` and `out` have the same number of rows for each; the first and the last are the ends of the interval.
+    """
+    n = w.Q.size
+    rows = out_t.size // intervals.size
+    failures = 0
+    for g in range(intervals.size):
+        i, first = intervals[g], g * rows
+        last = first + rows - 1
+        copy(at_rest, memory)
+        state[:] = 0.0
+        copy(states[i], state[: 3 * n])
+        out_t[first], out_t[last] = t[i], t[i + 1]
+        copy(states[i], out[first])
+        copy(states[i + 1], out[last])
+        code = renew_partition(f, w, t[i], state[:n])
+        for r in range(first + 1, last):
+            before = out_t[r - 1]
+            out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (rows - 1)
+            if code == DONE:
+                code, _ = f.step(f, w, options, memory, before, out_t[r] - before, tolerances, state, new_state)
+                if code != DONE and renew_partition(f, w, before, state[:n]) == DONE:
+                    copy(at_rest, memory)
+                    code, _ = f.step(f, w, options, memory, before, out_t[r] - before, tolerances, state, new_state)
+            memory[0] = 1.0
+            copy(new_state, state)
+            copy(new_state[: 3 * n], out[r])
+        if code != DONE:
+            out_t[first] = np.nan
+            failures += 1
+    return failures

@@ -1,0 +1,301 @@
+"""A step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
+
+Variable order and step in modified divided differences of a, as Krogh's DVDQ and Shampine and Gordon's STEP have them,
+for second-order equations: positions are the double integral of the polynomial through the accelerations, velocities
+the single one. The first evaluation stands where the prediction is, off the constraints by its error; the second ends
+on them. Differences are of all coordinates, so that a new partition needs no conversion.
+
+With t_n the times of the accepted steps, psi_i(n) = t_n - t_{n-i}, and i counted from 1 as in the literature:
+beta_i = prod_{j<i} psi_j(n+1) / psi_j(n), and on the step, s from 0 to 1, the polynomial through the last k
+accelerations is sum_i c_i(s) beta_i phi_i(n), c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1), psi_0 = 0.
+g_i = int c_i ds and G_i = int (1 - s) c_i ds give velocities and positions; all terms of these are positive.
+"""
+
+import numpy as np
+
+from twoloop.kernels.control.predictor import departure, keep_predicted
+from twoloop.kernels.data.common import ATOL, DEPARTURE, DONE, N_OUTER, RTOL, STEP, inlined, kernel, merged
+from twoloop.kernels.evaluation.calls import evaluate_there, project
+
+HIGHEST = 12  # order; with orders above 13 the nodes below would not do
+N_TERMS = HIGHEST + 2  # differences that a step makes, and coefficients g and G
+STRICT = 5.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
+SAFETY = 0.8  # of advance()
+GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
+START_GROWTH = 2.0  # ... while the order still rises with every step
+RESTART_AFTER = 3  # failures in a row, after which the method begins again with order 1
+
+# eight Gauss nodes on [0, 1]: exact for c_i and (1 - s) c_i up to i = 15
+NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
+REST = WEIGHTS * (1.0 - NODES)
+
+# places in `options`
+THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more is repeated
+# places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _tables
+(
+    LAST_ACCEPTED,  # set by advance() after every attempt
+    TRIAL,  # 1: the last attempt left a table that takes over if it was accepted
+    WHICH,  # of the two tables, that of the last accepted step
+    ORDER,
+    DEPTH,  # accelerations in the history
+    AGE,  # steps accepted at this order
+    STARTING,  # 1: the order rises with every step
+    FAILED,  # attempts in a row that were refused
+    NEXT_ORDER,
+    N_SCALARS,
+) = range(10)
+PSI, NEW_PSI, BETA, SPEED, PLACE, NODE, N_ROWS = range(7)  # SPEED holds g, PLACE holds G
+
+
+def memory_size(n_q: int) -> int:
+    """Length of `memory` for n_q coordinates."""
+    return N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * _padded(n_q) + 2 * _padded(n_q)
+
+
+def _padded(n_q: int) -> int:
+    return (n_q + 3) // 4 * 4
+
+
+@inlined
+def _row(memory, which):
+    start = N_SCALARS + which * (N_TERMS + 2)
+    return memory[start : start + N_TERMS + 2]
+
+
+@inlined
+def _table(memory, n, which):
+    """Rows phi_i - d of one of the two tables, and d itself in the last (N_TERMS + 1, n padded)."""
+    width = (n + 3) // 4 * 4
+    start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
+    return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
+
+
+@inlined
+def _scratch(memory, n):
+    """Two rows of velocities and of positions: means over the step, then 1 over the tolerances."""
+    width = (n + 3) // 4 * 4
+    start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
+    return memory[start : start + width], memory[start + width : start + 2 * width]
+
+
+@merged
+def _take_over(memory):
+    """Make the last attempt the history, if it was accepted; else note that it failed."""
+    left = memory[TRIAL]
+    memory[TRIAL] = 0.0
+    if memory[LAST_ACCEPTED] == 0.0:
+        memory[FAILED] += 1.0
+        memory[AGE] = 0.0
+        if memory[ORDER] > 1.0:
+            memory[STARTING] = 0.0
+        memory[ORDER] = min(memory[ORDER], memory[NEXT_ORDER])
+        if memory[FAILED] >= RESTART_AFTER:
+            memory[DEPTH] = 0.0
+        return
+    if left == 0.0:
+        return
+    memory[FAILED] = 0.0
+    memory[WHICH] = 1.0 - memory[WHICH]
+    psi, new_psi = _row(memory, PSI), _row(memory, NEW_PSI)
+    for i in range(N_TERMS):
+        psi[i] = new_psi[i]
+    memory[DEPTH] = min(memory[DEPTH] + 1.0, float(N_TERMS))
+    memory[AGE] = memory[AGE] + 1.0 if memory[ORDER] == memory[NEXT_ORDER] else 0.0
+    memory[ORDER] = memory[NEXT_ORDER]
+
+
+@merged
+def _begin(memory, n, state):
+    """A history of one acceleration."""
+    table = _table(memory, n, memory[WHICH])
+    table[:, :] = 0.0
+    for m in range(n):
+        table[N_TERMS, m] = state[2 * n + m]
+    _row(memory, PSI)[:] = 0.0
+    memory[ORDER] = memory[DEPTH] = memory[NEXT_ORDER] = 1.0
+    memory[STARTING] = 1.0
+    memory[FAILED] = memory[AGE] = 0.0
+
+
+@merged
+def _coefficients(memory, h, k):
+    """beta_1 ... beta_k+1, and g and G up to the term k + 2, for a step of h."""
+    psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
+    g, G, c = _row(memory, SPEED), _row(memory, PLACE), _row(memory, NODE)
+    new_psi[0] = h
+    for i in range(N_TERMS):
+        new_psi[i + 1] = psi[i] + h
+    beta[0] = 1.0
+    for i in range(k):  # all quotients first: none waits for the one before
+        beta[i + 1] = new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
+    for i in range(k):
+        beta[i + 1] *= beta[i]
+    for m in range(8):
+        c[m] = 1.0
+    before = 0.0  # psi_0
+    for i in range(k + 2):
+        speed = 0.0
+        place = 0.0
+        for m in range(8):
+            speed += WEIGHTS[m] * c[m]
+            place += REST[m] * c[m]
+        g[i], G[i] = speed, place
+        inverse = 1.0 / new_psi[i]
+        for m in range(8):
+            c[m] *= (NODES[m] * h + before) * inverse
+        before = psi[i]
+
+
+@merged
+def _predict(memory, h, k, old, new, state, q1, v1, n):
+    """The prediction (q1, v1), and what the differences would be if it were exact, into `new`."""
+    beta, g, G = _row(memory, BETA), _row(memory, SPEED), _row(memory, PLACE)
+    in_v, in_q = _scratch(memory, n)
+    for m in range(0, old.shape[1], 4):
+        d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
+        # what the acceptance of this step will add d to: phi_k+2 = d - beta_k+1 phi_k+1
+        b = beta[k]
+        new[k + 1, m] = -b * (old[k, m] + d0)
+        new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
+        new[k + 1, m + 2] = -b * (old[k, m + 2] + d2)
+        new[k + 1, m + 3] = -b * (old[k, m + 3] + d3)
+        new[k, m] = 0.0
+        new[k, m + 1] = 0.0
+        new[k, m + 2] = 0.0
+        new[k, m + 3] = 0.0
+        e0, e1, e2, e3 = 0.0, 0.0, 0.0, 0.0
+        x0, x1, x2, x3 = 0.0, 0.0, 0.0, 0.0
+        y0, y1, y2, y3 = 0.0, 0.0, 0.0, 0.0
+        for i in range(k - 1, -1, -1):
+            b, c, r = beta[i], g[i], G[i]
+            p0 = b * (old[i, m] + d0)
+            p1 = b * (old[i, m + 1] + d1)
+            p2 = b * (old[i, m + 2] + d2)
+            p3 = b * (old[i, m + 3] + d3)
+            e0 += p0
+            e1 += p1
+            e2 += p2
+            e3 += p3
+            x0 += c * p0
+            x1 += c * p1
+            x2 += c * p2
+            x3 += c * p3
+            y0 += r * p0
+            y1 += r * p1
+            y2 += r * p2
+            y3 += r * p3
+            new[i, m] = e0
+            new[i, m + 1] = e1
+            new[i, m + 2] = e2
+            new[i, m + 3] = e3
+        in_v[m] = x0
+        in_v[m + 1] = x1
+        in_v[m + 2] = x2
+        in_v[m + 3] = x3
+        in_q[m] = y0
+        in_q[m + 1] = y1
+        in_q[m + 2] = y2
+        in_q[m + 3] = y3
+    for m in range(n):
+        v0 = state[n + m]
+        v1[m] = v0 + h * in_v[m]
+        q1[m] = state[m] + h * (v0 + h * in_q[m])
+
+
+@merged
+def _error(g, G, h, order, largest_v, largest_q):
+    """The local error of an order from the largest of its difference over the tolerances."""
+    return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
+
+
+@merged
+def _next(memory, h, k, table, d, n):
+    """The largest error of this attempt over the tolerances; choose the next order, and say what its error is.
+
+    Order rules as in STEP: lower where the error would not be larger, higher where it would be smaller, after k + 1
+    steps at order k; while the method starts, higher with every step.
+    """
+    g, G = _row(memory, SPEED), _row(memory, PLACE)
+    per_v, per_q = _scratch(memory, n)
+    v0 = v1 = v2 = v3 = q0 = q1 = q2 = q3 = 0.0
+    lower, lowest = max(k - 1, 0), max(k - 2, 0)
+    for m in range(n):
+        a, b = per_v[m], per_q[m]
+        x = abs(d[m])
+        v0, q0 = max(v0, x * a), max(q0, x * b)
+        x = abs(table[lower, m] + d[m])
+        v1, q1 = max(v1, x * a), max(q1, x * b)
+        x = abs(table[lowest, m] + d[m])
+        v2, q2 = max(v2, x * a), max(q2, x * b)
+        x = abs(table[k + 1, m] + d[m])
+        v3, q3 = max(v3, x * a), max(q3, x * b)
+    error = _error(g, G, h, k, v0, q0)
+    below = _error(g, G, h, k - 1, v1, q1) if k > 1 else np.inf
+    far_below = _error(g, G, h, k - 2, v2, q2) if k > 2 else 0.0
+    order, expected = k, error
+    if (k > 2 and max(below, far_below) <= error) or (k == 2 and below <= 0.5 * error):
+        order, expected = k - 1, below
+    starting = memory[STARTING] == 1.0 and order == k and k < HIGHEST
+    if error <= 1.0:
+        memory[STARTING] = 1.0 if starting else 0.0
+        if starting:
+            order, expected = k + 1, error
+        elif order == k and k < HIGHEST and memory[AGE] >= k + 1 and memory[DEPTH] > k:
+            above = _error(g, G, h, k + 1, v3, q3)
+            if k > 1 and below <= min(error, above):
+                order, expected = k - 1, below
+            elif above < (0.5 * error if k == 1 else error):
+                order, expected = k + 1, above
+    memory[NEXT_ORDER] = float(order)
+    if not np.isfinite(error):
+        return np.inf
+    root = expected ** (1.0 / (order + 1.0))
+    if error > 1.0:
+        return min(max(error ** (1.0 / (k + 1.0)), 1.0 + 1e-9), SAFETY / SHRINKAGE)
+    return min(max(root, SAFETY / (START_GROWTH if starting else GROWTH)), 1.0)
+
+
+@kernel(STEP, vectorized=True)
+def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt; the error returned is such that advance() takes the step factor SAFETY over it."""
+    n = w.Q.size
+    q, v = state[:n], state[n : 2 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    if memory[DEPTH] > 0.0:
+        _take_over(memory)
+    if memory[DEPTH] == 0.0:
+        _begin(memory, n, state)
+    k = int(memory[ORDER])
+    w.counters[N_OUTER] += 1
+    old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
+    _coefficients(memory, h, k)
+    _predict(memory, h, k, old, new, state, q1, v1, n)
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # if the evaluation fails
+    code = evaluate_there(f, w, t + h, q1, v1, a1)
+    if code != DONE:
+        return code, np.inf
+    per_v, per_q = _scratch(memory, n)
+    d = new[N_TERMS]
+    rtol = tolerances[RTOL]
+    for m in range(n):
+        d[m] = a1[m] - new[0, m]
+    for m in range(n):
+        per_v[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
+    for m in range(n):
+        per_q[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
+    error = _next(memory, h, k, new, d, n)
+    if not error <= 1.0:
+        return DONE, error
+    g, G = _row(memory, SPEED)[k], _row(memory, PLACE)[k]
+    for m in range(n):
+        q1[m] += h * h * G * d[m]
+        v1[m] += h * g * d[m]
+    keep_predicted(w, q1)
+    code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    if code != DONE:
+        return code, np.inf
+    for m in range(n):
+        d[m] = a1[m] - new[0, m]
+    w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
+    memory[TRIAL] = 1.0
+    return DONE, max(error, w.notes[DEPARTURE])

@@ -1,0 +1,318 @@
+"""A step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), its outer loop by fixed point.
+
+The history is kept in modified divided differences (Krogh), which are scaled to the step as in DASSL and IDA (fixed
+leading coefficient): any step size may follow any other, and with equal steps they are backward differences. They are
+differences of the full (q, v), dependents with their restored values, so that a new partition needs no conversion.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.predictor import departure
+from twoloop.kernels.data.common import (
+    ATOL,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    OUTER_DIVERGED,
+    RTOL,
+    STEP,
+    compiled,
+    inlined,
+    kernel,
+)
+from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, rounding_floor
+from twoloop.kernels.steps.fixed_point_step import iterate_accelerations
+from twoloop.kernels.steps.stages import options_array as gauss_options
+
+MAX_ORDER = 5
+N_DIFFERENCES = MAX_ORDER + 2  # of orders 0 to MAX_ORDER + 1
+STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
+MAX_ITERATIONS = 60
+SAFETY = 0.9  # of advance(): the next step is SAFETY over the returned error times this one
+STRICT = 10.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
+BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
+NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
+HOLD = 1.2  # a step that could grow by less keeps its size
+GROWTH = 2.0  # the most by which a step grows
+
+# places in `options`: scalars, then the parameter block of the Gauss steps
+HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
+# places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
+(
+    LAST_ACCEPTED,  # set by advance() after every attempt
+    HAS_TRIAL,  # whether the last attempt left differences at its end
+    ORDER,
+    DEPTH,  # the highest difference there is
+    AGE,  # accepted steps since the order changed or the error test failed
+    NEXT_ORDER,
+    NEXT_DEPTH,
+    N_MEMORY_SCALARS,
+) = range(8)
+# rows of coefficients: times since the points of the history, from its last point and from the end of the step; the
+# error constants of orders 0, 1, ...
+SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
+
+
+def options_array(max_order: int, inner_tol: float, outer_tol: float, starter: Any) -> NDArray[np.float64]:
+    """The parameter block that the step reads; `starter`: the Gauss tableau of STARTER_STAGES stages."""
+    gauss = gauss_options(starter.A, starter.b, starter.c, inner_tol, outer_tol, 0.0)
+    return np.concatenate([[float(max_order), inner_tol, outer_tol], gauss])
+
+
+def memory_size(n_q: int) -> int:
+    """Length of `memory` for n_q coordinates."""
+    return N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES + (4 * N_DIFFERENCES + 4 + 3 * STARTER_STAGES) * n_q
+
+
+@inlined
+def _coefficients(memory, row):
+    start = N_MEMORY_SCALARS + row * N_DIFFERENCES
+    return memory[start : start + N_DIFFERENCES]
+
+
+@inlined
+def _blocks(memory, n):
+    """Differences and trial differences (N_DIFFERENCES, 2 n), prediction and its rate (2 n), scratch."""
+    o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
+    size = N_DIFFERENCES * 2 * n
+    differences = memory[o : o + size].reshape((N_DIFFERENCES, 2 * n))
+    trial = memory[o + size : o + 2 * size].reshape((N_DIFFERENCES, 2 * n))
+    o += 2 * size
+    return differences, trial, memory[o : o + 2 * n], memory[o + 2 * n : o + 4 * n], memory[o + 4 * n :]
+
+
+@compiled
+def _take_over(memory, differences, trial):
+    """Make the trial differences the history, if the last attempt was accepted."""
+    left = memory[HAS_TRIAL]
+    memory[HAS_TRIAL] = 0.0
+    if left == 0.0:
+        return
+    if memory[LAST_ACCEPTED] == 0.0:
+        memory[ORDER] = memory[NEXT_ORDER]
+        memory[AGE] = 0.0
+        return
+    for j in range(int(memory[NEXT_DEPTH]) + 1):
+        copy(trial[j], differences[j])
+    copy(_coefficients(memory, NEW_SPANS), _coefficients(memory, SPANS))
+    memory[AGE] = memory[AGE] + 1.0 if memory[ORDER] == memory[NEXT_ORDER] else 0.0
+    memory[ORDER] = memory[NEXT_ORDER]
+    memory[DEPTH] = memory[NEXT_DEPTH]
+
+
+@compiled
+def _begin(memory, differences, state, h, order):
+    """Begin a history: with order 1 from the state and its rate, with order 0 from the state alone."""
+    size = differences.shape[1]
+    for m in range(size):
+        differences[0, m] = state[m]
+        differences[1, m] = h * state[size // 2 + m]
+    _coefficients(memory, SPANS)[0] = h
+    memory[ORDER] = order
+    memory[DEPTH] = order
+
+
+@compiled
+def _predict(memory, differences, trial, h, prediction, rate):
+    """Scale the differences to a step of h into `trial`; extrapolate the polynomial of degree ORDER and its rate."""
+    k, depth = int(memory[ORDER]), int(memory[DEPTH])
+    spans, new_spans = _coefficients(memory, SPANS), _coefficients(memory, NEW_SPANS)
+    constants = _coefficients(memory, ERROR_CONSTANTS)
+    new_spans[0] = h
+    for j in range(depth):
+        new_spans[j + 1] = spans[j] + h
+    constants[0] = 1.0
+    copy(differences[0], trial[0])
+    copy(differences[0], prediction)
+    for m in range(rate.size):
+        rate[m] = 0.0
+    scale = 1.0
+    in_rate = 0.0
+    for j in range(1, depth + 1):
+        scale *= new_spans[j - 1] / spans[j - 1]
+        in_rate += 1.0 / new_spans[j - 1]
+        constants[j] = constants[j - 1] * j * h / new_spans[j]
+        for m in range(rate.size):
+            trial[j, m] = scale * differences[j, m]
+        if j <= k:
+            for m in range(rate.size):
+                prediction[m] += trial[j, m]
+                rate[m] += in_rate * trial[j, m]
+
+
+@compiled
+def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
+    """Solve y = prediction + c (y' - rate) at t for the independents: a fixed-point iteration on their accelerations.
+
+    c is h over 1 + 1/2 + ... + 1/k. On return the whole new state is consistent.
+    """
+    n = w.Q.size
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    leading = 0.0
+    for j in range(k):
+        leading += 1.0 / (j + 1.0)
+    c = h / leading
+    copy(prediction, new_state[: 2 * n])  # dependents: where Newton starts
+    copy(rate[n:], a1)
+    before = np.inf
+    for iteration in range(MAX_ITERATIONS):
+        w.counters[N_OUTER] += 1
+        for m in w.independent:
+            v1[m] = prediction[n + m] + c * (a1[m] - rate[n + m])
+            q1[m] = prediction[m] + c * (v1[m] - rate[m])
+        code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a_new, lam1)
+        if code != DONE:
+            return code
+        change = 0.0
+        for m in w.independent:
+            difference = c * abs(a_new[m] - a1[m])
+            change = max(change, difference / max(abs(v1[m]), 1.0))
+            change = max(change, c * difference / max(abs(q1[m]), 1.0))
+        copy(a_new, a1)
+        # the first iteration evaluates the prediction, never to be accepted: extrapolation alone is unstable
+        if iteration > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
+            for k in range(w.dependent.size):
+                m = w.dependent[k]
+                w.predicted[k] = prediction[m] + c * (prediction[n + m] + c * (a1[m] - rate[n + m]) - rate[m])
+            return DONE
+        if not change <= before:
+            return OUTER_DIVERGED
+        before = change
+    return OUTER_DIVERGED
+
+
+@compiled
+def _norm(tolerances, y, y1, d, sign, difference):
+    """Largest component of d + sign * difference over atol + rtol |y|."""
+    n_q = d.size // 2
+    largest = 0.0
+    for m in range(d.size):
+        scale = tolerances[ATOL + m % n_q] + tolerances[RTOL] * max(abs(y[m]), abs(y1[m]))
+        largest = max(largest, abs(d[m] + sign * difference[m]) / scale)
+    return largest
+
+
+@compiled
+def _judge(options, memory, tolerances, trial, y, y1, d):
+    """Estimate the error from d = y1 - prediction and choose the next order, into memory.
+
+    Returns an error that exceeds 1 where the estimate does, and from which advance() makes the step size chosen here.
+    """
+    k, depth = int(memory[ORDER]), int(memory[DEPTH])
+    spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
+    norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
+    # with unequal steps also the interpolation of the history has an error; the larger counts (as in DASSL)
+    interpolation = spans[0] / spans[k]
+    for j in range(k):
+        interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)
+    error = norm * max(spans[0] / spans[k], abs(interpolation))
+    here = norm * constants[k]
+    below, above = np.inf, np.inf
+    if k > 1:
+        below = STRICT * NEIGHBOUR * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
+    if k < options[HIGHEST] and depth > k:
+        above = STRICT * NEIGHBOUR * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
+    memory[NEXT_ORDER] = k
+    if not error <= 1.0:
+        if below < here:
+            memory[NEXT_ORDER] = k - 1
+        return error ** (1.0 / (k + 1))
+    factor = (BIAS * here) ** (-1.0 / (k + 1))
+    if memory[AGE] >= k:  # the estimates come from k + 1 steps of this order
+        lower, higher = (BIAS * below) ** (-1.0 / k), (BIAS * above) ** (-1.0 / (k + 2))
+        if lower > max(factor, higher):
+            memory[NEXT_ORDER] = k - 1
+        elif higher > factor:
+            memory[NEXT_ORDER] = k + 1
+        factor = max(factor, lower, higher)
+        if 1.0 < factor < HOLD:
+            factor = 1.0
+    else:
+        factor = min(factor, 1.0)
+    return SAFETY / min(max(factor, SAFETY), GROWTH)
+
+
+@compiled
+def _extend(memory, trial, y1, d):
+    """Make the scaled differences those at the end of the step."""
+    k = int(memory[ORDER])
+    memory[NEXT_DEPTH] = k + 1
+    if memory[DEPTH] > k and k < MAX_ORDER:
+        for m in range(d.size):
+            trial[k + 2, m] = d[m] - trial[k + 1, m]
+        memory[NEXT_DEPTH] = k + 2
+    copy(d, trial[k + 1])
+    for j in range(k, 0, -1):
+        for m in range(d.size):
+            trial[j, m] += trial[j + 1, m]
+    copy(y1, trial[0])
+
+
+@compiled
+def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
+    """A step of the starter, of order 6."""
+    s, n = STARTER_STAGES, w.Q.size
+    q1, v1 = new_state[:n], new_state[n : 2 * n]
+    A_stage = scratch[: s * n].reshape((s, n))
+    Q_stage = scratch[s * n : 2 * s * n].reshape((s, n))
+    V_stage = scratch[2 * s * n : 3 * s * n].reshape((s, n))
+    for j in range(s):
+        copy(state[2 * n : 3 * n], A_stage[j])
+    code = iterate_accelerations(
+        f,
+        w,
+        options[N_SCALARS:],
+        tolerances,
+        t,
+        h,
+        state[:n],
+        state[n : 2 * n],
+        A_stage,
+        Q_stage,
+        V_stage,
+        q1,
+        v1,
+        scratch[:0].reshape((0, n)),
+    )
+    if code == DONE:
+        code = accelerations(f, w, t + h, q1, v1, new_state[2 * n : 3 * n], new_state[3 * n :])
+    return code
+
+
+@kernel(STEP)
+def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt: predict from the history, correct, and choose the order and the size of the next step.
+
+    Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
+    """
+    n = w.Q.size
+    y, y1 = state[: 2 * n], new_state[: 2 * n]
+    differences, trial, prediction, rate, scratch = _blocks(memory, n)
+    fixed = tolerances[ESTIMATE] == 0.0
+    _take_over(memory, differences, trial)
+    if memory[DEPTH] == 0.0:
+        _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
+    k = int(memory[ORDER])
+    _predict(memory, differences, trial, h, prediction, rate)
+    if fixed and k < options[HIGHEST]:
+        code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
+    else:
+        code = _correct(f, w, options, t + h, h, k, prediction, rate, new_state, scratch[:n])
+    if code != DONE:
+        return code, np.inf
+    d = prediction
+    for m in range(2 * n):
+        d[m] = y1[m] - prediction[m]
+    error = 0.0
+    if fixed:
+        memory[NEXT_ORDER] = min(k + 1, int(options[HIGHEST]))
+    else:
+        error = _judge(options, memory, tolerances, trial, y, y1, d)
+        error = max(error, departure(w, tolerances, h, y[:n], y[n:], y1[:n]))
+    memory[HAS_TRIAL] = 1.0
+    _extend(memory, trial, y1, d)
+    return DONE, error

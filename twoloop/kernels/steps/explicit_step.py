@@ -1,0 +1,208 @@
+"""A step of an explicit Runge-Kutta method for (q_i, v_i): every stage is one evaluation, and there is no outer loop.
+
+The tableau is any whose first stage is the state itself and that estimates its error by two embedded formulas. The
+inner loop restores the dependents of every stage, so that the step never leaves the constraints. Or, which departs from
+the paper's procedure, all coordinates are integrated alike, stages stand where the formula puts them, off the
+constraints by its error, and the end of the step alone is put back on them.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.predictor import departure, keep_predicted
+from twoloop.kernels.data.common import (
+    ATOL,
+    DEPARTURE,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    NEARLY_SINGULAR,
+    RTOL,
+    STEP,
+    compiled,
+    inlined,
+    kernel,
+)
+from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_there, project
+
+# places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
+STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
+# vectors in `memory` after memory[0], which is advance()'s; then the slopes of the stages. Each has 2 n_q numbers, and
+# zeros up to a multiple of BLOCK
+STAGE, FINE, COARSE, N_VECTORS = range(4)
+BLOCK = 8
+
+
+def options_array(
+    A: ArrayLike,
+    b: ArrayLike,
+    c: ArrayLike,
+    fine: ArrayLike,
+    coarse: ArrayLike,
+    inner_tol: float,
+    free: bool = False,
+    theta: float = 0.0,
+) -> NDArray[np.float64]:
+    """The parameter block that the step reads; see `_error` for `fine` and `coarse`, `project` for theta."""
+    A, b, c, fine, coarse = (np.asarray(x, dtype=float) for x in (A, b, c, fine, coarse))
+    s = b.size
+    if A.shape != (s, s) or not c.size == fine.size == coarse.size == s:
+        shapes = ", ".join(str(x.shape) for x in (A, b, c, fine, coarse))
+        raise ValueError(f"A, b, c, fine and coarse must be (s, s), (s,), (s,), (s,), (s,); given {shapes}")
+    if np.triu(A).any() or c[0] != 0.0:
+        raise ValueError("A must be strictly lower triangular and c[0] = 0: the first stage is the state itself")
+    return np.concatenate([[float(s), inner_tol, float(free), theta], A.ravel(), b, c, fine, coarse])
+
+
+def memory_size(s: int, n_q: int) -> int:
+    """Length of `memory` for s stages and n_q coordinates."""
+    return 1 + (N_VECTORS + s) * (-(-2 * n_q // BLOCK) * BLOCK)
+
+
+@inlined
+def _width(n):
+    return (2 * n + BLOCK - 1) // BLOCK * BLOCK
+
+
+@inlined
+def tableau_of(options):
+    """Views of the parameter block: s, A, b, c, and the weights of the two estimates."""
+    s = int(options[STAGES])
+    o = N_SCALARS
+    A = options[o : o + s * s].reshape((s, s))
+    o += s * s
+    return s, A, options[o : o + s], options[o + s : o + 2 * s], options[o + 2 * s : o + 3 * s], options[o + 3 * s :]
+
+
+@inlined
+def _vector(memory, n, which):
+    return memory[1 + which * _width(n) : 1 + (which + 1) * _width(n)]
+
+
+@inlined
+def _slopes(memory, s, n):
+    """Velocities and accelerations of the stages, side by side."""
+    begin = 1 + N_VECTORS * _width(n)
+    return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
+
+
+@compiled
+def _weighted(weights, slopes, total):
+    """The sum of weights[k] slopes[k], block by block, each in registers."""
+    for m in range(0, total.size, BLOCK):
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
+        for k in range(weights.size):
+            weight = weights[k]
+            s0 += weight * slopes[k, m]
+            s1 += weight * slopes[k, m + 1]
+            s2 += weight * slopes[k, m + 2]
+            s3 += weight * slopes[k, m + 3]
+            s4 += weight * slopes[k, m + 4]
+            s5 += weight * slopes[k, m + 5]
+            s6 += weight * slopes[k, m + 6]
+            s7 += weight * slopes[k, m + 7]
+        total[m] = s0
+        total[m + 1] = s1
+        total[m + 2] = s2
+        total[m + 3] = s3
+        total[m + 4] = s4
+        total[m + 5] = s5
+        total[m + 6] = s6
+        total[m + 7] = s7
+
+
+@compiled
+def _move(y, h, weights, slopes, total, y1):
+    """y1 = y + h times the weighted sum: added at last, so that not every stage rounds y."""
+    _weighted(weights, slopes, total)
+    for m in range(y.size):
+        y1[m] = y[m] + h * total[m]
+
+
+@compiled
+def largest_error(tolerances, y, y1, one, other):
+    """e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
+
+    Each is an estimate over atol + rtol |y|. Taken component by component e^2 / sqrt(e^2 + d^2) would be e, of low
+    order, where d passes through zero: up to 30 % more evaluations.
+    """
+    n = one.size // 2
+    rtol = tolerances[RTOL]
+    e = e_v = d = d_v = 0.0
+    for m in range(n):
+        k, atol = n + m, tolerances[ATOL + m]
+        share = 1.0 / (atol + rtol * max(abs(y[m]), abs(y1[m])))
+        share_v = 1.0 / (atol + rtol * max(abs(y[k]), abs(y1[k])))
+        e, e_v = max(e, abs(one[m] * share)), max(e_v, abs(one[k] * share_v))
+        d, d_v = max(d, abs(other[m] * share)), max(d_v, abs(other[k] * share_v))
+    e, d = max(e, e_v), max(d, d_v)
+    return e * e / np.hypot(e, d) if e > 0.0 else 0.0
+
+
+@compiled
+def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other):
+    """The error of a step that is finished; `one` and `other` are room for the two estimates."""
+    _weighted(fine, slopes, one)
+    _weighted(coarse, slopes, other)
+    for m in range(y.size):
+        one[m] *= h
+        other[m] *= h
+    return largest_error(tolerances, y, y1, one[: y.size], other[: y.size])
+
+
+@kernel(STEP, vectorized=True)
+def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt; one that the estimate refuses ends without the accelerations at its end."""
+    s, A, b, c, fine, coarse = tableau_of(options)
+    n = w.Q.size
+    q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
+    slopes = _slopes(memory, s, n)
+    # near a singular position it matters on which side of it a stage is, and how well velocities keep to the rows
+    free = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] == 0.0
+    w.counters[N_OUTER] += 1
+    copy(state[n : 3 * n], slopes[0])
+    for j in range(1, s):
+        _move(y, h, A[j, :j], slopes, stage, stage)  # dependents too: where Newton starts
+        v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
+        copy(stage[n : 2 * n], v_stage)
+        if free:
+            code = evaluate_there(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
+        else:
+            code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
+        if code != DONE:
+            return code, np.inf
+    _move(y, h, b, slopes, stage, y1)
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other)
+        if not error <= 1.0:
+            return DONE, error
+    keep_predicted(w, q1)
+    if free:
+        code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    else:
+        code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
+    if code == DONE:
+        w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
+    return code, max(error, w.notes[DEPARTURE])
+
+
+@kernel(STEP)
+def compiled_explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """The same with stages by f.own, code made for the mechanism, which are free; f.instead is explicit_step."""
+    if w.notes[NEARLY_SINGULAR] != 0.0:
+        return f.instead(f, w, options, memory, t, h, tolerances, state, new_state)
+    n = w.Q.size
+    w.counters[N_OUTER] += 1
+    code, error = f.own(f, w, options, memory, t, h, tolerances, state, new_state)
+    if code != DONE or not error <= 1.0:
+        return code, error
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    keep_predicted(w, q1)
+    code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    if code == DONE:
+        w.notes[DEPARTURE] = departure(w, tolerances, h, state[:n], state[n : 2 * n], q1)
+    return code, max(error, w.notes[DEPARTURE])

@@ -1,0 +1,387 @@
+"""Implicit Runge-Kutta steps: the outer loop by fixed point, and Richardson's error estimate around it.
+
+Two outer loops are available: `iterate_accelerations` iterates on the stage accelerations alone (the tableau applied
+twice to q'' = a), `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
+"""
+
+import numpy as np
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.predictor import restore_predicted
+from twoloop.kernels.data.common import (
+    ATOL,
+    DEPARTURE,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    OUTER_DIVERGED,
+    RTOL,
+    STEP,
+    compiled,
+    exact,
+    inlined,
+    kernel,
+    merged,
+)
+from twoloop.kernels.evaluation.calls import accelerations, evaluate, restore, rounding_floor
+from twoloop.kernels.steps.stages import (
+    EXTRAPOLATION,
+    FARTHEST,
+    INNER_TOL,
+    OUTER_TEST,
+    OUTER_TOL,
+    end_error,
+    interpolate,
+    tableau_of,
+)
+
+MAX_ITERATIONS = 60
+MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
+GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
+SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
+SUDDEN = 10.0  # what that has to be in the paper's procedure, which has no such estimate, before it counts
+PATIENCE = 8  # iterations after which a difference that grows again means divergence
+
+# places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
+LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
+N_RESTS = 4  # rows of REST: what rounding took from q and from v, at the last accepted step and in this attempt
+PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
+
+
+def memory_size(s: int, n_q: int) -> int:
+    """Length of `memory` for s stages and n_q coordinates."""
+    return N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + s
+
+
+@inlined
+def _block(memory, s, n, which):
+    start = N_MEMORY_SCALARS + which * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def _vector(memory, s, n, which):
+    start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
+    return memory[start : start + n]
+
+
+@inlined
+def rests(memory, n, tolerances):
+    """The rows of REST, with which `memory` begins; none with step-size control, whose errors exceed rounding."""
+    count = N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
+    return memory[: count * n].reshape((count, n))
+
+
+@exact
+def compensated(x, rest, increment):
+    """The sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    increment += rest
+    total = x + increment
+    return total, increment - (total - x)
+
+
+@merged
+def forget(coordinates, rest):
+    """Coordinates that the constraints give have no rest."""
+    for i in range(N_RESTS // 2, rest.shape[0]):
+        for m in coordinates:
+            rest[i, m] = 0.0
+
+
+@merged
+def keep_rest(rest):
+    """That of the last attempt, which was accepted, is what the next step begins with."""
+    for i in range(rest.shape[0] // 2):
+        copy(rest[rest.shape[0] // 2 + i], rest[i])
+
+
+@compiled
+def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
+    """One step of size h from (q, v), a fixed-point iteration on the stage accelerations.
+
+    A_stage holds their prediction on entry.
+    Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
+    undamped systems the iteration's rate is the square of the first-order one. On return A_stage has converged and
+    (q1, v1) is the end of the step, on the constraints; w.notes[DEPARTURE] grows to how far its prediction was off.
+    The sums are compensated where `rest` has rows.
+    """
+    s, A, A2, b, bA, c = tableau_of(options)
+    n = q.size
+    tolerance = options[INNER_TOL]
+    for j in range(s):
+        for m in range(n):
+            total = 0.0
+            for k in range(s):
+                total += A2[j, k] * A_stage[k, m]
+            Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
+    first = 0.0
+    before = 0.0
+    converged = False
+    for iteration in range(MAX_ITERATIONS):
+        w.counters[N_OUTER] += 1
+        # all stages are set before any is evaluated: Gauss-Seidel would converge for smaller h only
+        for j in range(s):
+            for m in w.independent:
+                in_q = 0.0
+                in_v = 0.0
+                for k in range(s):
+                    in_q += A2[j, k] * A_stage[k, m]
+                    in_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * in_q
+                V_stage[j, m] = v[m] + h * in_v
+        change = 0.0
+        for j in range(s):
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1)
+            if code != DONE:
+                return code
+            for m in w.independent:
+                difference = h * abs(q1[m] - A_stage[j, m])
+                change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
+                change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
+            copy(q1, A_stage[j])
+        if change <= options[OUTER_TOL]:
+            converged = True
+            break
+        if iteration == 0:
+            first = change
+        elif not change <= GROWTH * first:
+            return OUTER_DIVERGED
+        elif change >= before:
+            if change <= rounding_floor(q):
+                converged = True
+                break
+            if iteration >= PATIENCE:
+                return OUTER_DIVERGED
+        before = change
+    if not converged:
+        return OUTER_DIVERGED
+    for m in range(n):
+        in_q = 0.0
+        in_v = 0.0
+        for k in range(s):
+            in_q += bA[k] * A_stage[k, m]
+            in_v += b[k] * A_stage[k, m]
+        if rest.shape[0] == 0:
+            q1[m] = q[m] + h * v[m] + h * h * in_q
+            v1[m] = v[m] + h * in_v
+        else:
+            q1[m], rest[2, m] = compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
+            v1[m], rest[3, m] = compensated(v[m], rest[1, m], h * in_v)
+    forget(w.dependent, rest)
+    return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
+
+
+@merged
+def _largest_change(coordinates, q, v, q_old, v_old):
+    change = 0.0
+    for m in coordinates:
+        change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
+        change = max(change, abs(v[m] - v_old[m]) / max(abs(v[m]), 1.0))
+    return change
+
+
+@compiled
+def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
+    """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
+
+    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration goes from
+    stage to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on
+    the constraints.
+    """
+    s, A, _, b, _, c = tableau_of(options)
+    n = q.size
+    tolerance = options[INNER_TOL]
+    for m in range(n):
+        q1[m] = q[m] + h * v[m]
+        v1[m] = v[m] + h * a[m]
+    code = evaluate(f, w, t + h, q1, v1, tolerance, A_stage[0])
+    if code != DONE:
+        return code
+    for j in range(s):
+        copy(A_stage[0], A_stage[j])
+        copy(v1, V_stage[j])
+        copy(q1, Q_stage[j])
+    norm_before = np.inf
+    for _ in range(MAX_ITERATIONS_PAPER):
+        w.counters[N_OUTER] += 1
+        for j in range(s):
+            for m in w.independent:
+                in_q = 0.0
+                in_v = 0.0
+                for k in range(s):
+                    in_q += A[j, k] * V_stage[k, m]
+                    in_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + h * in_q
+                V_stage[j, m] = v[m] + h * in_v
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j])
+            if code != DONE:
+                return code
+        copy(q1, q_old)
+        copy(v1, v_old)
+        for m in w.independent:
+            in_q = 0.0
+            in_v = 0.0
+            for k in range(s):
+                in_q += b[k] * V_stage[k, m]
+                in_v += b[k] * A_stage[k, m]
+            q1[m] = q[m] + h * in_q
+            v1[m] = v[m] + h * in_v
+        code = restore(f, w, t + h, q1, v1, tolerance)
+        if code != DONE:
+            return code
+        change = _largest_change(w.independent, q1, v1, q_old, v_old)
+        if options[OUTER_TEST] == 1.0:
+            change = max(change, _largest_change(w.dependent, q1, v1, q_old, v_old))
+        if change <= options[OUTER_TOL]:  # (32)
+            return DONE
+        norm = 0.0
+        for m in range(n):
+            norm += (q1[m] - q_old[m]) ** 2 + (v1[m] - v_old[m]) ** 2
+        norm = np.sqrt(norm)
+        if not norm <= norm_before:  # (33)
+            return OUTER_DIVERGED
+        norm_before = norm
+    return OUTER_DIVERGED
+
+
+@compiled
+def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
+    """Difference of one step and two half steps over (26), for positions and velocities, dependents too.
+
+    Its largest component, or the root mean square (27).
+    """
+    rtol = tolerances[RTOL]
+    total = 0.0
+    top = 0.0
+    for m in range(q.size):
+        atol = tolerances[ATOL + m]
+        in_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
+        in_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
+        total += in_q * in_q + in_v * in_v
+        top = max(top, abs(in_q), abs(in_v))
+    return top if largest else np.sqrt(total / (2 * q.size))
+
+
+@compiled
+def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
+    """The error of the two half steps and, with EXTRAPOLATION, their extrapolation with the whole step."""
+    share = options[EXTRAPOLATION]
+    error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
+    if not (share > 0.0 and error <= 1.0):
+        return DONE, error
+    for m in range(q.size):
+        q1[m] += share * (q1[m] - q_full[m])
+        v1[m] += share * (v1[m] - v_full[m])
+    return restore(f, w, t, q1, v1, options[INNER_TOL]), error
+
+
+@kernel(STEP)
+def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt, a fixed-point iteration on the accelerations; to estimate the error, a step of h and two of h/2.
+
+    The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
+    step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
+    last accepted step, those of the half steps from the whole step's.
+    """
+    s, _, _, _, _, c = tableau_of(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    previous = _block(memory, s, n, PREVIOUS)
+    trial = _block(memory, s, n, TRIAL)
+    half = _block(memory, s, n, HALF)
+    Q_stage = _block(memory, s, n, Q_STAGE)
+    V_stage = _block(memory, s, n, V_STAGE)
+    q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
+    q_mid, v_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID)
+    weights = memory[memory.size - s :]
+    rest = rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
+    if memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0:
+        for j in range(s):
+            copy(trial[j], previous[j])
+        memory[H_PREVIOUS] = memory[H_TRIAL]
+        memory[HAS_PREVIOUS] = 1.0
+        keep_rest(rest)
+    memory[HAS_TRIAL] = 0.0
+    ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
+    for j in range(s):
+        if ratio <= FARTHEST:
+            interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
+        else:
+            copy(a, trial[j])
+    code = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
+    if code != DONE:
+        return code, np.inf
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        copy(q1, q_full)
+        copy(v1, v_full)
+        for j in range(s):
+            interpolate(c, 0.5 * c[j], trial, weights, half[j])
+        w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
+        g = 0.5 * h
+        code = iterate_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rest)
+        if code != DONE:
+            return code, np.inf
+        for j in range(s):
+            interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
+        code = iterate_accelerations(
+            f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rest
+        )
+        if code != DONE:
+            return code, np.inf
+        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        if code != DONE:
+            return code, np.inf
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    memory[HAS_TRIAL] = 1.0
+    memory[H_TRIAL] = h
+    if code == DONE and tolerances[ESTIMATE] == 1.0:
+        error = max(error, SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, trial))
+    return code, max(error, w.notes[DEPARTURE])
+
+
+@kernel(STEP)
+def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt in the manner of the paper (Sects. 3.1-3.3): a step of h, two of h/2, their difference the error."""
+    s, _, _, _, _, _ = tableau_of(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    A_stage = _block(memory, s, n, TRIAL)
+    A_full = _block(memory, s, n, HALF)
+    Q_stage = _block(memory, s, n, Q_STAGE)
+    V_stage = _block(memory, s, n, V_STAGE)
+    q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
+    q_mid, v_mid, a_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID), _vector(memory, s, n, A_MID)
+    q_old, v_old = _vector(memory, s, n, Q_OLD), _vector(memory, s, n, V_OLD)
+    code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
+    if code != DONE:
+        return code, np.inf
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        copy(q1, q_full)
+        copy(v1, v_full)
+        for j in range(s):
+            copy(A_stage[j], A_full[j])
+        g = 0.5 * h
+        code = iterate_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
+        if code == DONE:
+            code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
+        if code != DONE:
+            return code, np.inf
+        code = iterate_first_order(
+            f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
+        )
+        if code != DONE:
+            return code, np.inf
+        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        if code != DONE:
+            return code, np.inf
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    if code == DONE and tolerances[ESTIMATE] == 1.0:
+        beside = SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, A_full)
+        if error <= 1.0 and beside > SUDDEN:
+            error = beside
+    return code, error

@@ -1,0 +1,144 @@
+"""The matrix of one Newton iteration from the tangents that a system gives, without a band, for diagonal.py.
+
+With v = T v_i + u, T = [I; -Cqd^-1 Cqi], the corrections d of the independent accelerations solve
+
+    T^T (M - z^2 K - z D) T d = T^T M T r,    K, D = derivatives by q, v of Q - Cq^T lam, lam held.
+
+It is factored as it stands, and no inverse of T^T M T is applied to the derivatives, as newton_dense.py does for the
+many systems of a Runge-Kutta method: half the work where a matrix serves one iteration only. What is left out is the
+same: how T and M change with the position, in which there is no stiffness.
+"""
+
+from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
+from twoloop.kernels.data.common import (
+    DONE,
+    FORCE_BY_V_GIVEN,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    SINGULAR,
+    compiled,
+    inlined,
+)
+from twoloop.kernels.evaluation.calls import find_tangents
+from twoloop.kernels.steps.newton_dense import reduce
+from twoloop.kernels.steps.newton_memory import (
+    BY_Q,
+    BY_V,
+    DAMPED,
+    FILTER,
+    Q_MOVED,
+    SYMMETRIC,
+    SYSTEMS,
+    V_MOVED,
+    pivots_of,
+    space,
+    vector,
+)
+from twoloop.kernels.steps.newton_tangents import tangent_by_q, tangent_by_v
+
+ASYMMETRY = 1e-12  # of the largest entry: what counts as rounding
+
+
+@inlined
+def _square(numbers, m):
+    return numbers[: m * m].reshape((m, m))
+
+
+@compiled
+def _symmetric(A):
+    largest, off = 0.0, 0.0
+    for i in range(A.shape[0]):
+        largest = max(largest, abs(A[i, i]))
+        for j in range(i):
+            off = max(off, abs(A[i, j] - A[j, i]))
+    return off <= ASYMMETRY * largest
+
+
+@compiled
+def _fill(memory, n, m, z, H):
+    """T^T M T - z^2 T^T K T - z T^T D T into H."""
+    N, Kr, Dr = space(memory, 1, n, SYSTEMS), space(memory, 1, n, BY_Q), space(memory, 1, n, BY_V)
+    square = z * z
+    if memory[DAMPED] == 1.0:
+        for i in range(m * m):
+            H[i] = N[i] - square * Kr[i] - z * Dr[i]
+    else:
+        for i in range(m * m):
+            H[i] = N[i] - square * Kr[i]
+
+
+@compiled
+def factor_iteration(f, w, memory, t, q, v, z):
+    """Factors of the matrix at a state that was evaluated just before, with its multipliers in w.lam."""
+    n = q.size
+    m = w.independent.size
+    w.counters[N_JACOBIANS] += 1
+    numbers = space(memory, 1, n, FILTER)
+    K, R = numbers.reshape((n, n)), space(memory, 1, n, SYSTEMS).reshape((n, n))
+    AT = space(memory, 1, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, Q_MOVED), K, R)
+    if code == DONE:
+        code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
+    reduce(w, K, AT, _square(space(memory, 1, n, BY_Q), m))
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    code = tangent_by_v(f, t, q, v, n - 1, K)
+    if code != DONE:
+        return code
+    if memory[DAMPED] == 1.0:
+        reduce(w, K, AT, _square(space(memory, 1, n, BY_V), m))
+    reduce(w, w.M, AT, _square(space(memory, 1, n, SYSTEMS), m))
+    w.counters[N_FACTORIZATIONS] += 1
+    _fill(memory, n, m, z, numbers)
+    H = _square(numbers, m)
+    memory[SYMMETRIC] = 0.0
+    if _symmetric(H):
+        if ldl_factor(H):
+            memory[SYMMETRIC] = 1.0
+            return DONE
+        _fill(memory, n, m, z, numbers)  # not definite, as of a compressed beam
+    return DONE if lu_factor(H, pivots_of(memory, 1, n, 1, 0)) > 0.0 else SINGULAR
+
+
+@compiled
+def _solve(w, memory, x):
+    m = x.size
+    H = _square(space(memory, 1, w.Q.size, FILTER), m)
+    if memory[SYMMETRIC] == 1.0:
+        ldl_solve(H, x)
+    else:
+        lu_solve(H, pivots_of(memory, 1, w.Q.size, 1, 0), x)
+
+
+@compiled
+def solve_iteration(w, memory, residual, a):
+    """The correction of the independents of a, added; it replaces the residual (n_q)."""
+    n = w.Q.size
+    m = w.independent.size
+    N, x = _square(space(memory, 1, n, SYSTEMS), m), vector(memory, 1, n, V_MOVED)[:m]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += N[i, j] * residual[w.independent[j]]
+        x[i] = total
+    _solve(w, memory, x)
+    for i in range(m):
+        residual[w.independent[i]] = x[i]
+        a[w.independent[i]] += x[i]
+
+
+@compiled
+def filter_by_iteration(w, memory, z, e_q, e_v):
+    """e_v (n_dof) becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)."""
+    n = w.Q.size
+    m = e_q.size
+    N, Kr = _square(space(memory, 1, n, SYSTEMS), m), _square(space(memory, 1, n, BY_Q), m)
+    x = vector(memory, 1, n, V_MOVED)[:m]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += N[i, j] * e_v[j] + z * Kr[i, j] * e_q[j]
+        x[i] = total
+    _solve(w, memory, x)
+    copy(x, e_v)

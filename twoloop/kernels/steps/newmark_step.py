@@ -1,0 +1,110 @@
+"""A Newmark step, its outer loop by fixed point on the independent accelerations. Equation numbers are the paper's."""
+
+import numpy as np
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.predictor import departure
+from twoloop.kernels.data.common import (
+    ATOL,
+    DONE,
+    ESTIMATE,
+    N_OUTER,
+    OUTER_DIVERGED,
+    RTOL,
+    STEP,
+    compiled,
+    kernel,
+    merged,
+)
+from twoloop.kernels.evaluation.calls import evaluate_state, rounding_floor
+
+MAX_ITERATIONS = 60
+TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
+
+# places in `memory` before the new accelerations; the first is advance()'s
+SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(1, 5)
+
+# places in `options`
+BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
+
+
+@merged
+def _largest(x, least):
+    for m in range(x.size):
+        least = max(least, abs(x[m]))
+    return least
+
+
+@compiled
+def _rate(memory, q, v, a, q1, v1, a1):
+    """Reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
+
+    Of the largest of each so far: at one time alone, coordinates are near zero wherever the origin is.
+    """
+    memory[SIZE] = _largest(q, memory[SIZE])
+    memory[SPEED] = _largest(v, memory[SPEED])
+    memory[ACCELERATION] = _largest(a, memory[ACCELERATION])
+    size = _largest(q1, memory[SIZE])
+    if size == 0.0:
+        return 0.0
+    return max(_largest(v1, memory[SPEED]) / size, np.sqrt(_largest(a1, memory[ACCELERATION]) / size))
+
+
+@compiled
+def _error(options, tolerances, rate, h, q, v, a, a1):
+    """Of e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for any beta and gamma = 1/2.
+
+    The largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 like the error of
+    the run. With ERROR_TOL > 0 the 2-norm of e over ERROR_TOL (the paper's err_out).
+    """
+    factor = abs(options[BETA] - 1.0 / 6.0) * h
+    total = 0.0
+    largest = 0.0
+    for m in range(q.size):
+        e = factor * abs(a1[m] - a[m])
+        total += (h * e) ** 2
+        largest = max(largest, e / (rate * tolerances[ATOL + m] + tolerances[RTOL] * abs(v[m]) + TINY))
+    return np.sqrt(total) / options[ERROR_TOL] if options[ERROR_TOL] > 0.0 else largest
+
+
+@kernel(STEP)
+def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt: (12) for the independent coordinates, inner loop, accelerations, until these stop changing."""
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    beta, gamma = options[BETA], options[GAMMA]
+    a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
+    for m in range(n):
+        a1[m] = a[m]
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: where Newton starts
+    before = np.inf
+    for _ in range(MAX_ITERATIONS):
+        w.counters[N_OUTER] += 1
+        for m in w.independent:
+            q1[m] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
+            v1[m] = v[m] + h * ((1.0 - gamma) * a[m] + gamma * a1[m])
+        code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a_new, lam1)
+        if code != DONE:
+            return code, np.inf
+        change = 0.0
+        for m in w.independent:
+            difference = h * abs(a_new[m] - a1[m])
+            change = max(change, gamma * difference / max(abs(v1[m]), 1.0))
+            change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
+        copy(a_new, a1)
+        if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
+            error = 0.0
+            if tolerances[ESTIMATE] == 1.0:
+                rate = _rate(memory, q, v, a, q1, v1, a1)
+                error = _error(options, tolerances, rate, h, q, v, a, a1)
+                if options[ERROR_TOL] == 0.0:  # not in the paper
+                    for k in range(w.dependent.size):
+                        m = w.dependent[k]
+                        w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
+                    error = max(error, departure(w, tolerances, h, q, v, q1))
+            return DONE, error
+        if not change <= before:
+            return OUTER_DIVERGED, np.inf
+        before = change
+    return OUTER_DIVERGED, np.inf

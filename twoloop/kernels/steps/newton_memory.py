@@ -1,0 +1,99 @@
+"""Where the parts of newton_step's `options` and `memory` are; both keep to these places."""
+
+import numpy as np
+
+from twoloop.kernels.data.common import inlined, merged
+from twoloop.kernels.steps.stages import N_SCALARS
+
+# `options` is that of stages.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
+# its real and imaginary part, the row of T^-1 and the column of T that belong to it (s real, s imaginary parts each)
+# VELOCITIES: 1 if their error is tested, too
+N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
+
+# places in `memory`: advance() sets LAST_ACCEPTED after every attempt
+(
+    LAST_ACCEPTED,
+    HAS_TRIAL,
+    H_TRIAL,
+    HAS_PREVIOUS,
+    H_PREVIOUS,
+    HAS_JACOBIAN,
+    FRESH,  # the derivatives are those of the present state
+    PARTITION_NUMBER,
+    H_FACTORED,
+    CONTRACTION,  # of the last iteration
+    DAMPED,  # 0: no derivative by v
+    SYMMETRIC,  # 1: the matrix of diagonal.py was factored as a symmetric one
+    LASTING,  # s, of diagonal.py: how long an error of velocity lasts; 0: not known
+    N_MEMORY_SCALARS,
+) = range(14)
+PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
+# spaces of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue
+BY_Q, BY_V, FILTER, SYSTEMS = range(4)
+
+
+def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
+    """Length of `memory`: scalars, stage blocks, vectors, spaces for matrices, pivots, two complex vectors, weights."""
+    matrices = SYSTEMS + 2 * n_eigenvalues
+    vectors = N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues
+    return N_MEMORY_SCALARS + vectors * n_q + matrices * n_q * n_q + s
+
+
+@merged
+def eigen_place(options, s):
+    """First place of the eigenvalue scalars."""
+    return N_SCALARS + 2 * s * s + 5 * s
+
+
+@merged
+def count_eigenvalues(options, s):
+    """Number of systems: one for each real eigenvalue and one for each pair."""
+    place = eigen_place(options, s)
+    return int(options[place + N_REAL] + options[place + N_PAIRS])
+
+
+@inlined
+def block(memory, s, n, which):
+    """One of the stage blocks, (s, n)."""
+    start = N_MEMORY_SCALARS + which * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def vector(memory, s, n, which):
+    """One of the vectors, (n)."""
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
+    return memory[start : start + n]
+
+
+@inlined
+def space(memory, s, n, which):
+    """The space of one matrix, (n^2)."""
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + which * n) * n
+    return memory[start : start + n * n]
+
+
+@inlined
+def system_space(memory, s, n, k):
+    """The space of the k-th eigenvalue's system, complex (n^2)."""
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (SYSTEMS + 2 * k) * n) * n
+    return memory[start : start + 2 * n * n].view(np.complex128)
+
+
+@inlined
+def _tail(memory, s, n, n_eigen, k):
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (SYSTEMS + 2 * n_eigen) * n) * n + k * n
+    return memory[start : start + 2 * n]
+
+
+@inlined
+def pivots_of(memory, s, n, n_eigen, k):
+    """Integers (n) for the row exchanges of the filter (k = 0) or of the (k - 1)-th eigenvalue's system."""
+    return _tail(memory, s, n, n_eigen, k)[:n].view(np.int64)
+
+
+@inlined
+def complex_vector(memory, s, n, n_eigen, which):
+    """Complex scratch (n), `which` being 0 or 1."""
+    return _tail(memory, s, n, n_eigen, 1 + n_eigen + 2 * which).view(np.complex128)

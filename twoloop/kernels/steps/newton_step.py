@@ -1,0 +1,386 @@
+"""Implicit Runge-Kutta steps whose outer loop is Newton's method, for stiff problems.
+
+The unknowns are the stage accelerations a_j of the independent coordinates, as in `iterate_accelerations`:
+
+    r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
+
+F being the two-loop right-hand side. With J_q, J_v, its derivatives by q_i and v_i at one state (simplified Newton),
+the corrections solve (I - h^2 A A x J_q - h A x J_v) d = r. In the eigenvectors of A this falls apart into one real
+(n_dof, n_dof) system I - (h l)^2 J_q - h l J_v for each real eigenvalue l and one complex for each pair, half the size
+of those of a first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA). A fixed-point iteration would
+need tiny steps there.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.predictor import restore_predicted
+from twoloop.kernels.data.common import (
+    ATOL,
+    BANDWIDTH,
+    DEPARTURE,
+    DONE,
+    ESTIMATE,
+    GENERATION,
+    LEAST,
+    N_OUTER,
+    OUTER_DIVERGED,
+    RTOL,
+    STEP,
+    compiled,
+    kernel,
+    merged,
+)
+from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
+from twoloop.kernels.steps import newton_banded, newton_dense
+from twoloop.kernels.steps.lasting import lasting_error
+from twoloop.kernels.steps.newton_memory import (
+    A_MID,
+    A_NEW,
+    CONTRACTION,
+    E_Q,
+    E_V,
+    FRESH,
+    GAMMA0,
+    H_FACTORED,
+    H_PREVIOUS,
+    H_TRIAL,
+    HAS_JACOBIAN,
+    HAS_PREVIOUS,
+    HAS_TRIAL,
+    LAST_ACCEPTED,
+    N_EIGEN_SCALARS,
+    N_REAL,
+    PARTITION_NUMBER,
+    PREVIOUS,
+    Q_MID,
+    Q_STAGE,
+    RESIDUAL,
+    TRIAL,
+    V_MID,
+    V_STAGE,
+    VELOCITIES,
+    block,
+    complex_vector,
+    count_eigenvalues,
+    eigen_place,
+    vector,
+)
+from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
+
+MAX_ITERATIONS = 15
+SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
+SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
+STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
+STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
+
+
+def newton_options(
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
+) -> NDArray[np.float64]:
+    """The part of `options` that Newton's method needs besides stages.options_array; `velocities`: those are tested.
+
+    Raises
+    ------
+    ValueError
+        If A has too few eigenvectors.
+    """
+    values, T = np.linalg.eig(A)
+    if np.linalg.cond(T) > 1e8:
+        raise ValueError(
+            "A of the tableau must have a basis of eigenvectors for Newton's method. Take outer='fixed-point'"
+        )
+    inverse = np.linalg.inv(T)
+    real = [k for k in range(len(b)) if values[k].imag == 0.0]
+    pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
+    gamma0 = float(values[real[0]].real) if real else float(np.abs(values).min())
+    parts: list[Any] = [[len(real), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
+    for k in real + pairs:
+        row, column = inverse[k], T[:, k]
+        parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
+    """Weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less the method's own.
+
+    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages hold f(y_n) already: then the last stage is left out.
+    """
+    s = len(b)
+    moments = 1.0 / np.arange(1.0, s + 1.0)
+    if c[0] > 1e-10:
+        moments[0] -= gamma0
+        embedded = np.linalg.solve(np.vander(c, increasing=True).T, moments)
+    else:
+        embedded = np.zeros(s)
+        embedded[:-1] = np.linalg.solve(np.vander(c[:-1], increasing=True).T, moments[:-1])
+        embedded[0] -= gamma0
+    return np.asarray(embedded - b)
+
+
+@compiled
+def derivatives_at(f, w, options, memory, s, t, q, v, a):
+    """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
+    if f.flags[BANDWIDTH] >= 0:
+        return newton_banded.derivatives(f, w, memory, s, t, q, v)
+    return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
+
+
+@compiled
+def factor_systems(f, w, options, memory, s, h):
+    """Factors for steps of h, for every eigenvalue and for gamma0."""
+    if f.flags[BANDWIDTH] >= 0:
+        code = newton_banded.factor(f, w, options, memory, s, h)
+    else:
+        code = newton_dense.factor(w, options, memory, s, h)
+    memory[H_FACTORED] = h
+    return code
+
+
+@compiled
+def correct(f, w, options, memory, s, residual, A_stage):
+    """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
+    n = w.Q.size
+    m = w.independent.size
+    place = eigen_place(options, s)
+    n_real = int(options[place + N_REAL])
+    n_eigen = count_eigenvalues(options, s)
+    x = complex_vector(memory, s, n, n_eigen, 0)
+    place += N_EIGEN_SCALARS + s
+    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
+    d[:, :] = 0.0
+    for k in range(n_eigen):
+        row = place + 2
+        column = row + 2 * s
+        place += 2 + 4 * s
+        for i in range(m):
+            total = complex(0.0, 0.0)
+            for j in range(s):
+                total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
+            x[i] = total
+        if f.flags[BANDWIDTH] >= 0:
+            newton_banded.solve(f, w, options, memory, s, k, x)
+        else:
+            newton_dense.solve(w, options, memory, s, k, x[:m])
+        twice = 1.0 if k < n_real else 2.0
+        for j in range(s):
+            re, im = options[column + j], options[column + s + j]
+            for i in range(m):
+                d[j, w.independent[i]] += twice * (re * x[i].real - im * x[i].imag)
+    for j in range(s):
+        for i in w.independent:
+            residual[j, i] = d[j, i]
+            A_stage[j, i] += d[j, i]
+
+
+@compiled
+def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
+    """Newton's method for the stage accelerations, predicted in A_stage: DONE, or why not."""
+    s, A, A2, _, _, c = tableau_of(options)
+    n = q.size
+    residual = block(memory, s, n, RESIDUAL)
+    Q_stage, V_stage = block(memory, s, n, Q_STAGE), block(memory, s, n, V_STAGE)
+    a_new = vector(memory, s, n, A_NEW)
+    before = 0.0
+    floor = STAGNATION_FIXED
+    if tolerances[ESTIMATE] == 1.0:
+        floor = STAGNATION * tolerances[LEAST]
+    for iteration in range(MAX_ITERATIONS):
+        w.counters[N_OUTER] += 1
+        for j in range(s):
+            for m in range(n):
+                Q_stage[j, m] = q[m] + c[j] * h * v[m]
+                V_stage[j, m] = v[m]
+            for k in range(s):
+                in_q, in_v = h * h * A2[j, k], h * A[j, k]
+                for m in range(n):
+                    Q_stage[j, m] += in_q * A_stage[k, m]
+                    V_stage[j, m] += in_v * A_stage[k, m]
+        for j in range(s):
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], options[INNER_TOL], a_new)
+            if code != DONE:
+                return code
+            for m in range(n):
+                residual[j, m] = a_new[m] - A_stage[j, m]
+            for m in w.dependent:
+                A_stage[j, m] = a_new[m]
+        scale_q, scale_v = 1.0, 1.0
+        for j in range(s):
+            for m in w.independent:
+                scale_q = max(scale_q, abs(Q_stage[j, m]))
+                scale_v = max(scale_v, abs(V_stage[j, m]))
+        correct(f, w, options, memory, s, residual, A_stage)
+        largest_q, largest_v = 0.0, 0.0
+        for j in range(s):
+            in_q, in_v = Q_stage[j], V_stage[j]  # their numbers are not needed any more
+            for m in range(n):
+                in_q[m] = 0.0
+                in_v[m] = 0.0
+            for k in range(s):
+                for m in range(n):
+                    in_q[m] += A2[j, k] * residual[k, m]
+                    in_v[m] += A[j, k] * residual[k, m]
+            for m in w.independent:
+                largest_q = max(largest_q, abs(in_q[m]))
+                largest_v = max(largest_v, abs(in_v[m]))
+        change = max(h * largest_v / scale_v, h * h * largest_q / scale_q)
+        if not np.isfinite(change):
+            return OUTER_DIVERGED
+        if iteration > 0:
+            contraction = change / before if before > 0.0 else 0.0
+            memory[CONTRACTION] = contraction
+            if contraction >= 0.9:
+                return DONE if change <= floor else OUTER_DIVERGED
+            if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
+                return DONE
+            # will it get there in time?
+            left = MAX_ITERATIONS - 1 - iteration
+            if change * contraction**left / (1.0 - contraction) > max(options[OUTER_TOL], floor):
+                return OUTER_DIVERGED
+        elif change <= 1e-3 * options[OUTER_TOL]:
+            return DONE
+        before = change
+    return DONE if before <= floor else OUTER_DIVERGED
+
+
+@compiled
+def _filter(f, w, options, memory, h, e_q, e_v):
+    """(I - z J)^-1 (e_q, e_v), z = h gamma0, J being the Jacobian of (v, F); all n_dof numbers in (n_q)."""
+    s = int(options[STAGES])
+    m = w.independent.size
+    if f.flags[BANDWIDTH] >= 0:
+        newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
+    else:
+        newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
+    for i in range(m):
+        e_q[i] += h * options[eigen_place(options, s) + GAMMA0] * e_v[i]
+
+
+@compiled
+def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
+    """Largest component, over atol + rtol |value|, of the embedded error estimate, filtered for stiff components."""
+    s, A, _, _, _, _ = tableau_of(options)
+    n = w.Q.size
+    q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
+    place = eigen_place(options, s)
+    gamma0 = options[place + GAMMA0]
+    e = options[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
+    e_q, e_v = vector(memory, s, n, E_Q), vector(memory, s, n, E_V)
+    raw, once = vector(memory, s, n, A_NEW), vector(memory, s, n, A_MID)
+    for i in range(w.independent.size):
+        j = w.independent[i]
+        in_q = gamma0 * v[j]
+        in_v = gamma0 * a[j]
+        for k in range(s):
+            speed = v[j]
+            for l in range(s):
+                speed += h * A[k, l] * A_stage[l, j]
+            in_q += e[k] * speed
+            in_v += e[k] * A_stage[k, j]
+        e_q[i] = h * in_q
+        e_v[i] = h * in_v
+    copy(e_v, raw)
+    _filter(f, w, options, memory, h, e_q, e_v)
+    error = 0.0
+    for i in range(w.independent.size):
+        j = w.independent[i]
+        error = max(error, abs(e_q[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
+        if options[place + VELOCITIES] == 1.0:
+            error = max(error, abs(e_v[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
+    if options[place + VELOCITIES] == 1.0:
+        return error
+    copy(e_v, once)
+    _filter(f, w, options, memory, h, e_q, e_v)
+    return max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state))
+
+
+@merged
+def _middle(c):
+    """The node next to the middle."""
+    found = 0
+    for j in range(c.size):
+        if abs(c[j] - 0.5) < abs(c[found] - 0.5):
+            found = j
+    return c[found]
+
+
+@kernel(STEP)
+def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt with Newton's method as the outer loop and an embedded estimate of the error."""
+    s, _, _, b, bA, c = tableau_of(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    previous, trial = block(memory, s, n, PREVIOUS), block(memory, s, n, TRIAL)
+    weights = memory[memory.size - s :]
+    q_mid, v_mid, a_mid = vector(memory, s, n, Q_MID), vector(memory, s, n, V_MID), vector(memory, s, n, A_MID)
+    if memory[LAST_ACCEPTED] == 1.0:
+        memory[FRESH] = 0.0
+        if memory[HAS_TRIAL] == 1.0:
+            for j in range(s):
+                copy(trial[j], previous[j])
+            memory[H_PREVIOUS] = memory[H_TRIAL]
+            memory[HAS_PREVIOUS] = 1.0
+    memory[HAS_TRIAL] = 0.0
+    if memory[PARTITION_NUMBER] != w.notes[GENERATION]:
+        memory[HAS_JACOBIAN] = 0.0
+        memory[PARTITION_NUMBER] = w.notes[GENERATION]
+    if memory[FRESH] == 0.0 and memory[CONTRACTION] > SLOW:
+        memory[HAS_JACOBIAN] = 0.0
+    while True:
+        if memory[HAS_JACOBIAN] == 0.0:
+            # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
+            # the time of a stage, so that this sees nothing of a force that the stages do not see
+            x = _middle(c) * h
+            for m in range(n):
+                q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
+                v_mid[m] = v[m] + x * a[m]
+            code = evaluate(f, w, t + x, q_mid, v_mid, options[INNER_TOL], a_mid)
+            if code != DONE:
+                return code, np.inf
+            multipliers(f, w, t + x, q_mid, v_mid, a_mid, w.lam)
+            code = derivatives_at(f, w, options, memory, s, t + x, q_mid, v_mid, a_mid)
+            if code != DONE:
+                return code, np.inf
+            memory[HAS_JACOBIAN] = 1.0
+            memory[FRESH] = 1.0
+            memory[H_FACTORED] = 0.0
+        if abs(memory[H_FACTORED] - h) > SAME_STEP * h:
+            code = factor_systems(f, w, options, memory, s, h)
+            if code != DONE:
+                memory[HAS_JACOBIAN] = 0.0
+                return code, np.inf
+        ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
+        for j in range(s):
+            if ratio <= FARTHEST:
+                interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
+            else:
+                copy(a, trial[j])
+        code = _iterate(f, w, options, memory, t, h, tolerances, q, v, trial)
+        if code == DONE:
+            break
+        if memory[FRESH] == 1.0:
+            return code, np.inf
+        memory[HAS_JACOBIAN] = 0.0
+    for m in range(n):
+        in_q = 0.0
+        in_v = 0.0
+        for k in range(s):
+            in_q += bA[k] * trial[k, m]
+            in_v += b[k] * trial[k, m]
+        q1[m] = q[m] + h * v[m] + h * h * in_q
+        v1[m] = v[m] + h * in_v
+    code = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
+    if code != DONE:
+        return code, np.inf
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        error = _estimate(f, w, options, memory, h, tolerances, state, new_state, trial)
+        error = max(error, w.notes[DEPARTURE])
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    memory[HAS_TRIAL] = 1.0
+    memory[H_TRIAL] = h
+    return code, error

@@ -1,0 +1,286 @@
+"""A step by the Taylor series of the motion, found from the index-3 equations themselves.
+
+With G = [C_q; A] the motion obeys G v + G_t = 0 and M a + G^T lam = Q. Written for the coefficients of the series, of
+order k in a and lam and of order k + 1 in v, all but the last coefficients of a, lam and v are known, and these solve
+
+    M_0 a_k + G_0^T lam_k = r_k,    G_0 a_k = c_k,
+
+with the matrix of the accelerations at the beginning of the step, whose factors are there: one solution with them an
+order, and no derivative of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001), 364-394, finds
+these offsets for any equations). What r and c need of G, M and Q follows from a program of products and functions, see
+`twoloop.generate.series`, and the recurrences for their coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
+
+The series has the order that the tolerance asks for, and the step the length at which its last terms are as large as
+the tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). Time is counted in units of the step
+before, so that no power of a short time underflows. The end of the step is moved to the constraints.
+"""
+
+import numpy as np
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.defect import excess
+from twoloop.kernels.control.predictor import departure, keep_predicted
+from twoloop.kernels.data.common import (
+    ATOL,
+    DEFECT,
+    DEPARTURE,
+    DONE,
+    ESTIMATE,
+    GAP,
+    N_OUTER,
+    NEARLY_SINGULAR,
+    RTOL,
+    STEP,
+    STEP_FACTOR,
+    compiled,
+    kernel,
+    merged,
+)
+from twoloop.kernels.evaluation.accelerations import solve_for_order
+from twoloop.kernels.evaluation.calls import evaluate_there, project
+from twoloop.kernels.steps.recurrences import (
+    ATTEMPTS,
+    KEEP,
+    KNOWN,
+    LAST_ACCEPTED,
+    LENGTH,
+    NEXT_LENGTH,
+    NEXT_UNIT,
+    ORDER,
+    PASSED,
+    SHORTER,
+    SUSPECT,
+    SUSPECTED,
+    TARGET,
+    THETA,
+    TRIED,
+    UNIT,
+    WHICH,
+    accelerations_found,
+    expand,
+    series_of,
+)
+
+ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
+ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
+LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
+NEAR_BEGIN = 1e-5  # of the step: no force changes within it
+GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly between 0 and 1
+MOST_SHORTENED = 0.1  # a step that is refused for its defect
+GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
+
+
+@kernel(STEP)
+def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
+    """The linear solution of one order, for code made for a mechanism where its own factors do not serve."""
+    solve_for_order(f, w, r, c, a, lam)
+    return DONE, 0.0
+
+
+@merged
+def _find_series(f, w, options, memory, t, state, unit, which, by_code):
+    """The series about a state, into one of the two places; by f.own, code made for the mechanism, if there is."""
+    memory[TARGET] = which
+    if by_code:
+        code, _ = f.own(f, w, options, memory, t, unit, state, state, state)
+        return code
+    return expand(f, w, options, memory, t, state, unit)
+
+
+@merged
+def _length(tolerances, series, unit, order, n):
+    """The step, in units, at which the last two terms, of positions and velocities, are within the tolerances."""
+    rtol, last, before = tolerances[RTOL], 0.0, 0.0
+    row, row_before = order * n, (order - 1) * n
+    for j in range(n):
+        atol = tolerances[ATOL + j]
+        of_q = 1.0 / (atol + rtol * abs(series[j]))
+        of_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
+        last = max(last, abs(series[row + j]) * max(of_q, order * of_v))
+        before = max(before, abs(series[row_before + j]) * max(of_q, (order - 1) * of_v))
+    least = -np.inf  # logarithm of 1 / length
+    if last > 0.0:
+        least = np.log(last) / order
+    if before > 0.0:
+        least = max(least, np.log(before) / (order - 1))
+    return np.exp(-least)
+
+
+@merged
+def _evaluate(series, unit, order, x, q, v, a):
+    """q, v and a at x units of time, by Horner's scheme; four coordinates at once, or two, some of the last ones twice.
+
+    The recurrence of the second derivative gives half of it.
+    """
+    n, per_unit = q.size, 1.0 / unit
+    twice = 2.0 * per_unit * per_unit
+    for first in range(0, n if n > 3 else 0, 4):
+        j = min(first, n - 4)
+        m = order * n + j
+        q0, q1, q2, q3 = series[m], series[m + 1], series[m + 2], series[m + 3]
+        v0 = v1 = v2 = v3 = 0.0
+        a0 = a1 = a2 = a3 = 0.0
+        for m in range((order - 1) * n + j, -1, -n):
+            a0, a1, a2, a3 = a0 * x + v0, a1 * x + v1, a2 * x + v2, a3 * x + v3
+            v0, v1, v2, v3 = v0 * x + q0, v1 * x + q1, v2 * x + q2, v3 * x + q3
+            q0, q1 = q0 * x + series[m], q1 * x + series[m + 1]
+            q2, q3 = q2 * x + series[m + 2], q3 * x + series[m + 3]
+        q[j], q[j + 1], q[j + 2], q[j + 3] = q0, q1, q2, q3
+        v[j], v[j + 1], v[j + 2], v[j + 3] = v0 * per_unit, v1 * per_unit, v2 * per_unit, v3 * per_unit
+        a[j], a[j + 1], a[j + 2], a[j + 3] = a0 * twice, a1 * twice, a2 * twice, a3 * twice
+    for first in range(0, n if n < 4 else 0, 2):
+        j = max(min(first, n - 2), 0)
+        k = min(j + 1, n - 1)
+        q0, q1 = series[order * n + j], series[order * n + k]
+        v0 = v1 = a0 = a1 = 0.0
+        for m in range((order - 1) * n, -1, -n):
+            a0, a1 = a0 * x + v0, a1 * x + v1
+            v0, v1 = v0 * x + q0, v1 * x + q1
+            q0, q1 = q0 * x + series[m + j], q1 * x + series[m + k]
+        q[j], q[k], v[j], v[k] = q0, q1, v0 * per_unit, v1 * per_unit
+        a[j], a[k] = a0 * twice, a1 * twice
+
+
+@compiled
+def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
+    """The defect within the step, at the share s of it, over what is allowed; infinite where there is none."""
+    found = accelerations_found(memory, q.size)
+    _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, found)
+    if evaluate_there(f, w, t + s * h, q, v, a) != DONE:
+        return np.inf
+    return excess(tolerances, h, order, found, a, q, v)
+
+
+@compiled
+def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
+    """Whether a defect is that of rounding in the equations: near the beginning, where the series is exact, as well."""
+    if defect > LOUDEST:
+        return False
+    noise = 0.0
+    for k in range(1, 4):
+        noise = max(noise, _defect_at(f, w, memory, t, h, k * NEAR_BEGIN, tolerances, series, order, q, v, a))
+    return defect <= LOUDER * noise
+
+
+@compiled
+def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
+    """The defect for which the step is refused before its end is looked at; 0: for none. Notes the largest found.
+
+    The places looked at are not the same in each attempt, but for the last at which a step was refused.
+    """
+    gap, shift = tolerances[GAP], memory[ATTEMPTS] * GOLDEN % 1.0
+    n_places = 0
+    if h > gap:
+        n_places = int(np.ceil(h / gap))
+    for k in range(-1, n_places):
+        s = (k + shift) / n_places if k >= 0 else (memory[SUSPECT] - t) / h
+        if k < 0 and not (memory[SUSPECTED] == 1.0 and 0.0 < s < 1.0):
+            continue
+        defect = _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a)
+        if defect > 1.0 and not _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
+            if memory[SUSPECTED] == 0.0 or t + s * h < memory[SUSPECT]:
+                memory[SUSPECT] = t + s * h
+            memory[SUSPECTED] = 1.0
+            return defect
+        w.notes[DEFECT] = max(w.notes[DEFECT], defect)
+    return 0.0
+
+
+@merged
+def _shortened(defect, order):
+    """The factor for a step that was refused for its defect."""
+    return max(MOST_SHORTENED, 0.9 * defect ** (-1.0 / order))
+
+
+@merged
+def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
+    """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
+    n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
+    q, v = state[:n], state[n : 2 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    w.counters[N_OUTER] += 1
+    if memory[TRIED] == 1.0 and memory[LAST_ACCEPTED] == 1.0:
+        memory[WHICH] = 1.0 - memory[WHICH]
+        memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
+    memory[TRIED] = 0.0
+    if memory[KNOWN] == 0.0:
+        copy(state, new_state)
+        code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
+        if code == DONE:
+            code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH], by_code)
+        if code != DONE:
+            return code, np.inf
+        memory[KNOWN], memory[UNIT] = 1.0, h
+        if estimated:
+            memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
+    series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
+    x = (memory[PASSED] + h) / unit
+    error, checked, found = 0.0, False, accelerations_found(memory, n)
+    if estimated:
+        error = x / memory[LENGTH]  # larger than the estimate of the error, which is a power of it
+        if x > memory[LENGTH] * (1.0 + ROUNDING):
+            w.notes[STEP_FACTOR] = memory[LENGTH] / x
+            return DONE, max(error, 1.0 + ROUNDING)
+        error = min(error, 1.0)
+        checked = w.notes[NEARLY_SINGULAR] == 0.0
+        if not checked and h > tolerances[GAP] * (1.0 + ROUNDING):
+            w.notes[STEP_FACTOR] = tolerances[GAP] / h
+            return DONE, 1.0 + ROUNDING
+        if checked:
+            memory[ATTEMPTS] += 1.0
+            if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
+                memory[SUSPECTED] = 0.0
+            w.notes[DEFECT] = 0.0
+            defect = _refused_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
+            if defect > 0.0:
+                w.notes[STEP_FACTOR] = _shortened(defect, order)
+                return DONE, 1.0 + ROUNDING
+    _evaluate(series, unit, order, x, q1, v1, found)
+    keep_predicted(w, q1)
+    code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    if code != DONE:
+        return code, np.inf
+    if options[KEEP] == 1.0:
+        memory[PASSED] += h
+        return DONE, 0.0
+    w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
+    if w.notes[DEPARTURE] > 0.0:
+        memory[SHORTER] = min(1.0, x / memory[LENGTH] * (ALLOWED / w.notes[DEPARTURE]) ** (1.0 / order))
+    if w.notes[DEPARTURE] > 1.0:
+        w.notes[STEP_FACTOR] = memory[SHORTER] * memory[LENGTH] / x
+        return DONE, w.notes[DEPARTURE]
+    if checked:
+        defect = excess(tolerances, h, order, found, a1, q1, v1)
+        if defect > 1.0:
+            noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
+            if not noise:
+                w.notes[STEP_FACTOR] = _shortened(defect, order)
+                return DONE, 1.0 + ROUNDING
+            _evaluate(series, unit, order, x, q1, v1, found)
+            code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+            if code != DONE:
+                return code, np.inf
+        w.notes[DEFECT] = max(w.notes[DEFECT], defect)
+    series = series_of(memory, order, n, 1.0 - memory[WHICH])
+    unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
+    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH], by_code)
+    if code != DONE:
+        return code, np.inf
+    memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
+    if estimated:
+        memory[NEXT_LENGTH] = _length(tolerances, series, unit, order, n)
+        shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
+        w.notes[STEP_FACTOR] = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
+    return DONE, max(error, w.notes[DEPARTURE])
+
+
+@kernel(STEP)
+def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """The step with series found by their program."""
+    return _step(f, w, options, memory, t, h, tolerances, state, new_state, False)
+
+
+@kernel(STEP, vectorized=True)
+def compiled_taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """The step with series found by f.own, code made for the mechanism; f.instead solves where its factors cannot."""
+    return _step(f, w, options, memory, t, h, tolerances, state, new_state, True)

@@ -1,0 +1,74 @@
+"""Adams(): a multistep method on the accelerations of all coordinates."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twoloop.methods.plan import LARGEST_MOVE, Plan
+
+# h times the frequency of a vibration that grows by 1 % a step, and times a rate of decay, at orders 1 to 12; of decay
+# that of order 6 from there on, because the order does not stay above where decay limits the steps
+STABLE_TO = tuple(
+    zip(
+        (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),
+        (2.01, 2.41, 1.96, 1.43, 1.06, 0.79, 0.79, 0.79, 0.79, 0.79, 0.79, 0.79),
+        strict=True,
+    )
+)
+
+
+@dataclass(frozen=True)
+class Adams:
+    """Adams methods of orders 1 to 12, predict-evaluate-correct-evaluate, for smooth motion that is not stiff.
+
+    Two evaluations a step: the cheapest method here wherever steps follow the motion rather than a stiff force. All
+    coordinates are integrated alike from their accelerations, by the second-order form: positions by the double
+    integral of the polynomial through the last accelerations, velocities by the single one. The end of every step is
+    moved to the nearest state on the constraints, in the metric of M; with nonholonomic rows, to that with the same
+    independent coordinates. So the method departs from the paper, whose outer loop knows independent coordinates only,
+    and a new partition does not interrupt it.
+
+    Starts by itself, with order 1 and a short step. Where stability rather than accuracy limited the steps, which is
+    measured at a few states when a run of many steps is over, `result.message` says so, and what to take.
+
+    Notes
+    -----
+    Modified divided differences: F. T. Krogh, Changing stepsize in the integration of differential equations using
+    modified divided differences, Lecture Notes in Mathematics 362 (1974), 22-71. The rules for the order are those of
+    STEP: L. F. Shampine and M. K. Gordon, Computer Solution of Ordinary Differential Equations (1975). The step is not
+    halved or doubled as there: it is multiplied by 0.8 e^(-1/(k+1)), e the estimated error over the tolerance, but at
+    most by 1.2 (2 while the order still rises with every step) and, when it is refused, at least by 0.5. The integrals
+    of the polynomials are found by Gauss quadrature with eight nodes, which is exact for them.
+    """
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return "Adams"
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates.
+
+        Raises
+        ------
+        ValueError
+            If the step is to be constant: order and accuracy of the first steps need a step that varies.
+        """
+        from twoloop.kernels.steps import adams_step as kernels
+
+        if fixed:
+            raise ValueError(
+                "method='Adams' begins with short steps of low order and cannot keep a constant one: leave step_size "
+                "out, or take another method"
+            )
+        return Plan(
+            kernels.adams_step,
+            np.array([LARGEST_MOVE]),
+            np.zeros(kernels.memory_size(n_q)),
+            exponent=1.0,  # the step returns the root of its error that belongs to its order
+            safety=kernels.SAFETY,
+            factor_min=0.1,
+            factor_max=kernels.START_GROWTH,
+            stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
+            compilable=True,
+        )

@@ -1,0 +1,178 @@
+"""Auto(...): the default method, which chooses others and goes from one to the other."""
+
+from dataclasses import dataclass, replace
+
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.traced_values import Check, unchecked
+from twoloop.methods.dop853 import DOP853
+from twoloop.methods.plan import Method, Plan, least_tolerance
+from twoloop.methods.taylor import Taylor
+from twoloop.problem.system import ConstrainedSystem
+
+MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method ...
+CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
+TIGHT_MANY = 1e-10  # ... or the tolerance is below this ...
+VERY_MANY = 64  # ... or there are so many coordinates
+LONG_STEPS = 1e-9  # tolerance whose rule holds at looser ones, too, for runs of few steps
+SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
+INVOLVED = 12  # ... up to so many operations a coordinate ...
+SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
+FEW = 5
+# the same of code made for the mechanism, where loops over coordinates and operations cost little:
+SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
+SHORT_FROM = 1e-3
+SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-8  # tolerance, for fewer than MANY coordinates and for others
+LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
+TIGHTEST = 1e-9  # ... and from which down to many
+LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
+LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
+LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
+LIMIT_SERIES = 0.4  # times the order: the same of a series, whose steps grow with its order
+DEARER = 4.0  # evaluations by code made for the mechanism that one without costs, about ...
+DEARER_HEAVY, HEAVY = 2.0, 17  # ... or, from so many operations of the callbacks a coordinate on, as these cost both
+MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
+
+
+def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1, dearer: float = 1.0) -> Plan:
+    """The plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
+
+    `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried, if it is found at so many
+    `looks` in a row. `dearer`: what an evaluation of `second` costs, in those of `first`.
+    """
+    from twoloop.kernels.control import switching as kernels
+
+    plans = (first, second)
+    each = [
+        [plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse, plan.predictive * plan.least_error]
+        for plan in plans
+    ]
+    return replace(
+        first,
+        step=kernels.switching_step,
+        options=kernels.switching_options(
+            limit, looks, MATRIX_COST + n_q / 8.0, dearer, each, first.options, second.options
+        ),
+        memory=kernels.switching_memory(n_q, first.memory, second.memory),
+        first=first.step,
+        second=second.step,
+        stable_to=None,
+        within_newton=second.within_newton,
+    )
+
+
+@dataclass(frozen=True)
+class Auto:
+    """Explicit steps where nothing is stiff, Newton's method where stiffness is measured; both ways during a run.
+
+    A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
+    coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
+    coordinates or more. Else with `few`; with `many` from 64 coordinates on, or from 16 on with at most a quarter as
+    many constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a
+    series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8 operations in all below 1e-3, and
+    `many` from 64 coordinates on.
+
+    At looser tolerances than these a run begins with `series` as well, as others may take no steps longer than a
+    hundredth of the run: after 10 steps it goes on without, if the next would be no longer than that. It also goes on
+    without where the series is not finite and the functions are.
+
+    After 100 evaluations, and then every 600, the largest rate of the motion is estimated, from the derivatives of the
+    accelerations. The implicit method is tried for 15 steps where the steps have come near the limit of stability that
+    this rate sets (at two looks in a row; at one with `many`, and with `few` from 16 coordinates on), or are above 5 %
+    of it and the rate is more than thirty times that of the motion itself. Unless they are far beyond that limit, this
+    waits until the run has cost three trials, and 64 evaluations for each independent coordinate if tangents have to be
+    differenced. The implicit method is kept if a second of motion costs it less, counted in evaluations and Newton
+    matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way. Counts
+    decide, not times: a run can be repeated.
+
+    While the implicit method runs, errors of positions are within the tolerances; those of velocities are tested
+    for what they will make of the positions before they turn back or decay.
+    With constant steps it is `fixed` throughout.
+
+    Parameters
+    ----------
+    few, many : method object
+        Explicit methods, for few and for many coordinates.
+    series : Taylor or None
+        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows.
+    loose, tight, tightest : method object
+        Implicit methods, for loose, tight and the tightest tolerances.
+    fixed : method object
+        For constant steps.
+    """
+
+    few: Method
+    many: Method
+    series: Taylor | None
+    loose: Method
+    tight: Method
+    tightest: Method
+    fixed: Method
+    n_rows: int = 0  # constraints of the system, and whether there is code made for it; solve_dae says so
+    compiled: bool = False
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return "auto"
+
+    @property
+    def tested(self) -> str:
+        """What the error estimate of implicit steps is taken over."""
+        return "positions"
+
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
+        """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
+        chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
+        if code is not None and isinstance(self.few, DOP853):
+            chosen = replace(chosen, few=self.few.for_system(system, code))
+        if self.series is None or (code is None and system.called_in_python):
+            return replace(chosen, series=None)
+        try:
+            return replace(chosen, series=self.series.for_system(system, code, check))
+        except ValueError:
+            return replace(chosen, series=None)
+
+    def _series_pays(self, n_q: int, tolerance: float) -> bool:
+        """Whether a step of the series costs less than the steps of the others that it replaces."""
+        assert self.series is not None and self.series.program is not None
+        operations = self.series.program.n_operations / n_q
+        if self.compiled:
+            short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
+            return short or tolerance < (SERIES_COMPILED if n_q < MANY else SERIES_COMPILED_MANY)
+        if tolerance < SERIES:
+            return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
+        return operations <= SIMPLE and n_q >= MANY
+
+    def _dearer(self, n_q: int) -> float:
+        """What an implicit method's evaluation costs, in evaluations by code made for the mechanism."""
+        program = None if self.series is None else self.series.program
+        return DEARER_HEAVY if program is not None and program.n_operations >= HEAVY * n_q else DEARER
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        if fixed:
+            return self.fixed.plan(n_q, rtol, atol, True)
+        tolerance = least_tolerance(rtol, atol)
+        implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
+        second = implicit.plan(n_q, rtol, atol, False)
+        dearer = self._dearer(n_q) if self.compiled else 1.0
+        explicit = self._explicit(n_q, rtol, atol, second, dearer)
+        if self.series is None or self.series.program is None:
+            return explicit
+        pays = self._series_pays(n_q, tolerance)
+        # at looser tolerances as well where steps are long: others may not be longer than a hundredth of the run
+        if not pays and not self._series_pays(n_q, LONG_STEPS):
+            return explicit
+        series = self.series.plan(n_q, rtol, atol, False)
+        chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
+        return replace(chosen, substitute=explicit, provisional=not pays)
+
+    def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
+        """The plan without a series."""
+        many = n_q >= VERY_MANY
+        if n_q >= MANY and not self.compiled:
+            many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
+        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
+        if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
+            limit, looks = LIMIT_FEW_OF_MANY, 1
+        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks, dearer)

@@ -1,0 +1,117 @@
+"""DOP853(...): an explicit method in the two-loop procedure."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from twoloop.checks.arguments import check_choice
+from twoloop.generate.stage_code import compiled_stages
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.traced_values import Check, unchecked
+from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_tolerances, least_tolerance
+from twoloop.problem.system import ConstrainedSystem
+
+COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
+REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
+LEAST_ERROR = 1e-6  # of the tolerance, in the trend: an error of order 8 falls a hundredfold with steps half as long
+STABLE_TO = (5.96, 6.39)  # h times the frequency of a vibration, and times a rate of decay
+SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
+
+
+@dataclass(frozen=True)
+class DOP853:
+    """An explicit Runge-Kutta method, Dormand and Prince's, of order 8, with 12 stages.
+
+    No outer loop: every stage is one evaluation, so that a step costs 12 (one that is refused 11). Accepted states are
+    on the constraints. For smooth motion that is not stiff. Stability, not accuracy,
+    limits h where the motion is slower than what could vibrate or decay: h w_max to 5.96 for undamped vibrations, and
+    h times the largest rate of decay to 6.39. What little of a vibration such steps do not resolve they damp: of the
+    amplitude 0.15 % a step at h w_max = 3. Where that limited many steps, `result.message` says so, and what to take.
+
+    A step is accepted when the largest component of the estimated local error of q and v, dependents too, is within
+    the tolerance. Fixed steps estimate nothing.
+
+    Parameters
+    ----------
+    stages : {"free", "restored"}
+        "free": all coordinates are integrated alike, stages are off the constraints by the error of the formula, and
+        the end of the step is moved to the nearest state on them, in the metric of M. This departs from the paper.
+        "restored": the paper's procedure with this tableau. The independent coordinates are integrated, and the inner
+        loop restores the dependent ones at every stage. Rows of nonholonomic constraints are always treated so at the
+        end of a step.
+    inner_tol : float, optional
+        With "restored", Newton on the positions stops when its largest correction, just made, is at most this (unit of
+        q). None: 1e-8.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If stages is not one of these, or inner_tol not a positive number.
+
+    Notes
+    -----
+    Tableau and error estimate, e5^2 / sqrt(e5^2 + 0.01 e3^2) of embedded estimates of orders 5 and 3: Hairer, Norsett
+    and Wanner, Solving ODEs I (1993), II.5 and II.10; e5 and e3 are largest components here, not root mean squares.
+    The numbers are those of `scipy.integrate.DOP853`. The stability limits are those of the method's polynomial R(z):
+    |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
+    """
+
+    stages: Literal["free", "restored"] = "free"
+    inner_tol: float | None = None
+    code: OwnCode | None = None  # made for one system; solve_dae puts it in
+
+    def __post_init__(self) -> None:
+        check_choice("stages", self.stages, ("free", "restored"))
+        check_tolerances(self, "inner_tol")
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
+
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "DOP853":
+        """The method with what is compiled for this system."""
+        return replace(self, code=code)
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        import scipy.integrate
+
+        from twoloop.kernels.steps import explicit_step as kernels
+
+        source = scipy.integrate.DOP853
+        s, free = len(source.B), self.stages == "free"
+        plan = Plan(
+            kernels.explicit_step,
+            kernels.options_array(
+                source.A,
+                source.B,
+                source.C,
+                source.E5[:s],  # the last weight, of the slope at the end, is 0 in both
+                COARSE_SHARE * source.E3[:s],
+                INNER_TOL if self.inner_tol is None else self.inner_tol,
+                free,
+                LARGEST_MOVE,
+            ),
+            np.zeros(kernels.memory_size(s, n_q)),
+            exponent=1.0 / 8.0,
+            safety=SAFETY,
+            predictive=free,
+            watchful=free,
+            least_error=LEAST_ERROR,
+            rough=ROUGH,
+            stable_to=lambda memory: STABLE_TO,
+            compilable=free,
+            reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
+        )
+        if self.code is None or not free:
+            return plan
+        made = compiled_stages(self.code, s)
+        return replace(
+            plan,
+            step=kernels.compiled_explicit_step,
+            memory=np.zeros(max(plan.memory.size, made.memory_size)),
+            own=made.function,
+            instead=kernels.explicit_step,
+        )

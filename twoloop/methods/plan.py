@@ -1,0 +1,88 @@
+"""What a method hands to a run: its plan; and what the methods share."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_positive
+
+Array = NDArray[np.float64]
+
+# Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
+INNER_TOL = 1e-8
+LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
+ROUGH = 10.0  # `rough` of a Plan, as measured for most methods
+LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
+OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
+OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
+
+    step: Any
+    options: Array
+    memory: Array
+    exponent: float
+    first: Any = None  # the two steps between which `step` chooses
+    second: Any = None
+    safety: float = 0.9
+    factor_min: float = 0.2
+    factor_max: float = 5.0
+    limit_start: float = np.inf
+    limit_factor: float = 0.7
+    limit_memory: int = 10
+    symmetric: bool = False
+    predictive: bool = False
+    least_error: float = LEAST_ERROR
+    rough: float = 1.0  # how many times less than its error the estimate of a step may be where a force jumps
+    reuse: float = 0.0  # correction of a position up to which the Jacobian before it serves, within a step
+    watchful: bool = False  # whether short steps are a reason to look how near a singular position is
+    lands: bool = False  # whether steps are shortened to end at output times
+    apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
+    stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
+    compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
+    inner: Any = None  # ... that code; None: the inner loop is the general one
+    own: Any = None  # a part of the step made for the mechanism, and what is called instead where it cannot serve
+    instead: Any = None
+    parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
+    interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
+    looks_within: bool = False  # whether its steps look at the equations between their ends; if not, they are limited
+    substitute: "Plan | None" = None  # what goes on where this one's values are not finite
+    provisional: bool = False  # whether that takes over, too, where steps turn out to be no longer than its own may be
+    traced: tuple[Any, ...] = ()  # what the callbacks were traced to, where a step goes by that: see traced_values.py
+    within_newton: "Plan | None" = None  # the same, parts included, of steps by Newton's method; None: not divided
+
+
+def least_tolerance(rtol: float, atol: float) -> float:
+    """The smaller of the two, but not below rounding."""
+    return max(min(rtol, atol), LEAST_TOLERANCE)
+
+
+def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
+    """Where the outer loop stops unless a method has its own rule."""
+    return OUTER_TOL_FIXED if fixed else OUTER_SHARE * least_tolerance(rtol, atol)
+
+
+class Method(Protocol):
+    """What solve_dae needs of a method."""
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        ...
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        ...
+
+
+def check_tolerances(method: Method, *names: str) -> None:
+    """Raise unless each tolerance of these names is None or a positive number."""
+    for name in names:
+        if getattr(method, name) is not None:
+            check_positive(name, getattr(method, name))

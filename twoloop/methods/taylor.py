@@ -1,0 +1,150 @@
+"""Taylor(): the Taylor series of the motion, found from the equations of the callbacks."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_size
+from twoloop.generate.series import SeriesProgram, series_program
+from twoloop.generate.series_code import compiled_series
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.traced_values import Check, unchecked
+from twoloop.generate.tracing import Untraceable
+from twoloop.methods.plan import LARGEST_MOVE, Plan, least_tolerance
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+LOWEST, HIGHEST = 4, 40  # orders that may be asked for
+PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
+PER_DIGIT_COMPILED, LEAST_COMPILED = 1.25, 7.5  # the same of code made for the mechanism
+FIXED = 19  # order of constant steps
+FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
+PADDED = 8  # operations of a table are a multiple of this
+
+
+@dataclass(frozen=True)
+class Taylor:
+    """The Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
+
+    The cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes milliseconds
+    and compiles nothing. From the operations that they are made of follow the coefficients of q, v, a and lam, order by
+    order: one linear solution with the matrix of the accelerations each, and no derivative of the constraints beyond
+    C_q. gamma and kinematics are not used. A step is as long as the series allows; its end is moved to the nearest
+    state on the constraints, in the metric of M. So the method departs from the paper, whose outer loop knows
+    independent coordinates only.
+
+    It takes callbacks that give C_q and do not branch on t, q or v, made of + - * /, powers, sin, cos, tan, sqrt,
+    hypot, exp, log, atan, sinh, cosh and tanh. `solve_dae` raises ValueError where they are not, and names the
+    callback.
+
+    Parameters
+    ----------
+    order : int, optional
+        Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
+        digit of the smaller tolerance (with `compiled=True` of solve_dae 7.5 and 1.25), or 19 with constant steps.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If order is not such a number.
+
+    Notes
+    -----
+    The orders to which each equation is to be differentiated: J. D. Pryce, A simple structural analysis method for
+    DAEs, BIT 41 (2001), 364-394. The step: the length at which each of the last two terms is within the tolerance, A.
+    Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
+    Experimental Mathematics 14 (2005), 99-117. In the statistics every coefficient counts as an evaluation.
+    """
+
+    order: int | None = None
+    program: SeriesProgram | None = None  # of one system; solve_dae puts it in ...
+    code: OwnCode | None = None  # ... and what is compiled for it
+
+    def __post_init__(self) -> None:
+        if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
+            raise ValueError(f"order must be between {LOWEST} and {HIGHEST}; given {self.order}")
+
+    @property
+    def name(self) -> str:
+        """Shown in messages and tables."""
+        return "Taylor" if self.order is None else f"Taylor(order={self.order})"
+
+    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Taylor":
+        """The method with the operations of this system, and with what is compiled for it.
+
+        Raises
+        ------
+        ValueError
+            If its callbacks do not run on symbols, or `check` finds that they give something else.
+        """
+        try:
+            program = system.remembered("series", lambda: series_program(system))
+            check(program.traced)
+        except Untraceable as error:
+            raise ValueError(
+                f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
+            ) from error
+        return replace(self, program=program, code=code)
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels.steps import recurrences as series
+        from twoloop.kernels.steps import taylor_step as taylor
+
+        program = self.program
+        if program is None:
+            raise ValueError("Taylor() knows no system yet: take for_system(system), as solve_dae does")
+        order = self.order
+        if order is None:
+            digits = -math.log10(least_tolerance(rtol, atol))
+            least, per_digit = (LEAST, PER_DIGIT) if self.code is None else (LEAST_COMPILED, PER_DIGIT_COMPILED)
+            order = FIXED if fixed else math.ceil(least + per_digit * max(digits, 0.0))
+        highest = order + 1
+        widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
+        plan = Plan(
+            taylor.taylor_step,
+            _options(program, highest, widths),
+            np.zeros(series.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
+            exponent=1.0 / highest,
+            safety=1.0,
+            factor_max=taylor.GROWTH,
+            watchful=True,
+            compilable=True,
+            looks_within=True,
+            parts=min(max(highest // 3, FEWEST), MOST),
+            traced=(program.traced,),
+        )
+        kept = plan.options.copy()
+        kept[series.KEEP] = 1.0
+        interior = replace(plan, options=kept, memory=plan.memory.copy())
+        if self.code is None:
+            return replace(plan, interior=interior)
+        code = compiled_series(program, self.code)
+        return replace(
+            plan,
+            step=taylor.compiled_taylor_step,
+            memory=np.zeros(code.memory_size(highest)),
+            own=code.function,
+            instead=taylor.solve_order,
+            interior=interior,
+        )
+
+
+def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
+    """The parameter block that the step reads, integers by their bits."""
+    from twoloop.kernels.steps import recurrences as series
+
+    tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
+    arrays: list[Any] = [*tables[0], *tables[1], *program.rows, program.row_places]
+    arrays += [*program.balance, program.balance_places]
+    arrays = [each.view(np.float64) if each.dtype == np.int64 else each for each in arrays]
+    scalars = np.zeros(series.N_SCALARS)
+    scalars[series.ORDER], scalars[series.THETA], scalars[series.N_NODES] = highest, LARGEST_MOVE, program.n_nodes
+    scalars[series.EARLY_WIDTH], scalars[series.LATE_WIDTH] = widths
+    begin = series.N_SCALARS + series.N_ARRAYS + 1
+    ends = begin + np.cumsum([0, *(len(each) for each in arrays)])
+    return np.concatenate([scalars, ends.astype(float), *arrays])

@@ -1,0 +1,161 @@
+"""Plain functions that return their array, made into callbacks: called as they are, or compiled."""
+
+import inspect
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from types import FunctionType
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
+
+import numpy as np
+from numba import njit, objmode
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from twoloop.kernels.compile.caches import named_apart, watch
+from twoloop.kernels.compile.callbacks import KINDS, compile_callback
+
+Array = NDArray[np.float64]
+
+KIND_NAMES = tuple(KINDS)
+HANDLE_BITS = 52  # so that a handle is a float64 exactly; a foreign one, of another process, matches none of ours
+
+
+class PythonFunctions:
+    """Plain Python functions of one system, called through the compiled `through_python`.
+
+    These find them by the handle, which is the only parameter of the system. It holds in this process and in forks of
+    it; unpickled elsewhere, the functions are registered again.
+    """
+
+    registry: ClassVar[WeakValueDictionary[int, "PythonFunctions"]] = WeakValueDictionary()
+
+    def __init__(self, name: str, functions: dict[str, Callable[..., Any]]):
+        self.name = name
+        self.functions = functions
+        self.handle = secrets.randbits(HANDLE_BITS)
+        self.registry[self.handle] = self
+
+    def call(self, kind: str, arguments: tuple[Any, ...], out: Array) -> None:
+        """Call one function with copies of the arrays, check what comes back and write it to `out`."""
+        t = arguments[0]
+        try:
+            value = self.functions[kind](*arguments)
+        except Exception as error:
+            error.add_note(f"raised by {kind} of system {self.name!r} at t = {t!r}")
+            raise
+        store(kind, self.name, t, value, out)
+
+
+def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
+    """Write what a Python function returned to `out`, or say what is wrong with it."""
+    try:
+        array = np.asarray(value)
+        real = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+    except ValueError:
+        real = False
+    if not real:
+        raise TypeError(
+            f"{kind} of system {name!r} must return a real array of shape {out.shape}; "
+            f"at t = {t!r} it returned {value!r}"
+        )
+    if array.shape != out.shape:
+        raise ValueError(
+            f"{kind} of system {name!r} must return an array of shape {out.shape}; at t = {t!r} it returned shape "
+            f"{array.shape}"
+        )
+    out[...] = array
+
+
+def _call(number: int, arguments: tuple[Any, ...], p: Array, out: Array) -> None:
+    functions = PythonFunctions.registry.get(int(p[0])) if p.size == 1 and np.isfinite(p[0]) else None
+    if functions is None:
+        raise RuntimeError(
+            "these callbacks lead to Python functions of a system that is not in this process, or no longer: their "
+            "`parameters` are not numbers to keep. Pass the system itself on, by pickle if need be"
+        )
+    functions.call(KIND_NAMES[number], arguments, out)
+
+
+@cache
+def through_python(kind: str) -> Dispatcher:
+    """The callback that calls a Python function of this kind, whichever `p` leads to."""
+    place = KIND_NAMES.index(kind)
+
+    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+        number = place
+        with objmode():
+            _call(number, (t, q.copy()), p, out)
+
+    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        number = place
+        with objmode():
+            _call(number, (t, q.copy(), x.copy()), p, out)
+
+    through = with_two if len(KINDS[kind].state) == 1 else with_three
+    return compile_callback(kind, through, ("through Python", str(place)))
+
+
+def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
+    """Compile a function that returns its array, and wrap it to the in-place signature of its kind.
+
+    The machine code is kept beside the source of the function, if it has one.
+    """
+    if isinstance(function, ConstantMatrix):
+        matrix = function.matrix  # numba knows what a function encloses, but not the attributes of an object
+
+        def function(t, q):  # type: ignore[no-untyped-def]
+            return matrix
+
+    if not isinstance(function, Dispatcher | FunctionType):
+        raise TypeError(
+            f"{kind}: compile=True takes functions made by def or lambda, with numbers that they enclose; given "
+            f"{function!r} of type {type(function).__name__}. Write such a function, or leave compile=True out"
+        )
+    user = function if isinstance(function, Dispatcher) else njit(named_apart(function, watch(function)))
+    message = f"{kind} returned an array of the wrong shape"
+
+    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
+
+    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, x)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
+
+    in_place: Any = with_two if len(KINDS[kind].state) == 1 else with_three
+    watched = watch(in_place)
+    code = user.py_func.__code__
+    in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
+    in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
+    return compile_callback(kind, in_place, watched, named=user.py_func)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantMatrix:
+    """A mass(t, q) that does not depend on either."""
+
+    matrix: Array
+
+    def __call__(self, t: float, q: Array) -> Array:
+        """The matrix."""
+        return self.matrix
+
+
+def check_arguments(kind: str, function: Callable[..., Any]) -> None:
+    """Raise if a function that returns its array names its arguments t, q, v, but in another order."""
+    wanted = ("t", *KINDS[kind].state)
+    try:
+        given = tuple(inspect.signature(function).parameters)
+    except (TypeError, ValueError):  # built-in functions have none to look at
+        return
+    if sorted(given) == sorted(wanted) and given != wanted:
+        raise TypeError(
+            f"{kind} is called as {kind}({', '.join(wanted)}); the function given takes ({', '.join(given)})"
+        )

@@ -1,0 +1,176 @@
+"""Events: zeros of functions event(t, q, v) along the dense solution, by SciPy's rules."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from twoloop.checks.arguments import shown
+
+Array = NDArray[np.float64]
+
+SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
+PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
+
+States = Callable[[Array], Array]  # rows [q, v] at sorted times
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event function with its attributes, checked."""
+
+    number: int
+    function: Callable[..., Any]
+    terminal: float  # occurrences after which the run ends; infinite: never
+    direction: float
+
+    @property
+    def name(self) -> str:
+        """As messages show it."""
+        own = getattr(self.function, "__name__", "")
+        return f"events[{self.number}]" + (f" ({own})" if own and own != "<lambda>" else "")
+
+    def __call__(self, t: float, q: Array, v: Array) -> float:
+        """Its value, or what is wrong with it."""
+        try:
+            value = self.function(t, q.copy(), v.copy())
+        except Exception as error:
+            error.add_note(f"raised by {self.name} at t = {t!r}")
+            raise
+        array = np.asarray(value)
+        if array.ndim > 0 or array.dtype.kind not in "iuf":
+            raise TypeError(f"{self.name} must return a number; at t = {t!r} it returned {shown(value)}")
+        if not np.isfinite(array):
+            raise ValueError(f"{self.name} must return a finite number; at t = {t!r} it returned {shown(value)}")
+        return float(array)
+
+
+def check_events(events: Any) -> list[Event]:
+    """The event functions with their attributes, or what is wrong with one."""
+    if events is None:
+        return []
+    functions = [events] if callable(events) else events
+    if not isinstance(functions, (list, tuple)):
+        raise TypeError(
+            f"events must be a function event(t, q, v) or a list of such; given {shown(events)} of type "
+            f"{type(events).__name__}"
+        )
+    return [_checked(number, function) for number, function in enumerate(functions)]
+
+
+def _checked(number: int, function: Any) -> Event:
+    if not callable(function):
+        raise TypeError(
+            f"events[{number}] must be a function event(t, q, v); given {shown(function)} of type "
+            f"{type(function).__name__}"
+        )
+    terminal, direction = getattr(function, "terminal", None), getattr(function, "direction", 0)
+    expected = f"events[{number}].terminal must be True, False or a positive number of occurrences"
+    if terminal is not None and not isinstance(terminal, (bool, int, np.bool_, np.integer)):
+        raise TypeError(f"{expected}; given {shown(terminal)} of type {type(terminal).__name__}")
+    if terminal is not None and terminal < 0:
+        raise ValueError(f"{expected}; given {shown(terminal)}")
+    expected = f"events[{number}].direction must be -1, 0 or 1"
+    if isinstance(direction, bool) or not isinstance(direction, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{expected}; given {shown(direction)} of type {type(direction).__name__}")
+    if direction not in (-1, 0, 1):
+        raise ValueError(f"{expected}; given {shown(direction)}")
+    return Event(number, function, float(terminal) if terminal else np.inf, float(direction))
+
+
+class EventSearch:
+    """Looks for the events of a run, step by step.
+
+    Attributes
+    ----------
+    found : list of list of (float, ndarray)
+        For each event its times and rows [q, v].
+    ended : (Event, float) or None
+        The terminal event that ends the run, and when.
+    reached : float
+        The end of the last step that was looked at.
+    """
+
+    def __init__(self, events: list[Event], t0: float, row: Array):
+        self.events, self.reached = events, t0
+        self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
+        self.ended: tuple[Event, float] | None = None
+        self._n_q = len(row) // 2
+        self._values = self._evaluate(t0, row)
+        self._at_start = True
+
+    def _evaluate(self, t: float, row: Array) -> list[float]:
+        return [event(t, row[: self._n_q], row[self._n_q :]) for event in self.events]
+
+    def search(self, states: States, ends: Array) -> None:
+        """Look at the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
+        if len(ends) < 2 or self.ended is not None:
+            return
+        parts = np.arange(1, SAMPLES) / SAMPLES
+        inner = ends[:-1, None] + parts * np.diff(ends)[:, None]
+        times = np.column_stack([ends[:-1], inner, ends[1:]])
+        rows = states(np.append(times[:, :-1].ravel(), ends[-1]))
+        for k in range(len(ends) - 1):
+            self._in_step(states, times[k], rows[SAMPLES * k : SAMPLES * (k + 1) + 1])
+            if self.ended is not None:
+                return
+            self.reached = float(ends[k + 1])
+
+    def break_off(self) -> None:
+        """Forget what was found in a step whose search was interrupted."""
+        if self.ended is None:
+            self.found = [[(t, row) for t, row in found if t <= self.reached] for found in self.found]
+
+    def _in_step(self, states: States, times: Array, rows: Array) -> None:
+        """Events between samples of one step."""
+        for k in range(1, len(times)):
+            before, self._values = self._values, self._evaluate(float(times[k]), rows[k])
+            active = [
+                event
+                for event, g, g_new in zip(self.events, before, self._values, strict=True)
+                if (g != 0.0 or self._at_start) and crosses(event.direction, g, g_new)
+            ]
+            self._at_start = False
+            ends = (float(times[k - 1]), float(times[k]))
+            roots = [
+                (_root(event, states, ends, (before[event.number], self._values[event.number])), event)
+                for event in active
+            ]
+            self._record(sorted(roots, key=lambda root: root[0]), states)
+            if self.ended is not None:
+                return
+
+    def _record(self, roots: list[tuple[float, Event]], states: States) -> None:
+        """Note events up to the first terminal one, and those at the same time."""
+        for t, event in roots:
+            if self.ended is not None and t > self.ended[1]:
+                return
+            found = self.found[event.number]
+            found.append((t, states(np.array([t]))[0]))
+            if len(found) >= event.terminal and self.ended is None:
+                self.ended = (event, t)
+
+
+def _root(event: Event, states: States, ends: tuple[float, float], values: tuple[float, float]) -> float:
+    """When an event is zero between two times at which its values are known, to rounding."""
+    known = dict(zip(ends, values, strict=True))
+    for t, value in known.items():
+        if value == 0.0:
+            return t
+
+    def at(t: float) -> float:
+        if t in known:
+            return known[t]
+        q, v = np.split(states(np.array([t]))[0], 2)
+        return event(t, q, v)
+
+    return float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION))
+
+
+def crosses(direction: float, g: float, g_new: float) -> bool:
+    """Whether a function that goes from g to g_new has a zero that counts (`find_active_events` of SciPy)."""
+    up, down = g <= 0.0 <= g_new, g_new <= 0.0 <= g
+    return (up and direction >= 0.0) or (down and direction <= 0.0)

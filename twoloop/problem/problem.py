@@ -1,0 +1,199 @@
+"""What every ready problem offers."""
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.problem.description import Description, name_and_unit
+from twoloop.problem.drawing import Drawing
+from twoloop.problem.joints import Joint
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+TAGS = (
+    "open chain",
+    "closed chain",
+    "rigid",
+    "flexible",
+    "planar",
+    "spatial",
+    "driven",
+    "redundant",
+    "singular",
+    "non-holonomic",
+    "stiff",
+    "dissipative",
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A state that is known from elsewhere.
+
+    Attributes
+    ----------
+    t : float
+        Time, s.
+    q, v : ndarray (n_q,)
+        Coordinates and velocities; NaN where none is known.
+    source : str
+        Where the numbers come from, and how far they were checked.
+    period : float or None
+        Period of the motion, s, where it is periodic.
+    lam : ndarray (n_c + n_a,) or None
+        Multipliers, where known.
+    digits : mapping
+        "q", "v", "lam": how many decimals of the values over max(1, largest of them) hold.
+    verified : str
+        The second route by which they were checked, and how far it agrees.
+    """
+
+    t: float
+    q: Array
+    v: Array
+    source: str
+    period: float | None = None
+    lam: Array | None = None
+    digits: Mapping[str, float] = field(default_factory=dict)
+    verified: str = ""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """When a benchmark's authors take a run for right.
+
+    The error is the root mean square, over outputs and quantities, of |difference| / max(|reference|, threshold).
+
+    Attributes
+    ----------
+    t_end : float
+        Length of the run, s.
+    n_outputs : int
+        Outputs, evenly spaced.
+    coordinates, velocities : tuple of int
+        Which quantities count.
+    threshold : float
+        Least magnitude by which a difference is divided.
+    low, high : float
+        Largest error allowed at low and at high precision.
+    source : str
+    """
+
+    t_end: float
+    n_outputs: int
+    coordinates: tuple[int, ...]
+    velocities: tuple[int, ...]
+    threshold: float
+    low: float
+    high: float
+    source: str
+
+    def error(self, q: Array, v: Array, q_known: Array, v_known: Array) -> float:
+        """Error of the states q, v (n_q, n_outputs) against the known ones."""
+        rows, speeds = list(self.coordinates), list(self.velocities)
+        given, known = np.vstack([q[rows], v[speeds]]), np.vstack([q_known[rows], v_known[speeds]])
+        relative = np.abs(given - known) / np.maximum(np.abs(known), self.threshold)
+        return float(np.sqrt(np.mean(relative**2)))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A mechanism ready to run.
+
+    Attributes
+    ----------
+    name : str
+    system : ConstrainedSystem
+        A copy of the one given, which knows the names, the energy and the drawing: results take them from it.
+    q0, v0 : ndarray (n_q,)
+        Consistent start.
+    t_span : (float, float)
+        Usual start and end, s.
+    energy : callable
+        energy(t, q, v) in J, for one state or, with q and v (n_q, n_t), for many.
+    parameters : dict
+        Geometry, masses and what else defines the case, with names.
+    note : str
+        What is assumed; shown wherever the problem is.
+    reference : Reference or None
+        The most accurate state known.
+    published : Reference or None
+        Values that others printed, with the digits that they hold.
+    motion : callable or None
+        motion(t) -> q, v (n_q,), where a closed form is known.
+    source : str
+        Who posed the problem, and where.
+    tags : tuple of str
+        Its kinds, of `TAGS`.
+    purpose : str
+        What it tests, in plain words.
+    conserved : bool or None
+        Whether the energy is an invariant. None: it is not known, and nothing is judged by it; `studies.compare` looks
+        at the energy of its reference then.
+    invariants : mapping
+        Further ones: name to invariant(t, q, v), as `energy`.
+    condition : Condition or None
+        The pass rule of the benchmark's authors, where they have one.
+    coordinates : tuple of str
+        Names of the coordinates with their units, such as "x of crank (m)"; results name their columns by them.
+    drawing : Drawing or None
+        What `Result.animate` draws.
+
+    Raises
+    ------
+    ValueError
+        If a tag is unknown, `coordinates` are not n_q different names, or the drawing does not fit the start.
+    """
+
+    name: str
+    system: ConstrainedSystem
+    q0: Array
+    v0: Array
+    t_span: tuple[float, float]
+    energy: Callable[[Any, Array, Array], Any]
+    parameters: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    reference: Reference | None = None
+    published: Reference | None = None
+    motion: Callable[[float], tuple[Array, Array]] | None = None
+    source: str = ""
+    tags: tuple[str, ...] = ()
+    purpose: str = ""
+    conserved: bool | None = None
+    invariants: Mapping[str, Callable[[Any, Array, Array], Any]] = field(default_factory=dict)
+    condition: Condition | None = None
+    coordinates: tuple[str, ...] = ()
+    drawing: Drawing | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        unknown = [tag for tag in self.tags if tag not in TAGS]
+        if unknown:
+            raise ValueError(f"tags must be of {', '.join(TAGS)}; given {unknown[0]!r}")
+        n_q, given = self.system.n_q, self.coordinates
+        if given and not len(given) == len(set(given)) == n_q:
+            raise ValueError(f"coordinates must be n_q = {n_q} different names, or none; given {given!r}")
+        if self.drawing is not None:
+            self.drawing.at(np.asarray(self.q0, dtype=float))
+        system = copy.copy(self.system)
+        system.description = Description(tuple(given), self.energy, self.conserved, self.drawing)
+        object.__setattr__(self, "system", system)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates without their units."""
+        return tuple(name_and_unit(each)[0] for each in self.coordinates)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the coordinates; "" for numbers without one."""
+        return tuple(name_and_unit(each)[1] for each in self.coordinates)
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The named joints of the system, whose forces and torques `Result.reactions` gives."""
+        return self.system.joints

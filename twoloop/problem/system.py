@@ -1,0 +1,451 @@
+"""The problem: M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0, as compiled callbacks and sizes."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks.arguments import check_flag, check_number, check_real, check_size, shown
+from twoloop.checks.bounds import check_callback
+from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
+from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
+from twoloop.problem.adapters import (
+    ConstantMatrix,
+    PythonFunctions,
+    check_arguments,
+    compile_returning,
+    store,
+    through_python,
+)
+from twoloop.problem.description import Description
+from twoloop.problem.jacobian import differenced_jacobian
+from twoloop.problem.joints import Joint, check_joints
+from twoloop.problem.pickling import packed, unpacked
+from twoloop.problem.system_methods import add_callbacks
+
+Array = NDArray[np.float64]
+
+
+@add_callbacks
+class ConstrainedSystem:
+    """A constrained mechanical system, M(t, q) a + C_q^T lam + A^T mu = Q(t, q, v).
+
+    Constraints are C(t, q) = 0 (with eq. (1) of the paper) and, if there are any, A(t, q) v + b(t, q) = 0, which need
+    not come from positions. Rows may depend on one another where they do not contradict; without any the system is one
+    of ordinary differential equations.
+
+    Each callback can be evaluated by the method of its name, which checks the arguments: `system.force(t, q, v)`.
+
+    Parameters
+    ----------
+    n_q, n_c : int
+        Number of coordinates and of constraints C.
+    {callbacks}
+    n_a : int
+        Number of non-holonomic constraints.
+    parameters : array_like, optional
+        The vector `p` that every callback gets. It stays as it is: `with_parameters` makes a system of others.
+    constant_mass : bool
+        True: M depends neither on t nor on q, and is factored once.
+    bandwidth : int, optional
+        No entry (i, j) with |i - j| > bandwidth is other than zero in M, in the derivatives of the force by q and v,
+        and in the second derivatives of each constraint by q; C_q itself may be full. With it the cost of a step of a
+        large system grows in proportion to n_q. Needs a constant M. None: nothing is known.
+    joints : sequence of Joint
+        Named rows, whose forces and torques `Result.reactions` gives.
+    name : str
+        Shown in messages.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a size or the bandwidth is not a sensible integer, a callback was not made by `twoloop.callback`, one that a
+        size asks for is missing, force_by_v or reaction_by_q is given without force_by_q, or a joint does not fit.
+
+    Notes
+    -----
+    A system can be copied, and pickled for another process: callbacks and functions at the top level of a module
+    travel by name. Plain functions without a name of their own, such as lambdas, cannot be pickled: a `TypeError`.
+    """
+
+    if TYPE_CHECKING:  # the methods of the callbacks, which follow from KINDS
+
+        def __getattr__(self, kind: str) -> Callable[..., Array]: ...
+
+    def __init__(
+        self,
+        *,
+        n_q: int,
+        n_c: int,
+        n_a: int = 0,
+        parameters: ArrayLike = (),
+        constant_mass: bool = False,
+        bandwidth: int | None = None,
+        joints: Sequence[Joint] = (),
+        name: str = "system",
+        **callbacks: Dispatcher | None,
+    ):
+        self.n_q = check_size("n_q", n_q, 1)
+        self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
+        self.name = name
+        self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
+        self.description = Description()  # a Problem puts its own in its place
+        p = _checked_parameters(parameters)
+        if not isinstance(constant_mass, (bool, np.bool_)):
+            raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
+        self.constant_mass = bool(constant_mass)
+        self.bandwidth = None if bandwidth is None else check_size("bandwidth", bandwidth, 0)
+        if self.bandwidth is not None and not self.constant_mass:
+            raise ValueError(
+                f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
+            )
+        self.given = _given(callbacks, self.n_c, self.n_a)
+        for kind, function in self.given.items():
+            entry = KINDS[kind]
+            if not isinstance(function, Dispatcher) or entry.signature.args not in function.overloads:
+                raise TypeError(
+                    f"{kind} must be compiled by @twoloop.callback({kind!r}) with the arguments "
+                    f"({', '.join(entry.arguments)}); given {function!r}. Plain Python functions enter by "
+                    "ConstrainedSystem.from_python"
+                )
+        flags = np.zeros(N_FLAGS, dtype=np.int64)
+        flags[CONSTANT_MASS] = self.constant_mass
+        flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
+        flags[BANDWIDTH] = -1  # a run decides by the size
+        all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
+        self.functions: Any = Functions(**all_callbacks, p=p, flags=flags)  # type: ignore[call-arg]
+        self._python: PythonFunctions | None = None
+        self._returning: dict[str, Any] = {}
+        self._shapes = {
+            kind: [tuple(getattr(self, size) for size in shape) for _, shape in entry.outputs]
+            for kind, entry in KINDS.items()
+        }
+        self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
+        self.checked = False  # by check_derivatives
+        self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
+
+    def __repr__(self) -> str:
+        return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
+
+    @property
+    def parameters(self) -> Array:
+        """The vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
+        p = self.functions.p.copy()  # kernels want an array that may be written
+        p.setflags(write=False)
+        return p.view()  # which nobody can make writable again
+
+    @parameters.setter
+    def parameters(self, value: Any) -> None:
+        raise AttributeError(
+            f"parameters of {self.name!r} cannot be changed, as results refer to them: make another system by "
+            "system.with_parameters(p), which shares the compiled callbacks"
+        )
+
+    def with_parameters(self, parameters: ArrayLike) -> ConstrainedSystem:
+        """Make a system of the same callbacks, of which nothing is compiled again, and other parameters.
+
+        What is told of a system beside its equations may enclose the parameters, too. Kept are the names of the
+        coordinates, joints without a `point` and `equations`, and the energy where it is generated with the equations;
+        another energy and a drawing are given by a `Problem` of the new system.
+
+        Parameters
+        ----------
+        parameters : array_like
+            The vector `p`, of the same length.
+
+        Returns
+        -------
+        ConstrainedSystem
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the parameters are not as many finite numbers, or the system is made of functions that take none.
+        """
+        if self._python is not None or self._returning:
+            raise TypeError(
+                f"{self.name!r} has no parameters: it is made by from_python, whose functions take none. Make another "
+                "system of functions that enclose other numbers, or give callbacks made by @twoloop.callback, which "
+                "get the parameters as p"
+            )
+        p, known = _checked_parameters(parameters), self.functions.p
+        if p.shape != known.shape:
+            raise ValueError(f"parameters of {self.name!r} must be {known.size} numbers, as they are; given {p.size}")
+        other = copy.copy(self)
+        other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
+        other.within_bounds, other.checked, other.made = set(), False, {}
+        other.description = self.description.with_parameters(p)
+        other.joints = tuple(joint for joint in self.joints if joint.point is None and joint.equations is None)
+        return other
+
+    @classmethod
+    def from_python(
+        cls,
+        *,
+        n_q: int,
+        n_c: int,
+        n_a: int = 0,
+        compile: bool = False,
+        bandwidth: int | None = None,
+        joints: Sequence[Joint] = (),
+        name: str = "system",
+        **functions: Any,
+    ) -> ConstrainedSystem:
+        """Make a system of plain Python functions, each of which takes arrays and returns one.
+
+        Parameters
+        ----------
+        n_q, n_c : int
+            Number of coordinates and of constraints C.
+        {callbacks}
+        n_a : int
+            Number of non-holonomic constraints.
+        compile : bool
+            False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
+            the values of closures and globals as they are now.
+        bandwidth : int, optional
+            As for the class; `mass` must then be an array.
+        joints : sequence of Joint
+            As for the class.
+        name : str
+            Shown in messages.
+
+        Raises
+        ------
+        TypeError
+            If an argument is not callable, or `compile=True` and numba cannot compile it (says why).
+        ValueError
+            If a size is out of range or a mass array has the wrong shape.
+
+        Notes
+        -----
+        Without `gamma` the differences of C_q and C_t are taken over 2e-4 of the largest coordinate and 2e-8 to 2e-4 s
+        (before t too): good to about 1e-11 unless coordinates of very different scale, or a driving motion of
+        kilohertz, ask for the formula.
+        """
+        n_q, n_c, n_a = check_size("n_q", n_q, 1), check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
+        if functions.get("kinematics") is not None:
+            raise TypeError(
+                "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
+                "with compiled callbacks to ConstrainedSystem(...)"
+            )
+        functions = _given(functions, n_c, n_a)
+        constant_mass = not callable(functions["mass"])
+        if constant_mass:
+            matrix = check_real("mass", functions["mass"])
+            if matrix.shape != (n_q, n_q):
+                raise ValueError(f"mass must have shape {(n_q, n_q)}; given an array of shape {matrix.shape}")
+            functions["mass"] = ConstantMatrix(matrix)
+        for kind, function in functions.items():
+            if not callable(function):
+                raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
+            check_arguments(kind, function)
+        sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
+        options: dict[str, Any] = {
+            "constant_mass": constant_mass,
+            "bandwidth": bandwidth,
+            "joints": joints,
+            "name": name,
+        }
+        if check_flag("compile", compile):
+            compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
+            system = cls(**sizes, **options, **compiled)
+            system._returning = functions
+            return system
+        python = PythonFunctions(name, functions)
+        wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
+        system = cls(**sizes, **options, **wrappers, parameters=[python.handle])
+        system._python = python  # the registry holds it weakly
+        return system
+
+    @property
+    def python_functions(self) -> dict[str, Any]:
+        """The plain Python functions by kind, where it is made of these and they are not compiled."""
+        return {} if self._python is None else self._python.functions
+
+    @property
+    def called_in_python(self) -> bool:
+        """Whether the callbacks are plain Python functions."""
+        return self._python is not None
+
+    def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
+        """What `make` makes of the equations with these parameters, once; functions may do otherwise."""
+        if self.called_in_python:  # what such functions find in their surroundings may change
+            return make()
+        if what not in self.made:
+            self.made[what] = make()
+        return self.made[what]
+
+    def arrays_of(self, kind: str) -> list[Array]:
+        """Zeros for a kind of callback to fill."""
+        return [np.zeros(shape) for shape in self._shapes[kind]]
+
+    def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
+        """What a callback gives at (t, q), (t, q, v) or (t, q, lam), whichever its kind asks for.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, if the callback goes out of the bounds of its arrays, or if there is none and
+            nothing can stand for it, as for gamma: the integrator then finds it by differences.
+        """
+        entry = KINDS[kind]
+        if entry.absent == "kernels" and kind not in self.given:
+            raise ValueError(f"{self.name!r} was given no {kind}")
+        t = check_number("t", t)
+        if not math.isfinite(t):
+            raise ValueError(f"t must be finite; given {t!r}")
+        arrays = []
+        for name, value in zip(entry.state, state, strict=True):
+            array = check_real(name, value)
+            if array.shape != (n := getattr(self, STATE[name]),):
+                raise ValueError(
+                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given shape {array.shape}"
+                )
+            arrays.append(np.ascontiguousarray(array))
+        check_callback(self, kind, t, arrays)
+        out = self.arrays_of(kind)
+        getattr(self.functions, kind)(t, *arrays, self.functions.p, *out)
+        return out[0] if len(out) == 1 else tuple(out)
+
+    def check_returned(self, t: float, q: Array, v: Array) -> None:
+        """Say what is wrong with the arrays that functions given with `compile=True` return at (t, q, v).
+
+        Machine code can only say that a shape is wrong, not which.
+        """
+        for kind, function in self._returning.items():
+            known = {"q": q, "v": v, "lam": np.ones(self.n_c)}
+            arguments = [known[name] for name in KINDS[kind].state]
+            copies = [np.array(argument) for argument in arguments]
+            store(kind, self.name, t, function(t, *copies), self.arrays_of(kind)[0])
+            if any((copy != argument).any() for copy, argument in zip(copies, arguments, strict=True)):
+                raise ValueError(
+                    f"{kind} of {self.name!r} must not change the arrays that it is given; copy them first"
+                )
+
+    def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
+        """C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
+        return self.rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
+
+    def rows(self, t: float, q: ArrayLike) -> Array:
+        """C_q, then A, (n_c + n_a, n_q)."""
+        return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
+
+    def rates(self, t: float, q: ArrayLike) -> Array:
+        """C_t, then b, (n_c + n_a,)."""
+        rate = self.constraint_rate(t, q)
+        return rate if self.n_a == 0 else np.append(rate, self.nonholonomic_rate(t, q))
+
+    def __copy__(self) -> ConstrainedSystem:
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), within_bounds=set(self.within_bounds))
+        return other
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ConstrainedSystem:
+        other = memo[id(self)] = copy.copy(self)
+        p = self.functions.p.copy()
+        if self._python is not None:  # numbers of its own for functions of its own
+            other._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo))
+            p = np.array([other._python.handle], dtype=np.float64)
+        other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
+        return other
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        plain = self._returning or (self._python.functions if self._python is not None else {})
+        options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "n_a": self.n_a}
+        options |= {"bandwidth": self.bandwidth, "joints": self.joints, "name": self.name}
+        if plain:
+            options["compile"] = not self.called_in_python
+        else:
+            options |= {"constant_mass": self.constant_mass, "parameters": self.parameters}
+        functions = {kind: packed(self.name, kind, function) for kind, function in (plain or self.given).items()}
+        known = self.description
+        if known.energy is not None:
+            packed(self.name, "energy", known.energy)
+        if known.drawing is not None:
+            packed(self.name, "points of the drawing", known.drawing.points)
+        return _made_again, (type(self), bool(plain), options, functions, self.functions.flags, known)
+
+
+def _made_again(
+    cls: type[ConstrainedSystem],
+    plain: bool,
+    options: dict[str, Any],
+    packed: dict[str, Any],
+    flags: Array,
+    known: Description,
+) -> ConstrainedSystem:
+    """The system that was pickled, of the functions that this process finds by the same names."""
+    functions = {kind: unpacked(function) for kind, function in packed.items()}
+    if plain and isinstance(functions["mass"], ConstantMatrix):
+        functions["mass"] = functions["mass"].matrix
+    system = (cls.from_python if plain else cls)(**options, **functions)
+    system.functions.flags[:] = flags
+    system.description = known
+    return system
+
+
+def _checked_parameters(parameters: Any) -> Array:
+    """The parameters as a new vector, or what is wrong with them."""
+    p = check_real("parameters", parameters)
+    if p.ndim != 1 or not np.isfinite(p).all():
+        raise ValueError(f"parameters must be a vector of finite numbers; given {shown(parameters)}")
+    return p
+
+
+def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
+    """The callbacks that are given, in the order of KINDS, or what is wrong with their choice."""
+    unknown = [kind for kind in callbacks if kind not in KINDS]
+    if unknown:
+        raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
+    sizes = {"n_c": n_c, "n_a": n_a}
+    needed = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
+    missing = [kind for kind in needed if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
+    if missing:
+        rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
+        raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
+    given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
+    given = {
+        kind: each
+        for kind, each in given.items()
+        if not (
+            KINDS[kind].optional and (each is None or (KINDS[kind].absent != "differences" and each is stand_in(kind)))
+        )
+    }
+    for kind, entry in KINDS.items():
+        if kind in given and sizes.get(entry.shape[0], 1) == 0:
+            of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
+            raise ValueError(f"{kind} goes with {of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
+    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in given]
+    if missing:
+        raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
+    if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
+        raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
+    return given
+
+
+def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
+    """The callback that stands in the place of one that is not given."""
+    if KINDS[kind].absent != "differences" or "constraint" not in given:
+        return stand_in(kind)
+    constraint = given["constraint"]
+    # what is called in Python cannot be watched, and need not be: it is looked up at every call
+    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
+    return differenced_jacobian(constraint, watched)
+
+
+def check_system(system: object) -> None:
+    """Raise unless a ConstrainedSystem is given."""
+    if isinstance(system, ConstrainedSystem):
+        return
+    inner = getattr(system, "system", None)
+    hint = "for a ready mechanism: problem.system"
+    if isinstance(inner, ConstrainedSystem):
+        hint = f"this is a {type(system).__name__}: give its system, problem.system"
+    raise TypeError(f"system must be a ConstrainedSystem ({hint}); given {system!r:.200}")

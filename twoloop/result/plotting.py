@@ -1,0 +1,78 @@
+"""A result as a figure: coordinates, energy, violation of the constraints."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.optional import needed
+from twoloop.problem.description import name_and_unit
+from twoloop.run.record import Record
+
+Array = NDArray[np.float64]
+
+WIDTH, HEIGHT = 8.0, 2.2  # inches; height of a panel
+LEGEND_MOST = 12  # coordinates that a legend names
+
+
+def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
+    """A figure of a result, see `Result.plot`."""
+    if result.t.size == 0:
+        raise ValueError(f"plot needs a result with output; this one has none: {result.message}")
+    # without pyplot: no display, no state, no backend of the user's that would change
+    figure_class = needed("matplotlib.figure", "matplotlib", "plot").Figure
+    units: dict[str, list[int]] = {}
+    for k, coordinate in enumerate(result.coordinates):
+        units.setdefault(name_and_unit(coordinate)[1], []).append(k)
+    known = result.description
+    n_panels = len(units) + (known.energy is not None) + (result.system is not None)
+    figure = figure_class(figsize=(WIDTH, HEIGHT * n_panels + 0.5), layout="constrained")
+    panels = list(np.atleast_1d(figure.subplots(n_panels, 1, sharex=True)))
+    rest = iter(panels)
+    for unit, chosen in units.items():
+        _coordinates(next(rest), result, unit, chosen)
+    if known.energy is not None:
+        energy, panel = result.energy, next(rest)
+        panel.plot(result.t, energy - energy[0] if known.conserved else energy, color="tab:red")
+        panel.set_ylabel("energy − start (J)" if known.conserved else "energy (J)")
+    if result.system is not None:
+        _violation(next(rest), result)
+    panels[-1].set_xlabel("t (s)")
+    name = "" if result.system is None else result.system.name
+    figure.suptitle(name if result.success else f"{name}: {result.status.name}", fontsize="medium")
+    if path is not None:
+        figure.savefig(path, dpi=150)
+    return figure
+
+
+def _coordinates(panel: Any, result: Record, unit: str, chosen: list[int]) -> None:
+    for k in chosen:
+        panel.plot(result.t, result.q[k], lw=1.0, label=name_and_unit(result.coordinates[k])[0])
+    panel.set_ylabel(f"q ({unit})" if unit else "q")
+    if len(chosen) <= LEGEND_MOST:
+        panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="x-small")
+    else:
+        panel.set_title(f"{len(chosen)} coordinates", fontsize="x-small")
+
+
+def _violation(panel: Any, result: Record) -> None:
+    positions, velocities = violation(result)
+    for values, label in ((positions, "|C|"), (velocities, "|d/dt C|, |A v + b|")):
+        if (values > 0.0).any():  # a logarithm has no place for zeros
+            panel.semilogy(result.t, np.where(values > 0.0, values, np.nan), lw=1.0, label=label)
+        else:
+            panel.plot([], [], label=f"{label}: 0")
+    panel.set_ylabel("largest violation")
+    panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="x-small")
+
+
+def violation(result: Record) -> tuple[Array, Array]:
+    """Largest violation of the positions, and of the velocities, (n_t,), at the times of a result with its system."""
+    system: Any = result.system
+    states = list(zip(result.t.tolist(), result.q.T, result.v.T, strict=True))
+    positions = [np.abs(system.constraint(t, q)).max(initial=0.0) if system.n_c else 0.0 for t, q, _ in states]
+    velocities = [np.abs(system.velocity_constraint(t, q, v)).max(initial=0.0) for t, q, v in states]
+    return np.array(positions), np.array(velocities)

@@ -1,0 +1,126 @@
+"""Forces and torques of joints, from the multipliers of a result."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_text
+from twoloop.mechanisms.rotation import half_spin, rotated
+from twoloop.problem.joints import Joint
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.record import Record
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = 1e-6  # relative: a reaction that multipliers without effect on the sum would change by less is unique
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What a joint does to its body; the other body, or the ground, gets the opposite force and torque.
+
+    Vectors are along the axes of space, one column an instant of `Result.t`.
+
+    Attributes
+    ----------
+    force : ndarray (2 or 3, n_t)
+        N, on the body.
+    torque : ndarray (n_t,) or (3, n_t)
+        N m, on the body, about `point`; planar ones positive from x to y. Zero for a point mass.
+    point : ndarray (2 or 3, n_t)
+        Where the point of the joint is in space, m.
+    unique : bool
+        Whether the multipliers determine the reaction. False where rows of the joint depend on rows outside it, so
+        that the load may be shared among joints in any proportion: `force` and `torque` are then those of the
+        multipliers of least norm. The sum C_q^T lam, hence the sum of all reactions on a body, is unique all the same.
+        Decided at the first time of the result; positions where rank is lost later on are not looked for.
+    """
+
+    force: Array
+    torque: Array
+    point: Array
+    unique: bool
+
+
+def reaction(result: Record, name: str) -> Reaction:
+    """Reaction of a named joint, see `Result.reactions`."""
+    check_text("name", name)
+    if result.system is None or not result.system.joints:
+        raise ValueError(
+            "reactions need joints, and this result has none. Name them in the system, joints=[twoloop.Joint(...)] "
+            "(ready mechanisms have theirs in problem.joints); to a result in a file give the system: "
+            "twoloop.load(path, system)"
+        )
+    system = result.system
+    known = {joint.name: joint for joint in system.joints}
+    if name not in known:
+        raise ValueError(f"name must be a joint of {system.name!r}: {', '.join(map(repr, known))}; given {name!r}")
+    joint = known[name]
+    multipliers = result.lam if joint.equations is None else np.linalg.solve(joint.equations.T, result.lam)
+    generalized = np.empty((len(joint.translation + joint.rotation), result.t.size))
+    for k, t in enumerate(result.t):
+        generalized[:, k] = -_rows(system, joint, t, result.q[:, k]).T @ multipliers[list(joint.rows), k]
+    point = _point(joint, result.q)
+    force, torque = _force_and_torque(joint, result.q, point, generalized)
+    return Reaction(force, torque, point, _unique(result, system, joint))
+
+
+def _rows(system: ConstrainedSystem, joint: Joint, t: float, q: Array) -> Array:
+    """Derivatives of the joint's equations by the coordinates of its body."""
+    rows = system.rows(t, q)
+    if joint.equations is not None:
+        rows = joint.equations @ rows
+    return rows[np.ix_(joint.rows, joint.translation + joint.rotation)]
+
+
+def _point(joint: Joint, q: Array) -> Array:
+    """The point of the joint in space, (2 or 3, n_t)."""
+    origin, angles = q[list(joint.translation)], q[list(joint.rotation)]
+    if joint.point is None:
+        return origin
+    point = np.repeat(np.array(joint.point)[:, None], q.shape[1], axis=1)
+    if joint.in_space:
+        return point
+    if len(angles) == 1:
+        s, c = np.sin(angles[0]), np.cos(angles[0])
+        point = np.stack([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+    elif len(angles) == 4:
+        point = np.stack(rotated.py_func(*angles, *point))
+    elif len(angles) == 9:
+        point = np.einsum("kit,kt->it", angles.reshape(3, 3, -1), point)
+    return origin + point
+
+
+def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) -> tuple[Array, Array]:
+    """Force, and torque about the point, of a generalised force (n, n_t) on the coordinates of the body."""
+    dimension = len(joint.translation)
+    force, turning = generalized[:dimension], generalized[dimension:]
+    angles, arm = q[list(joint.rotation)], point - q[list(joint.translation)]
+    if len(turning) == 0:
+        return force, np.zeros(force.shape[1:] if dimension == 2 else force.shape)
+    if dimension == 2:
+        return force, turning[0] - (arm[0] * force[1] - arm[1] * force[0])
+    if len(turning) == 4:  # e' = G^T spin / 2, so that the torque is G g / 2 along the axes of the body
+        torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *turning)))
+    else:  # each column of the matrix turns like an arm
+        torque = np.cross(angles.reshape(3, 3, -1), turning.reshape(3, 3, -1), axis=1).sum(axis=0)
+    return force, torque - np.cross(arm, force, axis=0)
+
+
+def _unique(result: Record, system: ConstrainedSystem, joint: Joint) -> bool:
+    """Whether no multipliers with C_q^T lam = 0 change the reaction, at the first time of the result."""
+    n_rows = len(result.lam)
+    if result.t.size == 0 or result.rank == n_rows:
+        return True
+    t, q = result.t[0], result.q[:, 0]
+    all_rows = system.rows(t, q)
+    rank = np.linalg.matrix_rank(all_rows) if result.rank is None else result.rank
+    idle = np.linalg.svd(all_rows)[0][:, rank:]
+    if joint.equations is not None:
+        idle = np.linalg.solve(joint.equations.T, idle)
+    rows = _rows(system, joint, t, q)
+    generalized = rows.T @ idle[list(joint.rows)]
+    q = np.repeat(q[:, None], idle.shape[1], axis=1)
+    force, torque = _force_and_torque(joint, q, _point(joint, q), generalized)
+    return bool(max(np.abs(force).max(initial=0.0), np.abs(torque).max(initial=0.0)) <= NEGLIGIBLE * np.abs(rows).max())

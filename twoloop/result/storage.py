@@ -1,0 +1,48 @@
+"""Results into files: NumPy's npz, without pickle."""
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import shown
+from twoloop.result.saved_fields import COUNTS, NUMBERS, OF_EVENTS, STATES, check_sum
+from twoloop.run.record import Record
+
+Array = NDArray[np.float64]
+
+FORMAT = "twoloop result 1"
+ALWAYS = ("t", *STATES, "h")
+SOMETIMES = (*COUNTS, "redundant", "atol", "untested")
+
+
+def check_path(path: Any) -> Path:
+    """Return `path` as a Path, or say that it is none."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+        raise TypeError(f"path must be a file name or a path; given {shown(path)} of type {type(path).__name__}")
+    return Path(path)
+
+
+def save(result: Record, path: str | os.PathLike[str]) -> None:
+    """Write a result to a file, see `Result.save`."""
+    arrays: dict[str, Any] = {name: getattr(result, name) for name in ALWAYS}
+    arrays |= {name: getattr(result, name) for name in SOMETIMES if getattr(result, name) is not None}
+    n_events = None if result.t_events is None else len(result.t_events)
+    for name in OF_EVENTS:
+        arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
+    words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
+    words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
+    words |= {name: getattr(result, name) for name in NUMBERS}
+    if result.sol is not None:
+        interpolator, table = result.sol.interpolator, result.sol.table
+        arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
+        words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
+        if interpolator.parts > 1:
+            arrays["sol_interior_t"], arrays["sol_interior_states"] = interpolator.interiors(table)
+    words["check_sums"] = {name: check_sum(array) for name, array in arrays.items()}
+    with check_path(path).open("wb") as file:
+        np.savez(file, words=np.array(json.dumps(words)), allow_pickle=False, **arrays)

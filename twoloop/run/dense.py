@@ -1,0 +1,390 @@
+"""The solution between steps: polynomials through stored states, put back on the constraints."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks.arguments import check_real
+from twoloop.checks.consistency import ConstraintWarning, pattern_of
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
+from twoloop.kernels.data import intervals as names
+from twoloop.methods.plan import INNER_TOL, Plan
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.workspace import kit_of, workspace
+
+Array = NDArray[np.float64]
+Groups = NDArray[np.int64]
+
+KEPT = 512  # intervals whose interior states are kept
+SOUND = 65536  # intervals of which it is kept in mind that their polynomials hold
+OFF = 10.0  # tolerances by which polynomials may be off the constraints and the equations
+MENDED = 4  # steps into which an interval is divided whose polynomials are
+
+
+class Table(NamedTuple):
+    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), the kind of the interval behind each but one."""
+
+    t: Array
+    states: Array
+    kinds: NDArray[np.int64]  # see kernels/data/intervals.py
+
+
+def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
+    """Ranks of C_q, and of C_q and A, by which workspaces are made: the kernels rely on them."""
+    from twoloop.kernels import advance
+
+    kit = kit_of(system, t, q)
+    work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
+    state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
+    if advance.start(kit, work, t, state) != common.RANK_DIFFERS:
+        return system.n_c, system.n_c + system.n_a
+    return int(work.notes[common.RANK]), int(work.notes[common.RANK_V])
+
+
+class Interpolator:
+    """Evaluates tables of states of one system; has a workspace of its own.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem.
+    t0, row : float, ndarray (3 n_q,)
+        A state [q, v, a] of the run.
+    rtol : float
+        Relative tolerance of the run.
+    atol : ndarray (n_q,)
+        Absolute tolerances.
+    ranks : (int, int)
+        Of C_q, and of C_q and A.
+    plans : dict, optional
+        How intervals of a kind are divided into `plan.parts` fixed steps; others are not.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        row: Array,
+        rtol: float,
+        atol: Array,
+        ranks: tuple[int, int],
+        plans: Mapping[int, Plan] = MappingProxyType({}),
+    ):
+        from twoloop.kernels import advance
+        from twoloop.kernels import interpolation as dense
+
+        self.kernels = dense
+        self.plans = dict(plans)
+        self.made_of = (system, t0, row.copy(), rtol, atol, ranks, self.plans)
+        self.system, self.rtol, self.ranks = system, rtol, ranks
+        self.tolerances = np.concatenate([np.zeros(common.ATOL), atol])
+        self.tolerances[common.RTOL] = rtol
+        self.parts = max((plan.parts for plan in self.plans.values()), default=MENDED)
+        self.parts = max(self.parts, MENDED)
+        q0 = row[: system.n_q]
+        self.kits = {kind: kit_of(system, t0, q0, plan) for kind, plan in self.plans.items()}
+        self.kit = kit_of(system, t0, q0)
+        self.work = workspace(system, self.kit, pattern_of(system, t0, q0), q0, rtol, 0.0, ranks)
+        self.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
+        self.filled: dict[float, tuple[Array, Array]] = {}
+        self.sound: set[float] = set()  # where intervals begin whose neighbours serve
+        self.judges = True
+        self.mending: dict[bool, tuple[Plan, Any]] = {}
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Scratch for the coefficients of two polynomials."""
+        half = 3 * max(names.WINDOW, self.parts + 1)
+        n = self.system.n_q
+        self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # for copies, and other processes
+        return type(self), self.made_of, {"parts": self.parts, "filled": self.filled, "judges": self.judges}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_room()
+
+    def states(self, table: Table, times: Array) -> Array:
+        """Rows [q, v] at `times`, sorted, each within the table."""
+        if len(times) == 0 or len(table.t) == 1:
+            return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
+        intervals = np.searchsorted(table.t[1:-1], times, side="right")
+        first = np.flatnonzero(np.diff(intervals, prepend=-1))
+        groups = _groups(table, intervals[first])
+        groups[:, names.FIRST_TIME], groups[:, names.END_TIME] = first, np.append(first[1:], len(times))
+        out = np.empty((len(times), 2 * self.system.n_q))
+        failures = 0
+        others = []
+        for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+            self._settle(table, block)
+            divided, own, rest = self._divided(table, block)
+            failures += self._between(divided, own, times, out)
+            others.append(rest)
+        failures += self._between(table, np.concatenate(others), times, out)
+        if failures > 0:
+            _warn(f"at {failures} of {len(times)} times the state is interpolated and off the constraints")
+        return out
+
+    def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
+        known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+        return int(
+            direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, times, self.nodes, self.room, out)
+        )
+
+    def _settle(self, table: Table, groups: Groups) -> None:
+        """See to it that each interval has interior states, or is known to need none."""
+        begins = table.t[groups[:, names.FIRST_OWN]].tolist()
+        new = np.array([t not in self.sound and t not in self.filled for t in begins])
+        if not self.judges or not new.any():
+            return
+        if len(self.filled) > KEPT:
+            self.filled.clear()
+            new = np.array([t not in self.sound for t in begins])
+        if len(self.sound) > SOUND:
+            self.sound.clear()
+        groups = groups[new & (groups[:, names.KIND] != names.JUMP)]
+        for kind, plan in self.plans.items():
+            of_kind = groups[:, names.KIND] == kind
+            self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, names.FIRST_OWN]))
+        inner = np.array([t in self.filled for t in table.t[groups[:, names.FIRST_OWN]].tolist()], dtype=bool)
+        divided, own, rest = self._divided(table, groups)
+        off = np.zeros(len(groups))
+        off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
+        self.sound.update(table.t[groups[~inner & (off <= OFF), names.FIRST_OWN]].tolist())
+        for k in np.flatnonzero(~(off <= OFF)):
+            self._mend(table, groups[k], float(off[k]))
+
+    def _judged(self, table: Table, groups: Groups) -> Array:
+        """How far the polynomials of these intervals are off, over the tolerances."""
+        out = np.zeros(len(groups))
+        arrays = (
+            self.tolerances,
+            table.t,
+            table.states,
+            np.ascontiguousarray(groups),
+            self.nodes,
+            self.room,
+            self.rows,
+            out,
+        )
+        direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
+        return out
+
+    def _mend(self, table: Table, group: Groups, worst: float) -> None:
+        """Choose what serves an interval best: its neighbours, states within it by steps, or its ends alone."""
+        i, kind = int(group[names.FIRST_OWN]), int(group[names.KIND])
+        begin = float(table.t[i])
+        ends = (table.t[i : i + 2], table.states[i : i + 2])
+        for found in (self._fill(table, *self._mending(kind), np.array([i])).get(begin, ends), ends):
+            own = Table(np.ascontiguousarray(found[0]), np.ascontiguousarray(found[1]), table.kinds)
+            single = group[None, :].copy()
+            single[0, [names.FIRST_OWN, names.LAST_OWN, names.LOW, names.HIGH]] = 0, len(own.t) - 1, 0, len(own.t) - 1
+            off = float(self._judged(own, single)[0])
+            if off < worst or not np.isfinite(worst):
+                worst = off
+                self.filled[begin] = own.t, own.states
+        if begin not in self.filled:
+            self.sound.add(begin)
+
+    def _mending(self, kind: int) -> tuple[Plan, Any]:
+        """By what steps an interval of a kind is divided where its method has none of its own."""
+        stiff = kind == names.VELOCITIES
+        if stiff not in self.mending:
+            from twoloop.methods.dop853 import DOP853
+            from twoloop.methods.presets import RungeKutta
+            from twoloop.methods.tableaux import radau_iia
+
+            method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
+            atol = float(self.tolerances[common.ATOL :].min())
+            plan = replace(method.plan(self.system.n_q, self.rtol, atol, True), parts=MENDED)
+            self.mending[stiff] = plan, kit_of(self.system, self.made_of[1], self.made_of[2][: self.system.n_q], plan)
+        return self.mending[stiff]
+
+    def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
+        """A table of interior states, the groups of intervals that are in it, and those of others."""
+        begins = table.t[groups[:, names.FIRST_OWN]].tolist()
+        filled = np.array([t in self.filled for t in begins])
+        pairs = [self.filled[t] for t, there in zip(begins, filled, strict=True) if there]
+        sizes = np.array([len(t) for t, _ in pairs], dtype=np.int64)
+        own = groups[filled]
+        own[:, names.LAST_OWN] = own[:, names.HIGH] = np.cumsum(sizes) - 1
+        own[:, names.FIRST_OWN] = own[:, names.LOW] = own[:, names.LAST_OWN] - sizes + 1
+        t = np.concatenate([table.t[:0], *(t for t, _ in pairs)])
+        states = np.concatenate([table.states[:0], *(states for _, states in pairs)])
+        return Table(t, states, table.kinds), own, groups[~filled]
+
+    def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
+        """Interior states of these intervals, by when they begin; where that fails, fewer of them, or none."""
+        n = self.system.n_q
+        tolerances = np.zeros(common.ATOL + n)  # without an estimate
+        state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
+        vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
+        filled = {}
+        for parts in range(plan.parts, 1, -1):
+            if len(intervals) == 0:
+                break
+            rows = parts + 1
+            out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
+            direct(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
+            found = np.isfinite(times[:, 0])
+            for k in np.flatnonzero(found):
+                filled[float(times[k, 0])] = (times[k].copy(), states[k].copy())
+            intervals = intervals[~found]
+        return filled
+
+    def interiors(self, table: Table) -> tuple[Array, Array]:
+        """The interior states of all m divided intervals, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
+
+        NaN where an interval has fewer.
+        """
+        groups = _groups(table, np.arange(len(table.t) - 1))
+        divided = []
+        for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+            self._settle(table, block)
+            begins = table.t[block[:, names.FIRST_OWN]].tolist()
+            divided += [self.filled[t] for t in begins if t in self.filled]
+        shape = (len(divided), self.parts + 1)
+        t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
+        for row, (own_t, own) in enumerate(divided):
+            t[row, : len(own_t)], states[row, : len(own)] = own_t, own
+        return t, states
+
+    def keep(self, t: Array, states: Array) -> None:
+        """Take interior states as they were found before; no others can be found."""
+        self.parts, self.judges = t.shape[1] - 1, False
+        self._make_room()
+        there = np.isfinite(t)
+        divided = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True) if here[0]]
+        self.filled = {float(own_t[0]): (own_t, own) for own_t, own in divided}
+
+    def complete(self, times: Array, states: Array, out: Array) -> None:
+        """Fill rows [a, lam] at rows [q, v] on the constraints."""
+        failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
+        if failures > 0:
+            _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
+
+
+def _groups(table: Table, which: Groups) -> Groups:
+    """A row for each of these intervals, without the times in it."""
+    groups = np.zeros((len(which), names.N_COLUMNS), dtype=np.int64)
+    groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
+    groups[:, names.KIND] = table.kinds[which]
+    jumps = np.flatnonzero(table.kinds == names.JUMP)
+    behind = np.searchsorted(jumps, which)
+    groups[:, names.LOW] = np.append(0, jumps + 1)[behind]
+    groups[:, names.HIGH] = np.append(jumps, len(table.t) - 1)[behind]
+    return groups
+
+
+def _warn(what: str) -> None:
+    warnings.warn(f"the constraint Jacobian has lost rank: {what}", ConstraintWarning, stacklevel=4)
+
+
+class DenseState:
+    """The state of a run at any times.
+
+    Attributes
+    ----------
+    t : float or ndarray (n,)
+        Times, s.
+    q, v : ndarray (n_q,) or (n_q, n)
+        Coordinates and velocities, on the constraints to rounding.
+    a : ndarray (n_q,) or (n_q, n)
+        Accelerations there, evaluated when they are first asked for.
+    lam : ndarray (n_c + n_a,) or (n_c + n_a, n)
+        Multipliers there, likewise.
+    """
+
+    def __init__(self, interpolator: Interpolator, t: Array, order: Groups, rows: Array):
+        self._interpolator, self._order, self._rows = interpolator, order, rows
+        n = interpolator.system.n_q
+        self.t: Any = t if t.ndim else float(t)
+        self.q, self.v = self._unsorted(rows[:, :n]), self._unsorted(rows[:, n:])
+
+    def _unsorted(self, rows: Array) -> Array:
+        """Columns in the order of `t` of rows in that of time."""
+        columns = np.empty(rows.shape[::-1])
+        columns[:, self._order] = rows.T
+        return columns if np.ndim(self.t) else columns[:, 0]
+
+    @cached_property
+    def _completed(self) -> Array:
+        system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
+        out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
+        self._interpolator.complete(times, self._rows, out)
+        return out
+
+    @property
+    def a(self) -> Array:
+        """Accelerations."""
+        return self._unsorted(self._completed[:, : self._interpolator.system.n_q])
+
+    @property
+    def lam(self) -> Array:
+        """Multipliers."""
+        return self._unsorted(self._completed[:, self._interpolator.system.n_q :])
+
+
+class DenseSolution:
+    """`result.sol`: the state of a run at any time between its start and its end.
+
+    Between accepted steps q and v are Hermite polynomials, and dependents are then restored by the inner loop, so that
+    the constraints hold to rounding. At an accepted step the state is the one stored. The polynomials go through q, v
+    and a of four neighbouring states (order 12), where Newton's method was at work in the outer loop through q and v
+    (order 8: a has the noise of vibrations that are stepped over); of `BDF` and `Newmark` v has a polynomial of its
+    own, through v and a (order 8). `RungeKutta` of order 6 and
+    more, by Newton's method of order 7 and more, and `Taylor` take steps that are too long for this, in `auto` too:
+    each is divided into 2 to 6 equal steps of the method, when the first time within it is asked for, which costs about
+    as much as the run has cost. Where the last of its states changes a polynomial by more than the tolerances, it is
+    held against the constraints and the equations at two places of the interval. Where it is off them, as beside a
+    singular position or a force that jumps, the interval is divided into four steps of `DOP853` (of a Radau method
+    where Newton's method was at work), or its two ends are all that count, whichever fits best. Evaluations for this,
+    and for restoring, are counted nowhere.
+
+    It takes 8 (2 + 3 n_q) bytes of memory a step.
+
+    Attributes
+    ----------
+    t_min, t_max : float
+        The times that it covers, s.
+    """
+
+    def __init__(self, interpolator: Interpolator, table: Table, t_max: float):
+        self.interpolator, self.table = interpolator, table
+        self.t_min, self.t_max = float(table.t[0]), t_max
+
+    def __call__(self, t: ArrayLike) -> DenseState:
+        """The state at a time or at times (n,) in any order.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If t is no number or vector, or not within the run.
+        """
+        times = check_real("t", t)
+        if times.ndim > 1:
+            raise ValueError(f"t must be a number or have shape (n,); given shape {times.shape}")
+        outside = ~((times >= self.t_min) & (times <= self.t_max))  # NaN, too
+        if outside.any():
+            raise ValueError(
+                f"t must lie within the run, from {self.t_min!r} to {self.t_max!r}; given "
+                f"{float(np.atleast_1d(times)[np.atleast_1d(outside)][0])!r}"
+            )
+        order = np.argsort(np.atleast_1d(times), kind="stable")
+        rows = self.interpolator.states(self.table, np.atleast_1d(times)[order])
+        return DenseState(self.interpolator, times, order, rows)
+
+    def __repr__(self) -> str:
+        return f"DenseSolution(from t = {self.t_min:g} to {self.t_max:g} s, {len(self.table.t) - 1} steps)"

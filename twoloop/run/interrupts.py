@@ -1,0 +1,95 @@
+"""Ctrl-C during a run: it ends the run, which returns what it has, wherever the signal arrives.
+
+An exception that arises between any two instructions of Python finds arrays half written, and machine code between its
+calls of Python that knows no way out. So the signal raises `KeyboardInterrupt` only within the functions of a user,
+which may take long and from which every caller expects exceptions; elsewhere it is kept until the run looks for it.
+"""
+
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.problem.adapters import PythonFunctions
+from twoloop.problem.events import Event
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.record import Record, Statistics, Status, explained
+
+Array = NDArray[np.float64]
+
+CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
+IMPATIENCE = 3  # signals after which the next one raises at once, whatever is lost
+
+
+class Interrupts:
+    """Stands in for Python's own handler of Ctrl-C as long as it is entered; a handler of the user's stays.
+
+    Attributes
+    ----------
+    asked : int
+        How many signals came.
+    """
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self._stands_in = False
+
+    def __enter__(self) -> "Interrupts":
+        if threading.current_thread() is threading.main_thread():  # no other may set handlers, and none gets signals
+            self._stands_in = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if self._stands_in:
+            signal.signal(signal.SIGINT, self._heard)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:
+        """Whether what was raised is Ctrl-C: then there is nothing to raise."""
+        if self._stands_in:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return kind is KeyboardInterrupt
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:
+        self.asked += 1
+        if self.asked > IMPATIENCE or _within_a_users_function(frame):
+            raise KeyboardInterrupt
+
+
+def _within_a_users_function(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code in CALLS_A_USER:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def said_of_interrupt(t: float, table: Array) -> str:
+    """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
+    gaps = int(np.isnan(table).any(axis=1).sum())
+    unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
+    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
+
+
+def not_begun(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Record:
+    """What is returned of a run that Ctrl-C ended before the accelerations at its start were known."""
+    n_q, none = system.n_q, np.zeros(0)
+    columns = np.zeros((n_q, 0))
+    found = None if events is None else [none for _ in events]
+    states = None if events is None else [np.zeros((0, n_q)) for _ in events]
+    return Record(
+        t=none,
+        q=columns,
+        v=columns.copy(),
+        a=columns.copy(),
+        lam=np.zeros((system.n_c + system.n_a, 0)),
+        h=none.copy(),
+        status=Status.INTERRUPTED,
+        message=said_of_interrupt(t0, columns.T) + explained(Status.INTERRUPTED),
+        stats=Statistics(n_accepted=0),
+        t_events=found,
+        q_events=states,
+        v_events=states,
+        system=system,
+        method=method,
+    )

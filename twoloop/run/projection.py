@@ -1,0 +1,301 @@
+"""consistent_state: a guess put on the constraints, how far it moved, and on which assembly it is."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
+
+from twoloop.checks.arguments import check_finite, check_flag, check_indices, check_vector
+from twoloop.checks.bounds import check_bounds
+from twoloop.checks.consistency import Violation, not_finite
+from twoloop.checks.scales import Scales, scales_of
+from twoloop.problem.system import ConstrainedSystem, check_system
+
+Array = NDArray[np.float64]
+
+MAX_ITERATIONS = 50
+CONVERGED = 1e-2  # of what a start may be off
+SINGULAR = 1e-10  # smallest singular value of scaled columns that still count as independent
+NEGLIGIBLE, WEAK = 1e-13, 1e-2  # singular values of rows of length 1 that count as zero: as a rule; redundant
+DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
+SAME = 0.1  # of what the projection moves: positions that are nearer to each other are one
+STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
+
+
+class Move(NamedTuple):
+    """The largest change that the projection made."""
+
+    change: float
+    coordinate: int
+
+
+class ConsistentState(tuple[Array, Array]):
+    """What `consistent_state` returns: the tuple (q, v), with a report.
+
+    Attributes
+    ----------
+    moved_q, moved_v : Move
+        Largest change of a position and of a velocity, and of which coordinate: (change, coordinate).
+    dependent : tuple of int (rank,)
+        The columns of C_q that determine the rest best, in ascending order; none of those kept.
+    determinant_sign : int
+        Sign of the determinant of these columns of C_q, 0 where their rank is not full. Two positions with the same
+        values of the other coordinates and opposite signs are on different assemblies, with a dead centre between.
+    margin : float
+        Smallest over largest singular value of these columns, rows and columns scaled to like size: 0 at a dead centre.
+    """
+
+    moved_q: Move
+    moved_v: Move
+    dependent: tuple[int, ...]
+    determinant_sign: int
+    margin: float
+
+
+def consistent_state(
+    system: ConstrainedSystem,
+    t: float,
+    q: ArrayLike,
+    v: ArrayLike,
+    *,
+    keep: Sequence[int] | None = None,
+    check_assembly: bool = True,
+) -> ConsistentState:
+    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    t : float
+        Time, s.
+    q, v : array_like (n_q,)
+        Guess. Its distance to the constraints should be small against the mechanism.
+    keep : sequence of int, optional
+        Coordinates that stay as given, position and velocity: a crank and its speed, say. None: all may move.
+    check_assembly : bool
+        Whether three other guesses, as far off as this one, must lead to the same assembly. False: what the projection
+        finds is taken.
+
+    Returns
+    -------
+    q, v : ndarray (n_q,)
+        With C(t, q) = 0 and C_q v + C_t = 0 to rounding, as a tuple that also says how far it moved (`moved_q`,
+        `moved_v`) and on which assembly it is (`determinant_sign`, `margin`); see `ConsistentState`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a shape is wrong, a value is not finite, `keep` leaves too little freedom, no consistent position is found
+        near the guess, or other guesses as far off would lead to another one: near a dead centre, as a rule.
+    """
+    check_system(system)
+    check_flag("check_assembly", check_assembly)
+    t = check_finite("t", t)
+    guess = check_vector("q", q, system.n_q)
+    speeds = check_vector("v", v, system.n_q)
+    kept = [] if keep is None else check_indices("keep", keep, system.n_q)
+    free = np.array([j for j in range(system.n_q) if j not in kept], dtype=int)
+    check_bounds(system, t, guess, speeds)
+    system.check_returned(t, guess, speeds)
+    reason = not_finite(system, t, guess, speeds)
+    if reason is not None:
+        raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
+    found = _position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
+    jacobian = system.rows(t, found)
+    change = _least_change(jacobian, free, -system.velocity_constraint(t, found, speeds))
+    velocity = speeds + change
+    scales = scales_of(system, t, found, jacobian)
+    wrong = Violation.of_velocity(system, t, found, velocity, jacobian, scales) if len(jacobian) > 0 else None
+    if wrong is not None and wrong.excess > 1.0:
+        why = f"max|C_q v + C_t| stays at {_largest(wrong.values)}"
+        raise ValueError(_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
+    state = ConsistentState((found, velocity))
+    state.moved_q, state.moved_v = _move(found - guess), _move(velocity - speeds)
+    state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
+    return state
+
+
+def _position(
+    system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
+) -> Array:
+    jacobian = system.jacobian(t, guess)
+    scales = scales_of(system, t, guess, jacobian)
+    scaled = scales.scaled(jacobian)
+    start = Violation.of_position(system, t, guess, jacobian, scales)
+    if start.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
+        why = f"max|C| stays at {_largest(start.values)}"
+        raise ValueError(_no_freedom(system, t, scaled, free, kept, why))
+    found, excess, iterations = _gauss_newton(system, t, guess, free)
+    redundant = found is None or _rank(scales.scaled(system.jacobian(t, found))) < system.n_c
+    cut = WEAK if redundant else NEGLIGIBLE
+    if redundant:  # rows that depend on one another do so on the constraints, and beside them only nearly
+        found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
+    if found is None or not excess <= 1.0:
+        where = guess if found is None else found
+        raise ValueError(
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
+            f"iterations max|C| is {_largest(system.constraint(t, where))}. Give a guess that is nearer to an "
+            f"assembled position{_smallest(scales, jacobian, free, kept)}"
+        )
+    if start.excess > 1.0 and check_assembly:
+        other = _another_assembly(system, t, found, guess, free, scales, cut)
+        if other is not None:
+            there = system.jacobian(t, found)
+            raise ValueError(
+                f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
+                f"{_change(guess, found, scales)}, and that of another guess as far away {other}. Give a guess that is "
+                "nearer to the assembly that is meant, or farther from a dead centre; check_assembly=False takes the "
+                f"one found{_smallest(scales, there, free, kept)}"
+            )
+    return found
+
+
+def _another_assembly(
+    system: ConstrainedSystem, t: float, found: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cut: float
+) -> str | None:
+    """Where another guess leads that is as far from the position found as the one given; None: to the same assembly.
+
+    Two assemblies are positions with the same values of all but the dependent coordinates. Where there is but one, a
+    small displacement ends where C_q sends it, to first order, with the same sign of the determinant.
+    """
+    moved = (found - guess) / scales.columns
+    far = float(np.abs(moved).max())
+    jacobian = system.jacobian(t, found)
+    dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
+    columns = list(dependent)
+
+    def distance(one: Array, other: Array) -> float:
+        return float(np.abs((one - other) / scales.columns).max())
+
+    def sign_at(q: Array) -> int:
+        block = scales.scaled(system.jacobian(t, q))[:, columns]
+        return int(np.linalg.slogdet(block)[0]) if sign != 0 else 0
+
+    weakest = far * _weakest_direction(scales.scaled(jacobian), free)
+    for other in (-2.0 * moved, weakest, -weakest):
+        way = other * scales.columns
+        again, excess, _ = _gauss_newton(system, t, found + way, free, cut)
+        if again is None or not excess <= 1.0:
+            return "does not converge"
+        expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
+        if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
+            continue
+        mixed = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
+        mixed[columns] = again[columns]
+        beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
+        if beside is None or not excess <= 1.0:
+            return "ends elsewhere, from where no way leads back to it"
+        if distance(beside, found) > SAME * far or sign_at(beside) != sign:
+            return f"ends on another one, which differs by {_change(found, beside, scales)}"
+    return None
+
+
+def _change(one: Array, other: Array, scales: Scales) -> str:
+    """Which coordinate changes most, with as many digits as show it."""
+    j = int(np.abs((other - one) / scales.columns).argmax())
+    size, change = max(abs(float(one[j])), abs(float(other[j]))), abs(float(other[j] - one[j]))
+    digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
+    return f"coordinate {j} from {one[j]:.{digits}g} to {other[j]:.{digits}g}"
+
+
+def _gauss_newton(
+    system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
+) -> tuple[Array | None, float, int]:
+    """Position (None: lost), what it is still off over what is accepted, and how many iterations it took."""
+    best, nearest, iteration = np.inf, q, 0
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        try:
+            jacobian, values = system.jacobian(t, q), system.constraint(t, q)
+        except (ArithmeticError, ValueError):  # an iterate outside what the callbacks are made for
+            return None, np.inf, iteration
+        if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
+            return None, np.inf, iteration
+        step = _least_change(jacobian, free, -values, cut)
+        excess = Violation.of_position(system, t, q, jacobian, scales_of(system, t, q, jacobian)).excess
+        if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
+            return q, excess, iteration  # as far as rounding lets it
+        if excess < best:
+            best, nearest = excess, q
+        q = q + step
+        if not np.isfinite(q).all():
+            return None, np.inf, iteration
+    return (nearest if best <= 1.0 else q), best, iteration  # up to 1 is accepted: rounding may keep it above CONVERGED
+
+
+def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
+    """The smallest change of the free coordinates that changes C by these values to first order."""
+    norms = np.linalg.norm(jacobian, axis=1)
+    norms = np.where(norms > 0.0, norms, 1.0)
+    change = np.zeros(jacobian.shape[1])
+    change[free] = np.linalg.lstsq(jacobian[:, free] / norms[:, None], values / norms, rcond=cut)[0]
+    return change
+
+
+def _rank(scaled: Array) -> int:
+    values = np.linalg.svd(scaled, compute_uv=False)
+    return int((values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)).sum())
+
+
+def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
+    """The dependent columns, the sign of their determinant, and how far they are from losing rank."""
+    rank = _rank(scaled[:, free])
+    if rank == 0:
+        return (), 0, 0.0
+    order = qr(scaled[:, free], mode="r", pivoting=True)[1]
+    dependent = tuple(sorted(int(j) for j in free[order[:rank]]))
+    if rank < len(scaled):
+        return dependent, 0, 0.0
+    block = scaled[:, list(dependent)]
+    values = np.linalg.svd(block, compute_uv=False)
+    return dependent, int(np.linalg.slogdet(block)[0]), float(values.min() / values.max())
+
+
+def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
+    """The direction in which the constraints hold the free coordinates least; its largest entry is 1."""
+    values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
+    held = values > SINGULAR * values.max()
+    direction = np.zeros(scaled.shape[1])
+    direction[free] = rows[held][-1] / np.abs(rows[held][-1]).max()
+    return direction
+
+
+def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
+    """Say that C_q nearly loses rank at a position, where it does in its own units and in like ones, and how far."""
+    if jacobian[:, free].size == 0:
+        return ""
+    values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]
+    ratios = [float(each.min()) / max(float(each.max()), 1e-300) for each in values]
+    if max(ratios) > DEAD_CENTRE:
+        return ""
+    without = f" without the columns of keep={kept}" if kept else ""
+    return (
+        f". There C_q{without} nearly loses rank, as at a dead centre: its smallest singular value is {ratios[0]:.2g} "
+        "of the largest"
+    )
+
+
+def _no_freedom(
+    system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
+) -> str:
+    ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
+    rows = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
+    if not kept:
+        return f"{rows} of {system.name!r} has {ranks} at t = {t!r}, and {why}: give a guess away from this position"
+    return (
+        f"keep leaves too little freedom: without the columns {kept} {rows} of {system.name!r} has {ranks} at "
+        f"t = {t!r}, and {why}. Keep fewer coordinates, or give a guess away from a dead centre"
+    )
+
+
+def _largest(values: Array) -> str:
+    return f"{float(np.abs(values).max()):.3g}"
+
+
+def _move(change: Array) -> Move:
+    j = int(np.abs(change).argmax())
+    return Move(float(change[j]), j)

@@ -1,0 +1,182 @@
+"""How a run ended, what it cost, and the trajectory: what a run returns, and `Result` makes more of."""
+
+import pickle
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.problem.description import Description
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.dense import DenseSolution
+
+Array = NDArray[np.float64]
+
+
+class Status(IntEnum):
+    """How a run ended: 0 reached the end, 1 an event, negative a failure; in words in `MEANINGS`."""
+
+    REACHED_END = 0
+    EVENT = 1
+    STEP_TOO_SMALL = -1
+    MAX_STEPS = -2
+    NOT_CONVERGED = -3
+    NOT_FINITE = -4
+    RANK_LOST = -5
+    SOLVER_FAILED = -6
+    INTERRUPTED = -7
+    STAGNATED = -8
+    WRONG_DERIVATIVE = -9
+    TIME_LIMIT = -10
+    ROWS_CONTRADICT = -11
+    RATE_JUMPS = -12
+    WRONG_TRACE = -13
+
+
+MEANINGS: dict[Status, str] = {
+    Status.REACHED_END: "the end of t_span was reached",
+    Status.EVENT: "an event ended the run",
+    Status.STEP_TOO_SMALL: "the step size fell below the spacing of floating-point numbers",
+    Status.MAX_STEPS: "max_steps accepted steps were taken",
+    Status.NOT_CONVERGED: "a step of fixed size did not converge, or gamma by differences misses the tolerance",
+    Status.NOT_FINITE: "a callback returned a value that is not finite, or the state overflowed",
+    Status.RANK_LOST: "the constraint Jacobian lost rank: no choice of independent coordinates exists",
+    Status.SOLVER_FAILED: "a solver of another project failed, or reached the time limit of its adapter",
+    Status.INTERRUPTED: "the run was interrupted from the keyboard",
+    Status.STAGNATED: "the steps became so short that the end is out of reach",
+    Status.WRONG_DERIVATIVE: "a derivative that the system gives is wrong, or M not symmetric, at a state of the run",
+    Status.TIME_LIMIT: "the run reached its time_limit",
+    Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
+    Status.RATE_JUMPS: "constraint_rate jumps, and no impulse gives velocities that the constraints allow",
+    Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it",
+}
+
+
+def explained(status: Status) -> str:
+    """Where the documentation explains a failure, for the end of its message; nothing for a run that succeeded."""
+    return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Counts and CPU time of a run; None where a foreign solver does not tell.
+
+    Attributes
+    ----------
+    n_accepted, n_rejected_error, n_rejected_convergence : int or None
+        Steps accepted, steps that failed the error test, steps whose loops did not converge.
+    n_outer : int or None
+        Iterations of the outer loop (each evaluates every stage once).
+    n_inner : int or None
+        Newton iterations of the inner loop.
+    n_evaluations : int or None
+        Solutions of eq. (6) for accelerations and multipliers, and evaluations of the forces alone, with which the
+        derivatives of a banded system are made.
+    n_partitions : int or None
+        Coordinate partitionings, the first included.
+    n_factorizations : int or None
+        Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, of the partitionings,
+        and for Newton's method in the outer loop.
+    n_jacobians : int or None
+        Times the derivatives of the right-hand side were made for Newton's method in the outer loop.
+    cpu_time : float
+        Process time of the integration, s: of the steps, of storing what they give, of events, and of q and v at output
+        times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
+        output times between steps are not included.
+    """
+
+    n_accepted: int | None = None
+    n_rejected_error: int | None = None
+    n_rejected_convergence: int | None = None
+    n_outer: int | None = None
+    n_inner: int | None = None
+    n_evaluations: int | None = None
+    n_partitions: int | None = None
+    n_factorizations: int | None = None
+    n_jacobians: int | None = None
+    cpu_time: float = 0.0
+
+
+@dataclass(frozen=True)
+class Record:
+    """A trajectory, how the run ended, and what it cost: the fields of `Result`, which says what they are."""
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    lam: Array
+    h: Array
+    status: Status
+    message: str
+    stats: Statistics
+    rejected_error: NDArray[np.int64] | None = None
+    rejected_convergence: NDArray[np.int64] | None = None
+    partitioned: NDArray[np.int64] | None = None
+    rank: int | None = None
+    redundant: NDArray[np.int64] | None = None
+    sol: DenseSolution | None = None
+    t_events: list[Array] | None = None
+    q_events: list[Array] | None = None
+    v_events: list[Array] | None = None
+    defect: float | None = None
+    widest_gap: float | None = None
+    system: ConstrainedSystem | None = None
+    method: str = ""
+    rtol: float | None = None
+    atol: Array | None = None
+    untested: NDArray[np.bool_] | None = None
+
+    @property
+    def success(self) -> bool:
+        """Whether the run reached its end or an event."""
+        return self.status >= 0
+
+    @property
+    def description(self) -> Description:
+        """Names, energy and drawing, as far as the `Problem` of the system told them."""
+        return Description() if self.system is None else self.system.description
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates with their units; q0, q1, ... where the problem has none."""
+        return self.description.coordinates or tuple(f"q{k}" for k in range(len(self.q)))
+
+    @property
+    def energy(self) -> Array:
+        """Energy at the times `t`, J, (n_t,).
+
+        Raises
+        ------
+        ValueError
+            If no energy is known: the system was solved without a `Problem`, or the result has no system.
+        """
+        return np.asarray(self._known("energy")(self.t, self.q, self.v))
+
+    def _known(self, what: str) -> Any:
+        """The energy or the drawing, or what to do to have it."""
+        found = getattr(self.description, what)
+        if found is None:
+            raise ValueError(
+                f"this result knows no {what}: put the system into a problem, twoloop.mechanisms.Problem(..., "
+                f"system=system, {what}=...), and solve problem.system. To a result in a file, or of another solver, "
+                "give the system: twoloop.load(path, problem.system), dataclasses.replace(result, "
+                "system=problem.system)"
+            )
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        try:
+            pickle.dumps(self.system)
+        except TypeError:  # of functions without a name of their own
+            state["system"] = None
+        return state
+
+    def __repr__(self) -> str:
+        known = {f.name: getattr(self.stats, f.name) for f in fields(self.stats)}
+        counts = ", ".join(f"{name}={value}" for name, value in known.items() if value is not None)
+        end = f"t[-1]={self.t[-1]:g}" if self.t.size else "no output"
+        return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"

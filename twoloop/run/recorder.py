@@ -1,0 +1,202 @@
+"""What a run keeps of its accepted steps as they come: all states, or those at output times; and its events."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.data.intervals import WINDOW
+from twoloop.problem.events import Event, EventSearch
+from twoloop.run.dense import DenseSolution, Interpolator, Table
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a run is to keep.
+
+    Attributes
+    ----------
+    times : ndarray or None
+        Output times; None: every accepted step.
+    lands : bool
+        Whether steps end at all output times, so that nothing is interpolated.
+    dense : bool
+        Whether the dense solution is wanted.
+    events : list of Event or None
+        None: no events were asked for.
+    """
+
+    times: Array | None
+    lands: bool
+    dense: bool
+    events: list[Event] | None
+
+    @property
+    def every_step(self) -> bool:
+        """Whether the states of all steps are needed, if only for a while."""
+        return self.times is None or self.between_steps
+
+    @property
+    def between_steps(self) -> bool:
+        """Whether states between steps are wanted."""
+        return (self.times is not None and not self.lands) or self.dense or self.events is not None
+
+
+class Recorder:
+    """Takes the states of accepted steps, chunk by chunk.
+
+    An interval is looked at when all states are known that its polynomials go through, so that what comes out does not
+    depend on the chunks. Of the states before it as many are kept as the polynomials need, and all if they are wanted.
+
+    Attributes
+    ----------
+    search : EventSearch or None
+        The events so far.
+    n_steps, last_step : int, float
+        After a terminal event: the number of steps up to it, and the part of the last one before it, s.
+    interrupted : bool
+        Whether Ctrl-C broke off the search for events, or what is computed between the steps.
+    """
+
+    def __init__(self, wanted: Wanted, interpolator: Interpolator | None, n_q: int, t0: float, state: Array):
+        self.wanted, self.interpolator, self._n_q, self._width = wanted, interpolator, n_q, len(state)
+        self.n_steps, self.last_step = 0, 0.0
+        self.interrupted = False
+        self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not looked at
+        self._kinds = np.empty(0, dtype=np.int64)
+        self._next = 0  # the first interval of these that was not looked at
+        self._all: list[tuple[Array, Array, NDArray[np.int64]]] = [(self._t, self._rows, self._kinds)]
+        self._outputs: list[tuple[Array, Array]] = []
+        self._n_outputs = 0
+        two = 2 * self._n_q
+        self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[:two])
+        if wanted.times is not None and wanted.lands:
+            self._outputs.append((self._t, self._rows))
+        elif wanted.times is not None:
+            self._outputs.append((self._t[:0], self._rows[:0, :two]))
+
+    def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
+        """Take over the states [q, v, a, lam] at which steps ended, and what kind of interval each step is.
+
+        Of the kinds there is one a step where states between steps are wanted, else none.
+        """
+        if not self.wanted.every_step:
+            self._outputs.append((t, rows))
+            return
+        if self.wanted.times is not None and self.wanted.lands:
+            landed = np.isin(t, self.wanted.times)
+            self._outputs.append((t[landed], rows[landed]))
+        if self.wanted.times is None or self.wanted.dense:
+            self._all.append((t, rows, kinds))
+        if not self.wanted.between_steps:
+            return
+        self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
+        self._kinds = np.concatenate([self._kinds, kinds])
+        self._look(len(self._t) - WINDOW)
+
+    def finish(self) -> None:
+        """No more states come."""
+        self._look(len(self._t) - 1)
+
+    @property
+    def last(self) -> tuple[float, Array] | None:
+        """Time and row [q, v] of the event that ended the run."""
+        return None if self.search is None or self.ended is None else self.search.found[self.ended[0].number][-1]
+
+    @property
+    def broken_off(self) -> float | None:
+        """When the search for events was interrupted, behind which nothing is known of them: the result ends there."""
+        behind = self.interrupted and self.search is not None and self.ended is None
+        return self.search.reached if behind and self.search is not None else None
+
+    @property
+    def ended(self) -> tuple[Event, float] | None:
+        """The event that ended the run, and when."""
+        return None if self.search is None else self.search.ended
+
+    def _look(self, end: int) -> None:
+        """Search and interpolate the intervals before `end`."""
+        interpolator = self.interpolator
+        if interpolator is None or self.ended is not None or self.interrupted:
+            return
+        if end < self._next or (end == self._next and len(self._t) > 1):
+            return
+        table = Table(self._t, np.ascontiguousarray(self._rows[:, : 3 * self._n_q]), self._kinds)
+        ends = self._t[self._next : end + 1]
+        if self.search is not None:
+            try:
+                self.search.search(lambda times: interpolator.states(table, times), ends)
+            except KeyboardInterrupt:
+                self.interrupted = True
+                self.search.break_off()
+                ends = ends[ends <= self.search.reached]
+            if self.ended is not None:
+                before = int(np.searchsorted(ends, self.ended[1]))
+                self.last_step = float(self.ended[1] - ends[max(before - 1, 0)])
+                ends = np.append(ends[:before], self.ended[1])
+        self.n_steps += len(ends) - 1
+        if self.wanted.times is not None and not self.wanted.lands:
+            times = self.wanted.times[self._n_outputs :]
+            times = times[times <= ends[-1]]
+            try:
+                self._outputs.append((times, interpolator.states(table, times)))
+                self._n_outputs += len(times)
+            except KeyboardInterrupt:
+                self.interrupted = True
+        drop = max(0, end - WINDOW)
+        self._t, self._rows, self._kinds = self._t[drop:], self._rows[drop:], self._kinds[drop:]
+        self._next = end - drop
+
+    def output(self) -> tuple[Array, Array]:
+        """Times and rows [q, v, a, lam] of the result."""
+        parts = self._outputs if self.wanted.times is not None else [(t, rows) for t, rows, _ in self._all]
+        t, rows = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+        if self.wanted.times is not None and self.wanted.lands:
+            landed = np.isin(t, self.wanted.times)  # the ends of the run may not be among them
+            t, rows = t[landed], rows[landed]
+        elif self.wanted.times is not None:
+            rows = self._completed(t, rows)
+        if self.broken_off is not None:
+            kept = t <= self.broken_off
+            return t[kept], rows[kept]
+        if self.search is None or self.search.ended is None:
+            return t, rows
+        event, end = self.search.ended
+        kept = t <= end
+        t, rows = t[kept], rows[kept]
+        if self.wanted.times is None and t[-1] < end:
+            last = self.search.found[event.number][-1][1][None, :]
+            t, rows = np.append(t, end), np.vstack([rows, self._completed(np.array([end]), last)])
+        return t, rows
+
+    def _completed(self, times: Array, rows: Array) -> Array:
+        """Rows [q, v, a, lam] at rows [q, v]."""
+        if self.interpolator is None:
+            return rows
+        added = np.full((len(times), self._width - rows.shape[1]), np.nan)
+        try:
+            self.interpolator.complete(times, rows, added)
+        except KeyboardInterrupt:
+            self.interrupted = True
+            added[np.isnan(added).any(axis=1)] = np.nan  # a row that was half written, too
+        return np.hstack([rows, added])
+
+    def solution(self) -> DenseSolution | None:
+        """The dense solution, if it is wanted."""
+        if not self.wanted.dense or self.interpolator is None:
+            return None
+        t, rows, kinds = (np.concatenate(each) for each in zip(*self._all, strict=True))
+        table = Table(t, np.ascontiguousarray(rows[:, : 3 * self._n_q]), kinds)
+        end = float(t[-1]) if self.broken_off is None else self.broken_off
+        return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
+
+    def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
+        """Times, coordinates and velocities of the events, an array for each event function."""
+        if self.search is None:
+            return None, None, None
+        n = self._n_q
+        times = [np.array([t for t, _ in found]) for found in self.search.found]
+        rows = [np.array([row for _, row in found]).reshape(-1, 2 * n) for found in self.search.found]
+        return times, [each[:, :n] for each in rows], [each[:, n:] for each in rows]

@@ -1,0 +1,127 @@
+"""Pieces of a run made again: short runs from stored states, by an explicit or an implicit method."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks.consistency import ConstraintWarning
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
+from twoloop.methods.dop853 import DOP853
+from twoloop.methods.plan import Method
+from twoloop.methods.presets import RungeKutta
+from twoloop.methods.tableaux import radau_iia
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.run import Run
+
+Array = NDArray[np.float64]
+
+CHUNK = 256  # attempts at steps in one call
+FIRST_TRY = 0.1  # of a piece: its first step where nothing is known of one before
+SHARE = 0.1  # of the tolerances of the run: those of the pieces ...
+FINEST = 1e-13  # ... which rounding allows no smaller
+
+
+def tighter(tolerance: ArrayLike) -> Array:
+    """Tolerances of a piece made again, for those of the run."""
+    return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
+
+
+def explicit() -> tuple[Method, Array]:
+    """The method for motion that is not stiff, and its nodes."""
+    import scipy.integrate
+
+    return DOP853(), scipy.integrate.DOP853.C
+
+
+def implicit(velocities: bool) -> tuple[Method, Array]:
+    """The method for stiff motion, and its nodes; `velocities`: their errors are tested, too."""
+    tableau = radau_iia(7)
+    return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
+
+
+class Remade(NamedTuple):
+    """States [q, v] at a time within a piece and at its end, and the longest step, s."""
+
+    between: Array
+    end: Array
+    longest: float
+
+
+class Remaker:
+    """Makes pieces of a run again, each from a state that is given; the arrays are made once.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    t, q, v : float, ndarray (n_q,)
+        A state of the run.
+    method : (method object, ndarray)
+        What makes the pieces, with the places within its steps where it looks at the equations, from 0 to 1.
+    rtol, atol : float, ndarray (n_q,)
+        Tolerances.
+    max_step : float
+        Largest step, s.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t: float,
+        q: Array,
+        v: Array,
+        method: tuple[Method, Array],
+        rtol: float,
+        atol: Array,
+        max_step: float,
+    ):
+        chosen, nodes = method
+        self.spacing = float(np.diff(np.unique(np.concatenate([[0.0], nodes, [1.0]]))).max())
+        plan = chosen.plan(system.n_q, rtol, float(atol.min()), False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConstraintWarning)  # of redundant rows, which the run has named
+            self.run = Run(system, plan, t, q, v, rtol, atol, None)
+        a, control = self.run.a, self.run.control
+        control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
+        control[a.MAX_ATTEMPTS] = CHUNK
+        self.run.work.notes[common.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
+        rows = (np.empty(len(Remade._fields)), np.empty((len(Remade._fields), len(self.run.state))))
+        self.out = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS)), np.zeros(2, dtype=np.int64))
+        self.next_step = np.inf
+
+    def to(self, t0: float, state: Array, between: float, t1: float, most: int) -> Remade | None:
+        """Start from a state [q, v] at t0; None if t1 is not reached within so many attempts at steps."""
+        run, a, n = self.run, self.run.a, len(state)
+        run.state[:] = 0.0
+        run.state[:n] = state
+        run.plan.memory[:] = run.memory
+        clock = run.clock
+        clock[:] = 0.0
+        clock[a.JUMP_FROM] = clock[a.JUMP_TO] = np.inf
+        clock[a.ROUGH_TO] = -np.inf
+        clock[a.T] = clock[a.T_START] = t0
+        clock[a.H_LIMIT] = run.plan.limit_start
+        clock[a.H_NEXT] = self.next_step if self.next_step < np.inf else FIRST_TRY * (t1 - t0)
+        self.next_step = np.inf
+        if a.start(run.kit, run.work, t0, run.state) != common.DONE:
+            return None
+        times = np.array([between, t1] if t0 < between < t1 else [t1])
+        arrays = (run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state)
+        found: list[Array] = []
+        longest, advance = 0.0, direct(a.advance)
+        _, states, steps, filled = self.out
+        for _ in range(0, most, CHUNK):
+            code = advance(run.kit, run.work, *arrays, times, *self.out)
+            n_rows, n_steps = filled.tolist()
+            found.extend(states[:n_rows, :n].copy())
+            longest = max(longest, float(steps[:n_steps, a.H].max(initial=0.0)))
+            if code == a.ALL_OUTPUT_DONE:
+                self.next_step = float(clock[a.H_NEXT])
+                return Remade(found[0], found[-1], longest)
+            if code != a.PAUSED and not (code == a.AT_JUMP and run.leap(t1)):
+                break
+        return None

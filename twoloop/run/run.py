@@ -1,0 +1,720 @@
+"""One run: its arrays, the chunks that the compiled `advance` returns, and what to say of how it ended."""
+
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import (
+    ConstraintWarning,
+    dependent_rows,
+    in_words,
+    least_inertia,
+    not_finite,
+    pattern_of,
+)
+from twoloop.checks.derivatives import wrong_derivative
+from twoloop.generate.traced_values import Sample
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common, intervals
+from twoloop.methods.plan import Plan, least_tolerance
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.crossings import said_of_crossings, singular_ratio
+from twoloop.run.dense import Interpolator
+from twoloop.run.impulse import beyond_jump
+from twoloop.run.interrupts import Interrupts, said_of_interrupt
+from twoloop.run.record import Record, Statistics, Status, explained
+from twoloop.run.recorder import Recorder, Wanted
+from twoloop.run.stability import Looks, said_of_stiffness
+from twoloop.run.workspace import kit_of, workspace
+
+Array = NDArray[np.float64]
+
+BUFFER_ROWS = 1024
+BUFFER_STEPS = 4096
+FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
+FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
+SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
+CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
+CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
+LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least
+PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
+FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
+SHORTEST_STEP = 1e-16  # of the first step
+STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
+STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
+STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
+CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
+# of the longest of the last steps: lengths tried for a step across a singular position, on which no stage should fall
+BRIDGES = tuple(0.85**k for k in range(28))
+CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
+NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
+# ends of which it may be said that stability limited the steps
+EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
+NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
+NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
+LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
+
+
+class Run:
+    """The arrays of one run, and the loop over its chunks.
+
+    Raises
+    ------
+    ValueError
+        If the accelerations at the start cannot be found.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        plan: Plan,
+        t0: float,
+        q0: Array,
+        v0: Array,
+        rtol: float,
+        atol: Array,
+        step_size: float | None,
+        interiors: Mapping[int, Plan] = MappingProxyType({}),
+    ):
+        from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
+
+        self.a = advance
+        self.system, self.plan, self.t0 = system, plan, t0
+        self.memory = plan.memory.copy()
+        self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
+        self.kit = kit_of(system, t0, q0, plan)
+        self.functions = self.kit.functions
+        n_rows = system.n_c + system.n_a
+        self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
+        self.pattern = pattern_of(system, t0, q0)
+        self.work = self._workspace()
+        self.new_state = np.zeros_like(self.state)
+        self.tolerances = np.zeros(common.ATOL + system.n_q)
+        self.tolerances[common.RTOL] = rtol
+        self.tolerances[common.ESTIMATE] = step_size is None
+        self.tolerances[common.LEAST] = least_tolerance(rtol, float(atol.min()))
+        self.tolerances[common.ATOL :] = atol
+        self.control = np.zeros(advance.N_CONTROL)
+        self.control[advance.MAX_STEP] = np.inf
+        self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
+        self.control[advance.MAX_STEPS] = np.inf
+        self.control[advance.BRIDGE] = 1.0
+        rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
+        self.control[advance.DRIVEN] = bool(rates)
+        first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
+        self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
+        self.clock = np.zeros(advance.N_CLOCK)
+        self.clock[advance.T] = self.clock[advance.T_START] = t0
+        self._control_by(plan)
+        self.substituted = False  # whether another plan has taken over, for good
+        self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
+        self.clock[advance.ROUGH_TO] = -np.inf
+        self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
+        self.jumps: list[float] = []  # times at which velocities changed as by an impulse
+        self._begin()
+
+    def _control_by(self, plan: Plan) -> None:
+        """Step-size control as a plan wants it."""
+        a, control = self.a, self.control
+        control[a.SAFETY], control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.safety, plan.factor_min, plan.factor_max
+        control[a.EXPONENT], control[a.PREDICTIVE], control[a.LEAST_ERROR] = (
+            plan.exponent,
+            plan.predictive,
+            plan.least_error,
+        )
+        control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
+        control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
+        control[a.ROUGH] = plan.rough
+        control[a.GIVES_WAY] = plan.substitute is not None
+        control[a.PROVISIONAL] = PROVISIONAL if plan.provisional else -1.0
+        self.clock[a.H_LIMIT] = plan.limit_start
+
+    def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
+        """Arrays for ranks of C_q and of all rows; without them for full ones."""
+        q0 = self.state[: self.system.n_q]
+        work = workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
+        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        return work
+
+    def _begin(self) -> None:
+        code = self.a.start(self.kit, self.work, self.t0, self.state)
+        if code == common.RANK_DIFFERS:
+            ranks = [int(self.work.notes[place]) for place in (common.RANK, common.RANK_V)]
+            self.work = self._workspace(*ranks)
+            code = self.a.start(self.kit, self.work, self.t0, self.state)
+        if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
+            required = self.work.notes[common.GAMMA_REQUIRED]
+            self.work.notes[common.GAMMA_REQUIRED] = np.inf
+            code = self.a.start(self.kit, self.work, self.t0, self.state)
+            self.work.notes[common.GAMMA_REQUIRED] = required
+        n = self.system.n_q
+        if code == common.DONE:
+            self._warn_of_redundant_rows()
+            return
+        if code == common.MASS_NOT_DEFINITE:
+            raise ValueError(
+                f"mass of {self.system.name!r} must be positive definite on the velocities that the constraints allow; "
+                f"at t = {self.t0!r} {least_inertia(self.system, self.t0, self.state[:n])[1]}"
+            )
+        if code == common.SINGULAR:
+            raise ValueError(
+                f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: the constraint "
+                f"Jacobian has lost rank there ({dependent_rows(self.system, self.t0, self.state[:n])}). Start from "
+                "another position"
+            )
+        raise ValueError(
+            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {self._not_finite()}"
+        )
+
+    def _warn_of_redundant_rows(self) -> None:
+        n_rows = self.system.n_c + self.system.n_a
+        self.rank = len(self.work.rows_v)
+        self.redundant = np.zeros(0, dtype=np.int64)
+        if self.rank < n_rows:
+            self.redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
+            n = self.system.n_q
+            rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+            off = np.abs(rows @ a - self.work.Gamma)
+            allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
+            wrong = np.flatnonzero(off > allowed).tolist()
+            if wrong:
+                raise ValueError(
+                    f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
+                    f"{in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
+                )
+            warnings.warn(
+                f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
+                f"{in_words(rows, self.redundant.tolist())}. They are left out of the solution and checked at every "
+                "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows",
+                ConstraintWarning,
+                stacklevel=4,
+            )
+
+    def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
+        """Set the first and the largest step, s."""
+        span = t1 - self.t0
+        first = min(self._first_step(span, self.state) if first_step is None else first_step, span)
+        self.clock[self.a.H_NEXT] = first
+        self.control[self.a.SHORTEST] = SHORTEST_STEP * first
+        self.max_step, self.gap = max_step, LONGEST_UNSEEN * span
+        self.tolerances[common.GAP] = self.gap
+        self._limit_steps()
+
+    def _limit_steps(self) -> None:
+        """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
+        self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
+
+    def _first_step(self, span: float, state: Array) -> float:
+        """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
+        n = self.system.n_q
+        q, v, a = (float(np.abs(state[k * n : (k + 1) * n]).max()) for k in range(3))
+        q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
+        scales = [span]
+        if v > 0.0:
+            scales.append(q / v)
+        if a > 0.0:
+            scales.append(float(np.sqrt(q / a)))
+        if v > 0.0 and a > 0.0 and v / a > FIRST_STEP * min(scales):  # not at what is next to rest
+            scales.append(v / a)
+        return FIRST_STEP * min(scales)
+
+    def go(
+        self,
+        t1: float,
+        wanted: Wanted,
+        report: Any,
+        time_limit: float | None,
+        check_derivatives: bool,
+        interrupts: Interrupts,
+    ) -> Record:
+        """Advance to t1, chunk by chunk, and assemble the result; look at derivatives once more at the end."""
+        deadline = np.inf if time_limit is None else time.monotonic() + time_limit
+        a, system = self.a, self.system
+        recorder = self._recorder(wanted)
+        outputs = np.array([t1])
+        if wanted.times is not None and wanted.lands:
+            outputs = np.append(wanted.times[(wanted.times > self.t0) & (wanted.times < t1)], t1)
+        self.control[a.STORE_ALL] = wanted.every_step
+        largest_chunk = BUFFER_STEPS
+        if any(event.terminal < np.inf for event in wanted.events or []):
+            largest_chunk = self.chunk = CHUNK_TO_EVENT
+        # the run is looked at after so many attempts, however long the chunks are that the clock allows
+        between_looks, next_look = self.chunk, self.chunk
+        step_parts = [np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])]  # the first partition of a run is not a renewal
+        filled = np.zeros(2, dtype=np.int64)
+        advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
+        cpu = 0.0
+        sample = Sample(self.t0, self.state[: 2 * system.n_q])
+        code = INTERRUPTED if interrupts.asked else a.PAUSED
+        out_t, out_state, out_steps = self._buffers()
+        plan, control, kit = self.plan, self.control, self.kit
+        raised: Exception | None = None
+        while code == a.PAUSED:
+            across, leaps = plan is not self.plan, self.clock[a.LEAPS] == 1.0
+            self.control[a.MAX_ATTEMPTS] = min(self.chunk, max(0, next_look - self._attempts()))
+            began = time.process_time()
+            try:
+                code = advance(
+                    kit,
+                    self.work,
+                    plan.options,
+                    plan.memory,
+                    self.tolerances,
+                    control,
+                    self.clock,
+                    self.state,
+                    self.new_state,
+                    outputs,
+                    out_t,
+                    out_state,
+                    out_steps,
+                    filled,
+                )
+            except KeyboardInterrupt:
+                code = INTERRUPTED
+            except Exception as error:  # of a callback; beyond a terminal event it does not matter
+                code, raised = INTERRUPTED, None if interrupts.asked else error
+            n_rows, n_steps = filled.tolist()
+            t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
+            sample.add(t, rows)
+            sample.add(self.clock[a.T : a.T + 1], self.state[None, :])
+            sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
+            if sparse:
+                t, rows, steps = t.copy(), rows.copy(), steps.copy()
+            step_parts.append(steps)
+            kinds = self._kinds(steps, across, leaps) if wanted.between_steps else NO_KINDS
+            recorder.add(t, rows, kinds)
+            spent = time.process_time() - began
+            cpu += spent
+            filled[:] = 0  # for Ctrl-C before the next chunk begins
+            if recorder.ended is not None:
+                break
+            looks.pass_by(steps[:, a.H])
+            pace.pass_by(steps[:, a.H])
+            if code == a.PAUSED and self._attempts() >= next_look:
+                between_looks = min(2 * between_looks, largest_chunk)
+                next_look = self._attempts() + between_looks
+                if not across:
+                    looks.take(float(self.clock[a.T]), self.state, system.n_q)
+                if pace.stagnates(self.clock[a.T], t1) and self.control[a.MAX_STEPS] == np.inf:
+                    code = STAGNATED
+            if spent < CHUNK_TIME:
+                self.chunk = min(2 * self.chunk, largest_chunk)
+            if not sparse or len(out_t) < min(self.chunk, BUFFER_ROWS):
+                out_t, out_state, out_steps = self._buffers()
+            if code == a.PAUSED and time.monotonic() > deadline:
+                code = OUT_OF_TIME
+            if code == a.PAUSED and (interrupts.asked or recorder.interrupted):
+                code = INTERRUPTED
+            if code == a.HAS_TO_GIVE_WAY:
+                self._give_way()
+                plan, control, kit, code = self.plan, self.control, self.kit, a.PAUSED
+            elif code == a.AT_JUMP and not across and self.leap(t1):
+                code = a.PAUSED
+            elif code == a.NEAR_SINGULAR:
+                plan, control = self._bridge()
+                kit = common.Kit(self.functions, self.kit.general, plan.step)
+                code = a.PAUSED
+            elif plan is not self.plan and code != a.ALL_OUTPUT_DONE:
+                plan, control, code = self._beyond(plan, control, code, n_steps)
+                kit = self.kit if plan is self.plan else kit
+            report(self.clock[a.T])
+        if wanted.between_steps:
+            began = time.process_time()
+            recorder.finish()
+            cpu += time.process_time() - began
+        if raised is not None and recorder.ended is None:
+            raise raised
+        t, table = recorder.output()
+        steps, statistics = np.concatenate(step_parts), self._statistics(cpu)
+        if recorder.ended is not None:
+            event, end = recorder.ended
+            steps = steps[: recorder.n_steps + 1]
+            if recorder.n_steps > 0:
+                steps[-1, a.H] = recorder.last_step
+            status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
+        reached = float(self.clock[a.T])
+        if recorder.broken_off is not None:
+            reached, steps = recorder.broken_off, steps[: recorder.n_steps + 1]
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
+        n = system.n_q
+        try:
+            if recorder.ended is None:
+                status, message = self._outcome(code, t1, pace)
+            if check_derivatives and code != INTERRUPTED:
+                last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
+                status, message = self._check_again(t, table, last, status, message)
+            if code != INTERRUPTED:
+                end = float(self.clock[a.T] if recorder.last is None else recorder.last[0])
+                status, message = self._check_traces(sample.up_to(end), status, message)
+            if status in EXPLAINED_BY_STIFFNESS:
+                message += said_of_stiffness(looks, self.kit, self.work)
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        if interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+            status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
+        errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
+        t_events, q_events, v_events = recorder.events()
+        return Record(
+            t=t,
+            q=table[:, :n].T,
+            v=table[:, n : 2 * n].T,
+            a=table[:, 2 * n : 3 * n].T,
+            lam=table[:, 3 * n :].T,
+            h=steps[1:, a.H],
+            status=status,
+            message=message + explained(status),
+            stats=statistics,
+            rank=self.rank,
+            redundant=self.redundant,
+            rejected_error=errors,
+            rejected_convergence=failures,
+            partitioned=partitions,
+            untested=steps[1:, a.JACOBIANS] > 0.0,
+            sol=recorder.solution(),
+            t_events=t_events,
+            q_events=q_events,
+            v_events=v_events,
+            defect=self._defect(),
+            widest_gap=float(self.work.notes[common.WIDEST_GAP]),
+            system=system,
+        )
+
+    def _defect(self) -> float | None:
+        """The largest defect of the steps, if all looked for it."""
+        checked = self.work.counters[common.N_ACCEPTED] > 0 and self.work.notes[common.UNCHECKED] == 0.0
+        return float(self.work.notes[common.LARGEST_DEFECT]) if checked else None
+
+    def _buffers(self) -> tuple[Array, Array, Array]:
+        """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
+        n_rows, n_steps = min(self.chunk, BUFFER_ROWS), min(self.chunk, BUFFER_STEPS)
+        return np.empty(n_rows), np.empty((n_rows, len(self.state))), np.empty((n_steps, self.a.N_STEP_COLUMNS))
+
+    def _recorder(self, wanted: Wanted) -> Recorder:
+        """What takes the states; where some are to lie between steps, with what finds them."""
+        n, interpolator = self.system.n_q, None
+        if wanted.between_steps:
+            ranks = (len(self.work.rows), len(self.work.rows_v))
+            start, atol = self.state[: 3 * n], self.tolerances[common.ATOL :]
+            interpolator = Interpolator(self.system, self.t0, start, self.rtol, atol, ranks, self.interiors)
+        return Recorder(wanted, interpolator, n, self.t0, self.state)
+
+    def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
+        """What kind of interval each of these accepted steps is, for the solution between them."""
+        if leaps:
+            return np.full(len(steps), intervals.JUMP)
+        if across:
+            return np.full(len(steps), intervals.ACROSS)
+        if self.plan.apart:
+            return np.full(len(steps), intervals.APART)
+        explicit = intervals.ACROSS if self.substituted else intervals.ACCELERATIONS
+        return np.where(steps[:, self.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)
+
+    def _give_way(self) -> None:
+        """Go on with the plan that takes over where values of this one are not finite."""
+        assert self.plan.substitute is not None
+        t, n = float(self.clock[self.a.T]), self.system.n_q
+        self.plan = replace(self.plan.substitute, inner=self.plan.inner)
+        self.kit = kit_of(self.system, t, self.state[:n], self.plan)
+        self.memory = self.plan.memory.copy()
+        self.substituted = True
+        self._control_by(self.plan)
+        self._limit_steps()
+        self.clock[self.a.FAILURE_CODE] = common.DONE
+        self.clock[self.a.H_NEXT] = self.clock[self.a.H_FAILED]
+        self.clock[self.a.H_BEFORE] = self.clock[self.a.ERROR_BEFORE] = 0.0
+
+    def _bridge(self) -> tuple[Plan, Array]:
+        """The plan and the controls for steps across a singular position, see kernels/steps/bridge.py."""
+        from twoloop.kernels.steps import bridge
+        from twoloop.methods.dop853 import DOP853
+
+        a, clock = self.a, self.clock
+        self.crossings.append([(float(clock[a.T]), self.state.copy())])
+        plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
+        control = self.control.copy()
+        control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
+        control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.factor_min, plan.factor_max
+        control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+        control[a.GIVES_WAY] = 0.0
+        if control[a.FIXED_STEP] == 0.0:
+            control[a.MAX_STEP] = min(self.max_step, self.gap)
+        clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
+        self.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
+        clock[a.H_NEXT] = self.lengths.pop(0)
+        return replace(plan, step=bridge.bridging_step), control
+
+    def _beyond(self, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
+        """What goes on after an attempt at a step across: the same, or the run's own steps again."""
+        a = self.a
+        if code == a.PAUSED and accepted == 0 and self.lengths:
+            self.clock[a.H_NEXT], self.clock[a.H_LIMIT] = self.lengths.pop(0), np.inf
+            return plan, control, code
+        if code == a.PAUSED and accepted > 0 and (self.work.notes[common.PIVOT] < CLEAR * self.clock[a.LARGEST_PIVOT]):
+            self.lengths = [float(self.clock[a.H_LONG]) * part for part in BRIDGES]
+            return plan, control, code
+        if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
+            return plan, control, code
+        if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
+            self.control[a.BRIDGE] = 0.0
+        self.crossings[-1].append((float(self.clock[a.T]), self.state.copy()))
+        self.plan.memory[:] = self.memory
+        self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
+        return self.plan, self.control, a.PAUSED
+
+    def leap(self, t1: float) -> bool:
+        """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
+        a, clock, n = self.a, self.clock, self.system.n_q
+        end = float(clock[a.JUMP_TO])
+        beyond = beyond_jump(self.system, end, self.state[:n], self.state[n : 2 * n])
+        if beyond is None:
+            return False
+        self.new_state[: 2 * n] = beyond
+        self.work.notes[common.KINK_BEFORE], self.work.notes[common.KINK_AFTER] = end, np.inf
+        if a.start(self.kit, self.work, end, self.new_state) != common.DONE:
+            return False
+        self.jumps.append(end)
+        self.plan.memory[:] = self.memory
+        clock[a.LEAPS] = 1.0
+        clock[a.H_LIMIT], clock[a.LIMIT_AGE] = self.plan.limit_start, 0.0
+        if end < t1:
+            clock[a.H_NEXT] = min(clock[a.H_NEXT], self._first_step(t1 - end, self.new_state))
+        return True
+
+    def _said_of_events(self) -> str:
+        """What a run that succeeded has to say of jumps and of singular positions."""
+        said = ""
+        if self.jumps:
+            said = f" At t = {_times(self.jumps)} C_t or b jumps: velocities changed there as by an impulse."
+        now = (float(self.clock[self.a.T]), self.state)
+        return said + said_of_crossings(self.system, self.crossings, now, self.rank)
+
+    def _attempts(self) -> int:
+        """How many steps were tried so far."""
+        places = [common.N_ACCEPTED, common.N_REJECTED_ERROR, common.N_REJECTED_CONVERGENCE]
+        return int(self.work.counters[places].sum())
+
+    def _statistics(self, cpu: float) -> Statistics:
+        c = self.work.counters
+        return Statistics(
+            n_accepted=int(c[common.N_ACCEPTED]),
+            n_rejected_error=int(c[common.N_REJECTED_ERROR]),
+            n_rejected_convergence=int(c[common.N_REJECTED_CONVERGENCE]),
+            n_outer=int(c[common.N_OUTER]),
+            n_inner=int(c[common.N_INNER]),
+            n_evaluations=int(c[common.N_EVALUATIONS]),
+            n_partitions=int(c[common.N_PARTITIONS]),
+            n_factorizations=int(c[common.N_FACTORIZATIONS]),
+            n_jacobians=int(c[common.N_JACOBIANS]),
+            cpu_time=cpu,
+        )
+
+    def _outcome(self, code: int, t1: float, pace: "_Pace") -> tuple[Status, str]:
+        """Status and message for how the run ended."""
+        a, t = self.a, float(self.clock[self.a.T])
+        stopped = f"Stopped at t = {t:.10g}"
+        failure = int(self.clock[a.FAILURE_CODE])
+        if code == a.ALL_OUTPUT_DONE:
+            fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
+            said = self._said_of_events() + self._said_of_end()
+            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
+        if code == INTERRUPTED:
+            return Status.INTERRUPTED, ""
+        if code == a.MAX_STEPS_REACHED:
+            return (
+                Status.MAX_STEPS,
+                f"{stopped} after max_steps = {int(self.control[a.MAX_STEPS])} accepted steps. Raise max_steps, loosen "
+                "rtol and atol, or shorten t_span.",
+            )
+        if code == OUT_OF_TIME:
+            return (
+                Status.TIME_LIMIT,
+                f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
+            )
+        if code == STAGNATED:
+            return (
+                Status.STAGNATED,
+                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average, after steps of "
+                f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
+                "singular position or a stiff force near this time, or take another method; with max_steps the run "
+                "goes on up to that number of steps.",
+            )
+        if code == a.AT_JUMP:
+            return (
+                Status.RATE_JUMPS,
+                f"{stopped}: constraint_rate or nonholonomic_rate jumps there, and no impulse gives velocities that "
+                "the constraints allow beyond it. Correct the drives, or end t_span before.",
+            )
+        if code == a.ROWS_VIOLATED:
+            return Status.ROWS_CONTRADICT, self._contradiction()
+        if failure == common.NOT_FINITE:
+            return (
+                Status.NOT_FINITE,
+                f"{stopped}: {self._not_finite()}. The result holds what was computed before.",
+            )
+        if code == a.RANK_LOST or failure == common.SINGULAR:
+            rows = dependent_rows(self.system, t, self.state[: self.system.n_q])
+            return (
+                Status.RANK_LOST,
+                f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
+                "coordinates exists at this singular position, and no step led across: end t_span before, take another "
+                f"method, or change the geometry.{self._end_is_near(t1)}",
+            )
+        if failure == common.GAMMA_INACCURATE:
+            reached, required = self.work.notes[common.GAMMA_ACCURACY], self.work.notes[common.GAMMA_REQUIRED]
+            return (
+                Status.NOT_CONVERGED,
+                f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
+                f"and rtol asks for {required:.1g}. Give gamma, or loosen rtol.",
+            )
+        reason = _REASONS[failure]
+        if code == a.FIXED_STEP_FAILED:
+            return (
+                Status.NOT_CONVERGED,
+                f"{stopped}: with the fixed step_size = {self.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
+                "step_size, or leave it out for step-size control.",
+            )
+        return (
+            Status.STEP_TOO_SMALL,
+            f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
+            f"{self._near_singular(t1)}{self._near_massless()}Look for a discontinuity near this time, loosen rtol and "
+            "atol, or use coordinates of similar scale.",
+        )
+
+    def _contradiction(self) -> str:
+        """Which row that was left out is violated, and which rows it depended on."""
+        t, n, row = float(self.clock[self.a.T]), self.system.n_q, int(self.work.notes[common.CONTRADICTION])
+        words = in_words(self.system.rows(t, self.state[:n]), [row])
+        return (
+            f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
+            f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "
+            "they are independent but for the start: start from another position, or correct the constraints."
+        )
+
+    def _said_of_end(self) -> str:
+        """A warning, and the sentence, where the run ends with constraints that have lost rank."""
+        if not self.crossings and not (self.plan.watchful and self.work.notes[common.NEARLY_SINGULAR] == 1.0):
+            return ""
+        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
+        if ratio > LOST_AT_END:
+            return ""
+        said = (
+            f"the run ends where the constraints lose rank (the smallest singular value of the constraint Jacobian is "
+            f"{ratio:.1g} of the largest): they do not determine velocities and accelerations there. End t_span a "
+            "little before, or beyond"
+        )
+        warnings.warn(said, ConstraintWarning, stacklevel=4)
+        return f" {said[0].upper()}{said[1:]}."
+
+    def _end_is_near(self, t1: float) -> str:
+        """A sentence where the end of the run is what was not reached, else nothing."""
+        left = t1 - float(self.clock[self.a.T])
+        if left > NEXT_TO_END * (t1 - self.t0):
+            return ""
+        return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
+
+    def _near_singular(self, t1: float) -> str:
+        """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
+        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
+        if ratio > NEARLY_SINGULAR:
+            return ""
+        return (
+            f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
+            f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
+            f"method, or change the geometry.{self._end_is_near(t1)} "
+        )
+
+    def _near_massless(self) -> str:
+        """A sentence where some motion has next to no inertia at the last state, else nothing."""
+        t, q = float(self.clock[self.a.T]), self.state[: self.system.n_q]
+        ratio, words = least_inertia(self.system, t, q)
+        return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
+
+    def _check_again(
+        self, t: Array, table: Array, last: tuple[float, Array], status: Status, message: str
+    ) -> tuple[Status, str]:
+        """Status and message, unless a derivative is wrong where the run went."""
+        n = self.system.n_q
+        inner = np.arange(1, LATER_CHECKS + 1) * len(t) // (LATER_CHECKS + 1)
+        states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in np.unique(inner) if 0 < k < len(t)]
+        states.append((last[0], last[1][:n], last[1][n : 2 * n]))
+        for instant, q, v in states:
+            wrong = wrong_derivative(self.system, instant, q, v)
+            if wrong is not None:
+                return Status.WRONG_DERIVATIVE, f"At t = {instant:.10g} of the run {wrong} {message}"
+        return status, message
+
+    def _check_traces(self, states: Any, status: Status, message: str) -> tuple[Status, str]:
+        """Status and message, unless a callback gives other values than what was recorded of it."""
+        for traced in self.traced:
+            wrong = traced.wrong(self.system, states)
+            if wrong is not None:
+                return Status.WRONG_TRACE, f"In the run {wrong}. {message}"
+        return status, message
+
+    def _not_finite(self) -> str:
+        """Which callback returned a value that is not finite, and when, as far as it is known."""
+        kind, at = int(self.work.notes[common.FAULT_KIND]), float(self.work.notes[common.FAULT_TIME])
+        if kind >= 0:
+            name = self.functions._fields[kind]
+            return f"{name} of {self.system.name!r} returned a value that is not finite at t = {at:.10g}"
+        n, t = self.system.n_q, float(self.clock[self.a.T])
+        q, v = self.state[:n], self.state[n : 2 * n]
+        end = t + float(self.clock[self.a.H_FAILED])
+        for instant in (t, end):
+            found = not_finite(self.system, instant, q, v)
+            if found is not None:
+                return f"{found} at t = {instant:.10g}"
+        if self.plan.looks_within:
+            return (
+                "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "
+                "no derivatives at this state (a root of zero, a norm of zero velocity), or its argument is too large "
+                "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
+            )
+        return "the callbacks are finite at the start of the step, but not at a state within it"
+
+
+def _times(times: list[float]) -> str:
+    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")
+
+
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
+
+
+class _Pace:
+    """Lengths of the accepted steps, to see that a run does not get anywhere."""
+
+    def __init__(self, t0: float):
+        self.window_t, self.window_n = t0, 0
+        self.longest = self.mean = 0.0
+
+    def pass_by(self, h: Array) -> None:
+        """Note the lengths of accepted steps."""
+        self.longest = max(self.longest, float(h.max(initial=0.0)))
+        self.window_n += len(h)
+
+    def stagnates(self, t: float, t1: float) -> bool:
+        """Whether the run has come to a standstill, at time t."""
+        if self.window_n < STAGNATION_STEPS:
+            return False
+        self.mean = (t - self.window_t) / self.window_n
+        self.window_t, self.window_n = t, 0
+        return self.mean < STAGNATION_PACE * self.longest and t1 - t > STAGNATION_LEFT * self.mean
+
+
+_REASONS = {
+    common.DONE: "the error estimate stayed above the tolerances",
+    common.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    common.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
+    common.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
+    common.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
+    common.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
+}

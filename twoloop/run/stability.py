@@ -1,0 +1,127 @@
+"""Whether stability, not accuracy, limited the steps of an explicit run: a look at a few of its states when it is over.
+
+At each, the largest rate of the motion is found by power iteration: that of dF/dq and of dF/dv, F being the
+accelerations. A rate times the step is compared with what the method is stable to, for vibrations and for decay.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.data import common
+from twoloop.methods.plan import Plan
+
+Array = NDArray[np.float64]
+
+MOST = 8  # states that are kept; they lie about as far from one another
+LAST_STEPS = 8  # whose median is the step at a state
+ITERATIONS = 6
+START = 0.1  # share of all coordinates in the direction of each look
+DISPLACEMENT = 1e-6  # of the largest coordinate or velocity, for derivatives along a direction
+INNER_TOL = 1e-8  # of the positions; their error is squared
+ALIGNED = 0.9  # cosine from which on two directions are one
+MANY = 200  # accepted steps before the last look, from which on it is worth a sentence
+NEXT_TO = 0.45  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
+
+
+class Look(NamedTuple):
+    """A state of a run, the step h there, and what h times a rate of vibration or decay may be for stability."""
+
+    t: float
+    q: Array
+    v: Array
+    a: Array
+    h: float
+    vibration: float
+    decay: float
+
+
+class Looks:
+    """States of a run, kept as it goes on."""
+
+    def __init__(self, plan: Plan):
+        self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
+        self.last = np.zeros(0)  # lengths of the last steps
+        self.kept: list[Look] = []
+
+    def pass_by(self, steps: Array) -> None:
+        """Note the lengths of accepted steps."""
+        self.n_steps += steps.size
+        self.last = np.append(self.last, steps[-LAST_STEPS:])[-LAST_STEPS:]
+
+    def take(self, t: float, state: Array, n_q: int) -> None:
+        """Keep this state, that after the last steps; of many only every second, fourth, ..."""
+        if self.plan.stable_to is None or self.last.size < LAST_STEPS:
+            return
+        self.n_seen += 1
+        if self.n_seen % self.every != 0:
+            return
+        q, v, a = state[: 3 * n_q].reshape(3, n_q).copy()
+        limits = self.plan.stable_to(self.plan.memory)
+        self.kept.append(Look(t, q, v, a, float(np.median(self.last)), *limits))
+        if len(self.kept) > MOST:
+            self.kept = self.kept[1::2]
+            self.every *= 2
+
+
+def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
+    """A sentence where stability limited the steps, else nothing. What stands in the workspace is lost."""
+    if not looks.kept or looks.n_steps < MANY:
+        return ""
+    start = 0.3 + 0.1 * (np.arange(work.Q.size) % 7)
+    directions = [np.zeros_like(start), np.zeros_like(start)]
+    found = []
+    for look in looks.kept:
+        for direction in directions:  # that of the look before, in which no coordinate may have been lost for good
+            direction += START * start
+        try:
+            vibration, decay = _rates(kit, work, look, directions)
+        except Exception:  # of a callback at a displaced state, which is none of the run: there is nothing to say
+            return ""
+        found.append((look.h * vibration / look.vibration, look.h * decay / look.decay, vibration, decay, look.h))
+    by_vibration, by_decay, vibration, decay, h = np.median(found, axis=0)
+    if max(by_vibration, by_decay) < NEXT_TO:
+        return ""
+    what = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
+    return (
+        f" The problem looks stiff: steps of {h:.2g} s are about as long as they can be for {what} to remain stable. "
+        "If these need not be resolved, take method='auto', 'RadauIIA9', or 'TRBDF2' for few digits."
+    )
+
+
+def _rates(kit: Any, work: Any, look: Look, directions: list[Array]) -> tuple[float, float]:
+    """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
+    from twoloop.kernels.evaluation import calls
+
+    if kit.inner(kit, work, calls.RENEW, look.t, look.q, look.v, 0.0, work.x, work.lam) != common.DONE:
+        return 0.0, 0.0
+    squared, opposed_q = _largest(kit, work, look, directions[0], work.independent, False)
+    rate, opposed_v = _largest(kit, work, look, directions[1], work.independent_v, True)
+    vibration = np.sqrt(squared) if opposed_q else 0.0
+    return (vibration, rate) if opposed_v else (max(vibration, rate), 0.0)
+
+
+def _largest(
+    kit: Any, work: Any, look: Look, direction: Array, places: NDArray[np.int64], by_v: bool
+) -> tuple[float, bool]:
+    """The largest factor by which dF/dq or dF/dv makes a direction longer, and whether it turns it round."""
+    from twoloop.kernels.evaluation import calls
+
+    size = DISPLACEMENT * max(1.0, float(np.abs(look.v if by_v else look.q).max()))
+    factor, opposed = 0.0, False
+    a = np.zeros_like(look.a)
+    for _ in range(ITERATIONS):
+        Q, V = look.q.copy(), look.v.copy()
+        (V if by_v else Q)[places] += size * direction[places]
+        if kit.inner(kit, work, calls.EVALUATE, look.t, Q, V, INNER_TOL, a, work.lam) != common.DONE:
+            return 0.0, False
+        image = (a - look.a)[places]
+        longest = float(np.abs(image).max(initial=0.0))
+        if not 0.0 < longest < np.inf:
+            return 0.0, False
+        before = direction[places]
+        cosine = float(image @ before) / float(np.linalg.norm(image) * np.linalg.norm(before))
+        factor, opposed = longest / (size * float(np.abs(before).max())), cosine < -ALIGNED
+        direction[places] = image / longest
+    return factor, opposed

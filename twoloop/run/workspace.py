@@ -1,0 +1,69 @@
+"""What every use of the kernels needs of a system: its callbacks with flags, and a workspace."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import least_inertia
+from twoloop.kernels.algebra.banded import banded_pays
+from twoloop.kernels.algebra.lapack import addresses
+from twoloop.kernels.data import common
+from twoloop.kernels.evaluation.augmented import augmented_pays
+from twoloop.kernels.layout import make_work
+from twoloop.methods.plan import Plan
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
+SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
+
+
+def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None) -> common.Kit:
+    """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
+    from twoloop.kernels.evaluation.calls import inner_loop
+
+    flags = system.functions.flags.copy()
+    mass = system.mass(t0, q0)
+    if system.constant_mass:
+        flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+    definite = bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+    reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
+    flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
+    bandwidth = system.bandwidth if definite and system.n_a == 0 else None
+    if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
+        flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
+    flags[common.DENSE_FORM] = flags[common.FORM]
+    sparse = augmented_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
+    if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
+        flags[common.FORM] = common.AUGMENTED
+    functions = system.functions._replace(flags=flags)
+    if plan is None:
+        return common.Kit(functions, inner_loop)
+    flags[common.STRAIGHT] = plan.inner is not None
+    steps = (plan.step, plan.first, plan.second)
+    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, plan.own, plan.instead)
+
+
+def workspace(
+    system: ConstrainedSystem,
+    kit: common.Kit,
+    pattern: Array,
+    q0: Array,
+    rtol: float,
+    reuse: float,
+    ranks: tuple[int | None, int | None] = (None, None),
+) -> common.Work:
+    """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows."""
+    flags = kit.flags
+    reduced, augmented = flags[common.DENSE_FORM] == common.NULL_SPACE, flags[common.FORM] == common.AUGMENTED
+    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented))
+    work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
+    work.notes[common.GAMMA_SHARE] = 1.0
+    work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf
+    work.notes[common.ROUNDED] = ROUNDING * float(np.abs(q0).max())
+    work.notes[common.REUSE] = max(reuse, work.notes[common.ROUNDED])
+    work.pattern[:] = pattern
+    if flags[common.BANDWIDTH] >= 0:
+        work.lapack[:] = addresses()
+    return work

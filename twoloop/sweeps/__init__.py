@@ -1,0 +1,1 @@
+"""Many runs of one mechanism, in processes, with rows that are kept."""

@@ -1,0 +1,143 @@
+"""Tasks in processes of their own, each of which may die: the task that it was at says so, all others are done."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from twoloop.kernels.compile.caches import n_made
+
+RENEWED_AFTER = 150  # functions that a worker compiled or read: LLVM keeps some MB of each as long as the process lives
+LOOK_EVERY = 1.0  # s, at workers that say nothing: a process that one of them started may hold its connection open
+
+Task = Callable[[Any], Any]
+
+
+def in_processes(task: Task, inputs: dict[int, Any], n_workers: int) -> Iterator[tuple[int, Any, str]]:
+    """What a task makes of each input, as it comes.
+
+    Parameters
+    ----------
+    task : callable
+        task(input) -> what can be pickled; it raises nothing but KeyboardInterrupt.
+    inputs : dict
+        By their numbers.
+    n_workers : int
+
+    Yields
+    ------
+    (int, object, str)
+        The number of an input and what was made of it, or None and how the worker died.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the task raised one.
+    RuntimeError
+        If a worker dies before it can begin.
+    """
+    left = list(reversed(inputs.items()))
+    workers: list[_Worker] = []
+    try:
+        while left or workers:
+            while left and len(workers) < n_workers:
+                workers.append(_Worker(task, left.pop()))
+            wait([each.connection for each in workers], LOOK_EVERY)
+            for worker in list(workers):
+                for number, made in worker.answers():
+                    yield number, made, ""
+                if worker.number is not None and worker.dead:
+                    yield worker.number, None, worker.how_it_died()
+                if worker.number is None and left and not worker.worn and not worker.dead:
+                    worker.begin(left.pop())
+                elif worker.number is None or worker.dead:
+                    worker.end()
+                    workers.remove(worker)
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+class _Worker:
+    """A process, and the number of the input that it is at."""
+
+    def __init__(self, task: Task, first: tuple[int, Any]):
+        # not forked: a fork of a process with threads may stand still
+        context = multiprocessing.get_context("spawn")
+        self.connection, far = context.Pipe()
+        self.process = context.Process(target=_serve, args=(far, task))
+        self.process.start()
+        far.close()
+        self.began = self.worn = self.dead = False
+        self.begin(first)
+
+    def begin(self, entry: tuple[int, Any]) -> None:
+        """Hand it an input."""
+        self.number: int | None = entry[0]
+        try:
+            self.connection.send(entry[1])
+        except OSError:
+            self.dead = True
+
+    def answers(self) -> Iterator[tuple[int, Any]]:
+        """What it has made since; notes when it dies."""
+        try:
+            alive = self.process.is_alive()  # asked first: what a process said before it died counts
+            while self.connection.poll():
+                said = self.connection.recv()
+                if said == "ready":
+                    self.began = True
+                    continue
+                made, n_functions = said
+                if made is None:
+                    raise KeyboardInterrupt
+                assert self.number is not None
+                number, self.number, self.worn = self.number, None, n_functions >= RENEWED_AFTER
+                yield number, made
+            self.dead = self.dead or not alive
+        except (EOFError, OSError):
+            self.dead = True
+
+    def how_it_died(self) -> str:
+        """In words."""
+        self.process.join(10.0 * LOOK_EVERY)
+        code = self.process.exitcode
+        if code is not None and code < 0:
+            how = f"ended by signal {-code} ({signal.strsignal(-code)})"
+        else:
+            how = f"ended with exit code {code}"
+        if not self.began:
+            raise RuntimeError(
+                f"a worker process {how} before its first run, see what it says above. A script must start its sweep "
+                "under if __name__ == '__main__', and functions must stand in a module that another process can import"
+            )
+        return f"the worker process {how} in this run"
+
+    def end(self) -> None:
+        """End it, whatever it is doing."""
+        self.connection.close()
+        self.process.terminate()
+        self.process.join(LOOK_EVERY)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+
+
+def _serve(connection: Connection, task: Task) -> None:
+    """What a worker does: answer until nobody asks."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    before = n_made()
+    connection.send("ready")
+    while True:
+        try:
+            given = connection.recv()
+        except EOFError:
+            return
+        try:
+            made = task(given)
+        except KeyboardInterrupt:
+            made = None
+        connection.send((made, n_made() - before))
