@@ -5,7 +5,9 @@ from twoloop.kernels.compile.callbacks import callback
 from twoloop.methods.bdf import BDF
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.esdirk import ESDIRK
-from twoloop.methods.presets import Newmark, RungeKutta, paper_irk, paper_newmark
+from twoloop.methods.newmark import Newmark
+from twoloop.methods.presets import paper_irk, paper_newmark
+from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.joints import Joint

@@ -8,7 +8,8 @@ from twoloop.kernels.algebra.banded import factor_bordered, lu_band, solve_borde
 from twoloop.kernels.data import common
 from twoloop.kernels.layout import make_work
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
-from twoloop.methods.presets import Newmark, RungeKutta
+from twoloop.methods.newmark import Newmark
+from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import gauss, radau_iia
 from twoloop.run import workspace as workspace_module
 from twoloop.run.run import Run

@@ -202,7 +202,7 @@ class Interpolator:
         stiff = kind == names.VELOCITIES
         if stiff not in self.mending:
             from twoloop.methods.dop853 import DOP853
-            from twoloop.methods.presets import RungeKutta
+            from twoloop.methods.runge_kutta import RungeKutta
             from twoloop.methods.tableaux import radau_iia
 
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()

@@ -13,7 +13,7 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method
-from twoloop.methods.presets import RungeKutta
+from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
