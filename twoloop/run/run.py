@@ -15,7 +15,6 @@ from twoloop.checks.consistency import (
     dependent_rows,
     in_words,
     least_inertia,
-    not_finite,
     pattern_of,
 )
 from twoloop.checks.derivatives import wrong_derivative
@@ -24,10 +23,11 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common, intervals
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.crossings import said_of_crossings, singular_ratio
 from twoloop.run.dense import Interpolator
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
+from twoloop.run.messages import outcome
+from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.record import Record, Statistics, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
 from twoloop.run.stability import Looks, said_of_stiffness
@@ -46,18 +46,12 @@ LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked a
 PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
-STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
-STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
-STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
 # of the longest of the last steps: lengths tried for a step across a singular position, on which no stage should fall
 BRIDGES = tuple(0.85**k for k in range(28))
 CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
-NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
-NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
@@ -249,7 +243,7 @@ class Run:
         between_looks, next_look = self.chunk, self.chunk
         step_parts = [np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])]  # the first partition of a run is not a renewal
         filled = np.zeros(2, dtype=np.int64)
-        advance, pace, looks = direct(a.advance), _Pace(self.t0), Looks(self.plan)
+        advance, pace, looks = direct(a.advance), Pace(self.t0), Looks(self.plan)
         cpu = 0.0
         sample = Sample(self.t0, self.state[: 2 * system.n_q])
         code = INTERRUPTED if interrupts.asked else a.PAUSED
@@ -348,7 +342,7 @@ class Run:
         n = system.n_q
         try:
             if recorder.ended is None:
-                status, message = self._outcome(code, t1, pace)
+                status, message = outcome(self, code, t1, pace)
             if check_derivatives and code != INTERRUPTED:
                 last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
                 status, message = self._check_again(t, table, last, status, message)
@@ -489,14 +483,6 @@ class Run:
             clock[a.H_NEXT] = min(clock[a.H_NEXT], self._first_step(t1 - end, self.new_state))
         return True
 
-    def _said_of_events(self) -> str:
-        """What a run that succeeded has to say of jumps and of singular positions."""
-        said = ""
-        if self.jumps:
-            said = f" At t = {_times(self.jumps)} C_t or b jumps: velocities changed there as by an impulse."
-        now = (float(self.clock[self.a.T]), self.state)
-        return said + said_of_crossings(self.system, self.crossings, now, self.rank)
-
     def _attempts(self) -> int:
         """How many steps were tried so far."""
         places = [common.N_ACCEPTED, common.N_REJECTED_ERROR, common.N_REJECTED_CONVERGENCE]
@@ -516,127 +502,6 @@ class Run:
             n_jacobians=int(c[common.N_JACOBIANS]),
             cpu_time=cpu,
         )
-
-    def _outcome(self, code: int, t1: float, pace: "_Pace") -> tuple[Status, str]:
-        """Status and message for how the run ended."""
-        a, t = self.a, float(self.clock[self.a.T])
-        stopped = f"Stopped at t = {t:.10g}"
-        failure = int(self.clock[a.FAILURE_CODE])
-        if code == a.ALL_OUTPUT_DONE:
-            fixed = ", with a constant step: no error was estimated" if self.control[a.FIXED_STEP] > 0.0 else ""
-            said = self._said_of_events() + self._said_of_end()
-            return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
-        if code == INTERRUPTED:
-            return Status.INTERRUPTED, ""
-        if code == a.MAX_STEPS_REACHED:
-            return (
-                Status.MAX_STEPS,
-                f"{stopped} after max_steps = {int(self.control[a.MAX_STEPS])} accepted steps. Raise max_steps, loosen "
-                "rtol and atol, or shorten t_span.",
-            )
-        if code == OUT_OF_TIME:
-            return (
-                Status.TIME_LIMIT,
-                f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
-            )
-        if code == STAGNATED:
-            return (
-                Status.STAGNATED,
-                f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average, after steps of "
-                f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
-                "singular position or a stiff force near this time, or take another method; with max_steps the run "
-                "goes on up to that number of steps.",
-            )
-        if code == a.AT_JUMP:
-            return (
-                Status.RATE_JUMPS,
-                f"{stopped}: constraint_rate or nonholonomic_rate jumps there, and no impulse gives velocities that "
-                "the constraints allow beyond it. Correct the drives, or end t_span before.",
-            )
-        if code == a.ROWS_VIOLATED:
-            return Status.ROWS_CONTRADICT, self._contradiction()
-        if failure == common.NOT_FINITE:
-            return (
-                Status.NOT_FINITE,
-                f"{stopped}: {self._not_finite()}. The result holds what was computed before.",
-            )
-        if code == a.RANK_LOST or failure == common.SINGULAR:
-            rows = dependent_rows(self.system, t, self.state[: self.system.n_q])
-            return (
-                Status.RANK_LOST,
-                f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
-                "coordinates exists at this singular position, and no step led across: end t_span before, take another "
-                f"method, or change the geometry.{self._end_is_near(t1)}",
-            )
-        if failure == common.GAMMA_INACCURATE:
-            reached, required = self.work.notes[common.GAMMA_ACCURACY], self.work.notes[common.GAMMA_REQUIRED]
-            return (
-                Status.NOT_CONVERGED,
-                f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
-                f"and rtol asks for {required:.1g}. Give gamma, or loosen rtol.",
-            )
-        reason = _REASONS[failure]
-        if code == a.FIXED_STEP_FAILED:
-            return (
-                Status.NOT_CONVERGED,
-                f"{stopped}: with the fixed step_size = {self.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
-                "step_size, or leave it out for step-size control.",
-            )
-        return (
-            Status.STEP_TOO_SMALL,
-            f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-            f"{self._near_singular(t1)}{self._near_massless()}Look for a discontinuity near this time, loosen rtol and "
-            "atol, or use coordinates of similar scale.",
-        )
-
-    def _contradiction(self) -> str:
-        """Which row that was left out is violated, and which rows it depended on."""
-        t, n, row = float(self.clock[self.a.T]), self.system.n_q, int(self.work.notes[common.CONTRADICTION])
-        words = in_words(self.system.rows(t, self.state[:n]), [row])
-        return (
-            f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
-            f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "
-            "they are independent but for the start: start from another position, or correct the constraints."
-        )
-
-    def _said_of_end(self) -> str:
-        """A warning, and the sentence, where the run ends with constraints that have lost rank."""
-        if not self.crossings and not (self.plan.watchful and self.work.notes[common.NEARLY_SINGULAR] == 1.0):
-            return ""
-        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
-        if ratio > LOST_AT_END:
-            return ""
-        said = (
-            f"the run ends where the constraints lose rank (the smallest singular value of the constraint Jacobian is "
-            f"{ratio:.1g} of the largest): they do not determine velocities and accelerations there. End t_span a "
-            "little before, or beyond"
-        )
-        warnings.warn(said, ConstraintWarning, stacklevel=4)
-        return f" {said[0].upper()}{said[1:]}."
-
-    def _end_is_near(self, t1: float) -> str:
-        """A sentence where the end of the run is what was not reached, else nothing."""
-        left = t1 - float(self.clock[self.a.T])
-        if left > NEXT_TO_END * (t1 - self.t0):
-            return ""
-        return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
-
-    def _near_singular(self, t1: float) -> str:
-        """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
-        ratio = singular_ratio(self.system, float(self.clock[self.a.T]), self.state[: self.system.n_q], self.rank)
-        if ratio > NEARLY_SINGULAR:
-            return ""
-        return (
-            f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-            f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
-            f"method, or change the geometry.{self._end_is_near(t1)} "
-        )
-
-    def _near_massless(self) -> str:
-        """A sentence where some motion has next to no inertia at the last state, else nothing."""
-        t, q = float(self.clock[self.a.T]), self.state[: self.system.n_q]
-        ratio, words = least_inertia(self.system, t, q)
-        return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
     def _check_again(
         self, t: Array, table: Array, last: tuple[float, Array], status: Status, message: str
@@ -659,62 +524,3 @@ class Run:
             if wrong is not None:
                 return Status.WRONG_TRACE, f"In the run {wrong}. {message}"
         return status, message
-
-    def _not_finite(self) -> str:
-        """Which callback returned a value that is not finite, and when, as far as it is known."""
-        kind, at = int(self.work.notes[common.FAULT_KIND]), float(self.work.notes[common.FAULT_TIME])
-        if kind >= 0:
-            name = self.functions._fields[kind]
-            return f"{name} of {self.system.name!r} returned a value that is not finite at t = {at:.10g}"
-        n, t = self.system.n_q, float(self.clock[self.a.T])
-        q, v = self.state[:n], self.state[n : 2 * n]
-        end = t + float(self.clock[self.a.H_FAILED])
-        for instant in (t, end):
-            found = not_finite(self.system, instant, q, v)
-            if found is not None:
-                return f"{found} at t = {instant:.10g}"
-        if self.plan.looks_within:
-            return (
-                "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "
-                "no derivatives at this state (a root of zero, a norm of zero velocity), or its argument is too large "
-                "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
-            )
-        return "the callbacks are finite at the start of the step, but not at a state within it"
-
-
-def _times(times: list[float]) -> str:
-    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")
-
-
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
-
-
-class _Pace:
-    """Lengths of the accepted steps, to see that a run does not get anywhere."""
-
-    def __init__(self, t0: float):
-        self.window_t, self.window_n = t0, 0
-        self.longest = self.mean = 0.0
-
-    def pass_by(self, h: Array) -> None:
-        """Note the lengths of accepted steps."""
-        self.longest = max(self.longest, float(h.max(initial=0.0)))
-        self.window_n += len(h)
-
-    def stagnates(self, t: float, t1: float) -> bool:
-        """Whether the run has come to a standstill, at time t."""
-        if self.window_n < STAGNATION_STEPS:
-            return False
-        self.mean = (t - self.window_t) / self.window_n
-        self.window_t, self.window_n = t, 0
-        return self.mean < STAGNATION_PACE * self.longest and t1 - t > STAGNATION_LEFT * self.mean
-
-
-_REASONS = {
-    common.DONE: "the error estimate stayed above the tolerances",
-    common.OUTER_DIVERGED: "the outer loop (stages) did not converge",
-    common.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
-    common.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
-    common.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
-    common.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
-}

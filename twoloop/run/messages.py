@@ -1,0 +1,188 @@
+"""What is said of how a run ended: status and message, and what to try."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+from twoloop.checks.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite
+from twoloop.kernels.data import common
+from twoloop.run.crossings import said_of_crossings, singular_ratio
+from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
+from twoloop.run.record import Status
+
+if TYPE_CHECKING:
+    from twoloop.run.run import Run
+
+NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
+LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
+NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
+
+_REASONS = {
+    common.DONE: "the error estimate stayed above the tolerances",
+    common.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    common.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
+    common.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
+    common.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
+    common.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
+}
+
+
+def _said_of_events(run: "Run") -> str:
+    """What a run that succeeded has to say of jumps and of singular positions."""
+    said = ""
+    if run.jumps:
+        said = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse."
+    now = (float(run.clock[run.a.T]), run.state)
+    return said + said_of_crossings(run.system, run.crossings, now, run.rank)
+
+
+def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
+    """Status and message for how the run ended."""
+    a, t = run.a, float(run.clock[run.a.T])
+    stopped = f"Stopped at t = {t:.10g}"
+    failure = int(run.clock[a.FAILURE_CODE])
+    if code == a.ALL_OUTPUT_DONE:
+        fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
+        said = _said_of_events(run) + _said_of_end(run)
+        return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
+    if code == INTERRUPTED:
+        return Status.INTERRUPTED, ""
+    if code == a.MAX_STEPS_REACHED:
+        return (
+            Status.MAX_STEPS,
+            f"{stopped} after max_steps = {int(run.control[a.MAX_STEPS])} accepted steps. Raise max_steps, loosen "
+            "rtol and atol, or shorten t_span.",
+        )
+    if code == OUT_OF_TIME:
+        return (
+            Status.TIME_LIMIT,
+            f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
+        )
+    if code == STAGNATED:
+        return (
+            Status.STAGNATED,
+            f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average, after steps of "
+            f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
+            "singular position or a stiff force near this time, or take another method; with max_steps the run "
+            "goes on up to that number of steps.",
+        )
+    if code == a.AT_JUMP:
+        return (
+            Status.RATE_JUMPS,
+            f"{stopped}: constraint_rate or nonholonomic_rate jumps there, and no impulse gives velocities that "
+            "the constraints allow beyond it. Correct the drives, or end t_span before.",
+        )
+    if code == a.ROWS_VIOLATED:
+        return Status.ROWS_CONTRADICT, _contradiction(run)
+    if failure == common.NOT_FINITE:
+        return (
+            Status.NOT_FINITE,
+            f"{stopped}: {_not_finite(run)}. The result holds what was computed before.",
+        )
+    if code == a.RANK_LOST or failure == common.SINGULAR:
+        rows = dependent_rows(run.system, t, run.state[: run.system.n_q])
+        return (
+            Status.RANK_LOST,
+            f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
+            "coordinates exists at this singular position, and no step led across: end t_span before, take another "
+            f"method, or change the geometry.{_end_is_near(run, t1)}",
+        )
+    if failure == common.GAMMA_INACCURATE:
+        reached, required = run.work.notes[common.GAMMA_ACCURACY], run.work.notes[common.GAMMA_REQUIRED]
+        return (
+            Status.NOT_CONVERGED,
+            f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
+            f"and rtol asks for {required:.1g}. Give gamma, or loosen rtol.",
+        )
+    reason = _REASONS[failure]
+    if code == a.FIXED_STEP_FAILED:
+        return (
+            Status.NOT_CONVERGED,
+            f"{stopped}: with the fixed step_size = {run.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
+            "step_size, or leave it out for step-size control.",
+        )
+    return (
+        Status.STEP_TOO_SMALL,
+        f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
+        f"{_near_singular(run, t1)}{_near_massless(run)}Look for a discontinuity near this time, loosen rtol and "
+        "atol, or use coordinates of similar scale.",
+    )
+
+
+def _contradiction(run: "Run") -> str:
+    """Which row that was left out is violated, and which rows it depended on."""
+    t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[common.CONTRADICTION])
+    words = in_words(run.system.rows(t, run.state[:n]), [row])
+    return (
+        f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
+        f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "
+        "they are independent but for the start: start from another position, or correct the constraints."
+    )
+
+
+def _said_of_end(run: "Run") -> str:
+    """A warning, and the sentence, where the run ends with constraints that have lost rank."""
+    if not run.crossings and not (run.plan.watchful and run.work.notes[common.NEARLY_SINGULAR] == 1.0):
+        return ""
+    ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
+    if ratio > LOST_AT_END:
+        return ""
+    said = (
+        f"the run ends where the constraints lose rank (the smallest singular value of the constraint Jacobian is "
+        f"{ratio:.1g} of the largest): they do not determine velocities and accelerations there. End t_span a "
+        "little before, or beyond"
+    )
+    warnings.warn(said, ConstraintWarning, stacklevel=4)
+    return f" {said[0].upper()}{said[1:]}."
+
+
+def _end_is_near(run: "Run", t1: float) -> str:
+    """A sentence where the end of the run is what was not reached, else nothing."""
+    left = t1 - float(run.clock[run.a.T])
+    if left > NEXT_TO_END * (t1 - run.t0):
+        return ""
+    return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
+
+
+def _near_singular(run: "Run", t1: float) -> str:
+    """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
+    ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
+    if ratio > NEARLY_SINGULAR:
+        return ""
+    return (
+        f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
+        f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
+        f"method, or change the geometry.{_end_is_near(run, t1)} "
+    )
+
+
+def _near_massless(run: "Run") -> str:
+    """A sentence where some motion has next to no inertia at the last state, else nothing."""
+    t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
+    ratio, words = least_inertia(run.system, t, q)
+    return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
+
+
+def _not_finite(run: "Run") -> str:
+    """Which callback returned a value that is not finite, and when, as far as it is known."""
+    kind, at = int(run.work.notes[common.FAULT_KIND]), float(run.work.notes[common.FAULT_TIME])
+    if kind >= 0:
+        name = run.functions._fields[kind]
+        return f"{name} of {run.system.name!r} returned a value that is not finite at t = {at:.10g}"
+    n, t = run.system.n_q, float(run.clock[run.a.T])
+    q, v = run.state[:n], run.state[n : 2 * n]
+    end = t + float(run.clock[run.a.H_FAILED])
+    for instant in (t, end):
+        found = not_finite(run.system, instant, q, v)
+        if found is not None:
+            return f"{found} at t = {instant:.10g}"
+    if run.plan.looks_within:
+        return (
+            "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "
+            "no derivatives at this state (a root of zero, a norm of zero velocity), or its argument is too large "
+            "(exp, tanh). Take 'auto' or 'DOP853', which evaluate the functions only"
+        )
+    return "the callbacks are finite at the start of the step, but not at a state within it"
+
+
+def _times(times: list[float]) -> str:
+    return ", ".join(f"{t:.4g}" for t in times[:3]) + (", ..." if len(times) > 3 else "")

@@ -1,0 +1,32 @@
+"""The pace of a run: what it does not get anywhere by, and how it ends then."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
+STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
+STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
+STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
+
+
+class Pace:
+    """Lengths of the accepted steps, to see that a run does not get anywhere."""
+
+    def __init__(self, t0: float):
+        self.window_t, self.window_n = t0, 0
+        self.longest = self.mean = 0.0
+
+    def pass_by(self, h: Array) -> None:
+        """Note the lengths of accepted steps."""
+        self.longest = max(self.longest, float(h.max(initial=0.0)))
+        self.window_n += len(h)
+
+    def stagnates(self, t: float, t1: float) -> bool:
+        """Whether the run has come to a standstill, at time t."""
+        if self.window_n < STAGNATION_STEPS:
+            return False
+        self.mean = (t - self.window_t) / self.window_n
+        self.window_t, self.window_n = t, 0
+        return self.mean < STAGNATION_PACE * self.longest and t1 - t > STAGNATION_LEFT * self.mean
