@@ -4,9 +4,9 @@ import importlib
 import sys
 import traceback
 
-from studies import cli
-from studies.cli import REPORTS, ROOT
-from studies.index import STUDIES, put_in_readme
+from studies.bench import cli
+from studies.bench.cli import REPORTS, ROOT
+from studies.bench.index import STUDIES, put_in_readme
 
 USAGE = "usage: python -m studies [NAME | all | readme | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 

@@ -11,13 +11,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from references.ablation import VARIANTS, solve_variant
-from studies import figures
-from studies.bench import REPEATS, Case, Run, Solver
-from studies.cases import beam, four_bar
-from studies.cli import StudyError
-from studies.metrics import violations
-from studies.study import Series, Study, key
+from references.paper.ablation import VARIANTS, solve_variant
+from studies.bench import figures
+from studies.bench.cases import beam, four_bar
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Case, Run, Solver
+from studies.bench.metrics import violations
+from studies.bench.study import Series, Study, key
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 

@@ -19,10 +19,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from studies import cli
+from studies.bench import cli
+from studies.bench.cli import ROOT, StudyError
+from studies.bench.render import number, table
 from studies.bench_side import METHODS
-from studies.cli import ROOT, StudyError
-from studies.render import number, table
 
 SIDE = Path(__file__).with_name("bench_side.py")
 NAMES = ("compile", "evaluation", *(f"step of {method}" for method in METHODS), "sol")

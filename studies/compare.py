@@ -8,13 +8,13 @@ from typing import Any
 
 import pandas as pd
 
-from studies import cli, figures, tables
-from studies.bench import REPEATS, Case, Run, collect
-from studies.cli import StudyError
-from studies.reference_motion import ReferenceMotion, check_published, make_reference
-from studies.render import number, power, render, table
-from studies.solvers import CATALOGUE, COMPARED
-from studies.store import Output
+from studies.bench import cli, figures, tables
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Case, Run, collect
+from studies.bench.reference_motion import ReferenceMotion, check_published, make_reference
+from studies.bench.render import number, power, render, table
+from studies.bench.solvers import CATALOGUE, COMPARED
+from studies.bench.store import Output
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import pandas as pd
 
-from studies import figures, study, tables
-from studies.cli import StudyError
-from studies.render import TEMPLATES
-from studies.store import Output, plain
+from studies.bench import figures, study, tables
+from studies.bench.cli import StudyError
+from studies.bench.render import TEMPLATES
+from studies.bench.store import Output, plain
 
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")

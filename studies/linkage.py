@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import matplotlib.pyplot as plt
 import numpy as np
 
-from references.four_bar_minimal import MinimalFourBar
-from studies import figures, study
-from studies.cases.four_bar import SECOND
-from studies.store import Output
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench import figures, study
+from studies.bench.cases.four_bar import SECOND
+from studies.bench.store import Output
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
 

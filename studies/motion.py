@@ -11,16 +11,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies import figures
-from studies.bench import Run
-from studies.cases import four_bar
-from studies.cases.four_bar import Y3
-from studies.cli import StudyError
-from studies.metrics import deviation
-from studies.render import number
-from studies.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IDA_C, IRK, LINE_UP, NEWMARK, OWN_EXPLICIT, gear
-from studies.study import Series, Study, key
-from studies.tables import setting
+from studies.bench import figures
+from studies.bench.cases import four_bar
+from studies.bench.cases.four_bar import Y3
+from studies.bench.cli import StudyError
+from studies.bench.collector import Run
+from studies.bench.metrics import deviation
+from studies.bench.render import number
+from studies.bench.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IDA_C, IRK, LINE_UP, NEWMARK, OWN_EXPLICIT, gear
+from studies.bench.study import Series, Study, key
+from studies.bench.tables import setting
 from twoloop import Result
 
 Array = NDArray[np.float64]

@@ -10,15 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from references.ida import solve_ida
-from studies import figures
-from studies.bench import Case, Run, Solver
-from studies.cases import four_bar
-from studies.cases.four_bar import Y3
-from studies.cli import StudyError
-from studies.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
-from studies.study import Series, Study, key
-from studies.tables import setting
+from references.sundials.ida import solve_ida
+from studies.bench import figures
+from studies.bench.cases import four_bar
+from studies.bench.cases.four_bar import Y3
+from studies.bench.cli import StudyError
+from studies.bench.collector import Case, Run, Solver
+from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.bench.study import Series, Study, key
+from studies.bench.tables import setting
 from twoloop import Result
 
 Array = NDArray[np.floating]

@@ -8,14 +8,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies import figures, tables
-from studies.bench import REPEATS, Run
-from studies.cases import four_bar
-from studies.cli import StudyError
-from studies.metrics import CHECKED, violations
-from studies.render import number
-from studies.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, OWN_EXPLICIT, baumgarte, gear, paper_irk_at
-from studies.study import Series, Study, key
+from studies.bench import figures, tables
+from studies.bench.cases import four_bar
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Run
+from studies.bench.metrics import CHECKED, violations
+from studies.bench.render import number
+from studies.bench.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, OWN_EXPLICIT, baumgarte, gear, paper_irk_at
+from studies.bench.study import Series, Study, key
 from twoloop import Result
 
 Array = NDArray[np.floating]

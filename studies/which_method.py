@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from studies import index
-from studies.render import render
-from studies.takes import SUFFIX, takes
+from studies.bench import index
+from studies.bench.render import render
+from studies.bench.takes import SUFFIX, takes
 
 OURS = "two-loop"  # family of our solvers, in the findings of validation
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from studies.sharp_forces import families
-from studies.sharp_motion import Motion, case, drawn_from
+from studies.bench.sharp_forces import families
+from studies.bench.sharp_motion import Motion, case, drawn_from
 
 SEED = 24
 FAMILIES = tuple(families())

@@ -1,14 +1,14 @@
 """Random mechanisms under random sharp forces: a run is right, or it says that it is not.
 
 Right is what SciPy makes of the same motion in as few coordinates as it has freedoms, by the rule of
-`studies/sharp_motion.py`, kept in differential_motions.json. `studies.robustness` does the same at length.
+`studies/bench/sharp_motion.py`, kept in differential_motions.json. `studies.robustness` does the same at length.
 """
 
 import numpy as np
 import pytest
 
-from studies.sharp_forces import KIND, SIZE, A
-from studies.sharp_motion import RIGHT, SILENT, TIMES, judged, march, off, positions
+from studies.bench.sharp_forces import KIND, SIZE, A
+from studies.bench.sharp_motion import RIGHT, SILENT, TIMES, judged, march, off, positions
 from tests.differential_motions import FAMILIES, mechanism_of, read
 
 TIME_LIMIT = 20.0  # s

@@ -76,7 +76,9 @@ def test_the_folder_is_the_one_that_numba_writes_to():
 def test_compile_names_every_file(capsys):
     main(["compile"])
     lines = capsys.readouterr().out.splitlines()
-    names = {path.stem for path in Path(kernels.__file__).parent.glob("*.py")} - {"__init__"}
+    folder = Path(kernels.__file__).parent
+    files = {path.relative_to(folder).with_suffix("") for path in folder.rglob("*.py") if path.stem != "__init__"}
+    names = {".".join(path.parts) for path in files}
     assert {line.split()[3] for line in lines[:-1]} == names
     assert lines[-1].startswith("ready after")
 

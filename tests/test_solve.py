@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from references.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import trajectory
 from tests.problems import START, pendulum, pendulum_energy, pendulum_state, run, swing, violations, worst
 from twoloop import (
     ConstrainedSystem,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space
 
-from studies.energy_drift import drift, windows
+from studies.energy.drift import drift, windows
 from twoloop import BDF, DOP853, Newmark, RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.methods.tableaux import gauss

@@ -35,11 +35,12 @@ def info() -> None:
     print(f"twoloop {__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
     print(f"needed:   {', '.join(f'{package} {installed(package)}' for package in NEEDED)}")
     print(f"optional: {', '.join(f'{package} {installed(package)}' for package in OPTIONAL)}")
-    folder = folder_of(kernels)
+    rooms = (each.name for each in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}.") if each.ispkg)
+    folder, *others = (folder_of(package) for package in (kernels, *map(import_module, rooms)))
     if folder is None:
         print("cache:    none: no folder can be written; set NUMBA_CACHE_DIR to one that can, by you alone")
     else:
-        files = list(folder.glob("*.nbc"))
+        files = [file for each in (folder, *others) if each is not None for file in each.glob("*.nbc")]
         size = sum(file.stat().st_size for file in files)
         state = f"{len(files)} compiled functions, {size / 1e6:.1f} MB" if files else "empty: python -m twoloop compile"
         print(f"cache:    {folder} ({state})")
@@ -49,12 +50,13 @@ def info() -> None:
 
 def compile_all() -> None:
     """Compile every kernel, or read it from the cache, one line for each file."""
-    names = sorted(module.name for module in pkgutil.iter_modules(kernels.__path__))
+    prefix = f"{kernels.__name__}."
+    names = sorted(each.name for each in pkgutil.walk_packages(kernels.__path__, prefix) if not each.ispkg)
     began = time.perf_counter()
     for number, name in enumerate(names, 1):
-        print(f"{number:3d} of {len(names)}  {name:20s}", end="", flush=True)
+        print(f"{number:3d} of {len(names)}  {name.removeprefix(prefix):30s}", end="", flush=True)
         before = time.perf_counter()
-        import_module(f"{kernels.__name__}.{name}")
+        import_module(name)
         print(f"{time.perf_counter() - before:7.1f} s", flush=True)
     print(f"ready after {time.perf_counter() - began:.1f} s")
 

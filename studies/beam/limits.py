@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from studies.bench import Array, Case
-from studies.solvers import ERR_IN, PAPER_TOL
+from studies.bench.collector import Array, Case
+from studies.bench.solvers import ERR_IN, PAPER_TOL
 from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import Problem, ancf_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent

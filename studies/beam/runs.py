@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies.bench import REPEATS, Array, Case, Run, Solver
-from studies.cases import beam
-from studies.cases.beam import SOFT, STIFF
-from studies.metrics import ASTRAY, deviation
-from studies.solvers import (
+from studies.bench.cases import beam
+from studies.bench.cases.beam import SOFT, STIFF
+from studies.bench.collector import REPEATS, Array, Case, Run, Solver
+from studies.bench.metrics import ASTRAY, deviation
+from studies.bench.solvers import (
     CATALOGUE,
     IDA_C,
     IDA_C_ORDER_2,
@@ -66,7 +66,7 @@ def _differenced(case: Case, tol: float, repeat: int) -> Result:
 
 
 def _exudyn(case: Case, step: float, repeat: int) -> Result:
-    from references.exudyn_beam import solve_exudyn_beam
+    from references.exudyn.beam import solve_exudyn_beam
 
     n_steps = round(case.t_end / step)
     return solve_exudyn_beam(case.problem, case.t_end, n_steps, store_every=max(1, n_steps // INSTANTS))
@@ -106,7 +106,7 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
 @lru_cache
 def _exudyn_motion(kind: str, t_end: float) -> tuple[Array, float]:
     """Exudyn's own tip at the common instants in fine steps, and how far it is from that in half as many."""
-    from references.exudyn_beam import solve_exudyn_beam
+    from references.exudyn.beam import solve_exudyn_beam
 
     coarse, fine = (
         tip_height(solve_exudyn_beam(beam.MAKE[kind](), t_end, n, store_every=n // INSTANTS).q) for n in EXUDYN_FINE

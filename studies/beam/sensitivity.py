@@ -7,8 +7,8 @@ import numpy as np
 
 from studies.beam.limits import Row
 from studies.beam.runs import NEWTON
-from studies.bench import Array, Case
-from studies.cases.beam import SOFT, STIFF
+from studies.bench.cases.beam import SOFT, STIFF
+from studies.bench.collector import Array, Case
 from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam
 from twoloop.mechanisms.ancf_beam import tip_height

@@ -7,16 +7,16 @@ from typing import Any
 import pandas as pd
 
 import studies.beam as package
-from studies import figures, tables
-from studies import study as common
 from studies.beam.findings import TARGETS, findings_of
 from studies.beam.limits import along_rows, limit_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, by_tip, cases, measure, runs
 from studies.beam.sensitivity import CHANGES, sensitivity_rows
-from studies.bench import collect
-from studies.render import number, render, table
-from studies.solvers import IDA_C, IDA_C_ORDER_2, OWN_EXPLICIT, QUARTER
-from studies.store import Output
+from studies.bench import figures, tables
+from studies.bench import study as common
+from studies.bench.collector import collect
+from studies.bench.render import number, render, table
+from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, OWN_EXPLICIT, QUARTER
+from studies.bench.store import Output
 
 ERROR = "largest error of the tip's height over the run (m)"
 LISTED = (  # the CSV has all

@@ -8,14 +8,14 @@ from typing import Any
 
 import pandas as pd
 
-from studies import cli
+from studies.bench import cli
+from studies.bench.cli import Call, StudyError
+from studies.bench.index import write_index
+from studies.bench.render import render
+from studies.bench.store import Output
 from studies.claims import beam_judges, experiments, judges
 from studies.claims.rows import STUDIES, Rows, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
-from studies.cli import Call, StudyError
-from studies.index import write_index
-from studies.render import render
-from studies.store import Output
 
 ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())
 COLUMNS = ("section", "statement", "criterion", "fixed", "judge", "stand_in", "assumed")  # of a claim, for claims.csv

@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 
 from studies.beam.sensitivity import PARAMETERS
+from studies.bench.solvers import COMPILED, DEFAULT, IRK, OWN_EXPLICIT, PAPER_TOL
+from studies.bench.tables import time_for
 from studies.claims.rows import BEAM_END, BEAMS, Rows, cheapest
 from studies.claims.verdicts import Judgement, decide, span, span_known
-from studies.solvers import COMPILED, DEFAULT, IRK, OWN_EXPLICIT, PAPER_TOL
-from studies.table3_causes import FLAT
-from studies.tables import time_for
+from studies.table3.causes import FLAT
 
 FACTOR = 2.0  # within which a limit counts as the same
 GIVEN_UP = 0.1  # share of steps given up that counts as little

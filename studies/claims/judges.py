@@ -4,12 +4,8 @@ import numpy as np
 import pandas as pd
 
 from studies import ablation
-from studies.claims.beam_judges import FOLLOWS, TIPS
-from studies.claims.experiments import PASSES
-from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
-from studies.claims.verdicts import Judgement, decide, span, span_known
-from studies.metrics import ASTRAY, LOST
-from studies.solvers import (
+from studies.bench.metrics import ASTRAY, LOST
+from studies.bench.solvers import (
     ADAMS,
     GEAR_ORDERS,
     IDA_C,
@@ -22,7 +18,11 @@ from studies.solvers import (
     TAYLOR,
     gear,
 )
-from studies.table3_causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells
+from studies.claims.beam_judges import FOLLOWS, TIPS
+from studies.claims.experiments import PASSES
+from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
+from studies.claims.verdicts import Judgement, decide, span, span_known
+from studies.table3.causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells
 
 IRK_GROUP, NEWMARK_GROUP, GSTIFF_GROUP = "Table 3: IRK", "Table 3: Newmark", "GSTIFF stand-in"
 COARSEST, FINEST = TOLERANCES[0], TOLERANCES[-1]

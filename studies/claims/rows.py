@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies import tables
-from studies.cases.beam import SOFT, STIFF
-from studies.cli import StudyError
+from studies.bench import tables
+from studies.bench.cases.beam import SOFT, STIFF
+from studies.bench.cli import StudyError
 from twoloop.mechanisms import four_bar
 
 STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam", "ablation")

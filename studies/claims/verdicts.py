@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from studies.bench.render import number
 from studies.claims.rows import NotRun, Rows
-from studies.render import number
 
 FILE = Path(__file__).with_name("claims.toml")
 

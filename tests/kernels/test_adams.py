@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from references.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import trajectory
 from tests.problems import (
     force_residual,
     moving_pivot,

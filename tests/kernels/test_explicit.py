@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from references.four_bar_minimal import trajectory
-from references.index1 import solve_index1
+from references.paper.four_bar_minimal import trajectory
+from references.scipy.index1 import solve_index1
 from tests.problems import (
     force_residual,
     moving_pivot,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from references.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import trajectory
 from tests.problems import called, kit_of, worst
 from twoloop import RungeKutta, solve_dae
 from twoloop.kernels import advance

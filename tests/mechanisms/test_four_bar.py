@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from references.four_bar_minimal import MinimalFourBar
+from references.paper.four_bar_minimal import MinimalFourBar
 from tests.problems import one_angle, slope, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar

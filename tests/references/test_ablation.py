@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
-from references.ablation import FROZEN_ORDER, VARIANTS, solve_variant
-from references.four_bar_minimal import MinimalFourBar
-from references.paper_step import Step, advance, kkt, true_states
+from references.paper.ablation import FROZEN_ORDER, VARIANTS, solve_variant
+from references.paper.four_bar_minimal import MinimalFourBar
+from references.paper.paper_step import Step, advance, kkt, true_states
 from tests.problems import (
     moving_pivot,
     moving_pivot_state,

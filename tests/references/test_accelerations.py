@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from references.accelerations import Equations, accelerations, compiled_gamma, factor, saddle_solve
-from references.four_bar_minimal import MinimalFourBar
-from references.index1 import solve_index1
+from references.equations.accelerations import Equations, accelerations, compiled_gamma, factor, saddle_solve
+from references.paper.four_bar_minimal import MinimalFourBar
+from references.scipy.index1 import solve_index1
 from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import four_bar, governor, heavy_top, spatial_four_bar, spatial_slider_crank

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from references.beam_reduced import reduced_motion
+from references.scipy.beam_reduced import reduced_motion
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from references.accelerations import accelerations
-from references.gear import solve_gear
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import solve_index1
+from references.equations.accelerations import accelerations
+from references.paper.gear import solve_gear
+from references.scipy.index1 import solve_index1
+from references.sundials.ida import solve_ida
+from references.sundials.ida_c import solve_ida_c
 from tests.test_bounds import FAR, NO_TANGENT, Q, V, beyond, system
 
 ENTRIES = {

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from references.beam_reduced import reduced_motion
 from references.driver import TimeLimit
-from references.exudyn_beam import solve_exudyn_beam
-from references.exudyn_four_bar import SOLVERS, solve_exudyn
-from references.four_bar_minimal import trajectory
-from references.fully_implicit import solve_fully_implicit
-from references.gear import solve_gear
-from references.ida import FORMS, solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import METHODS, solve_index1
+from references.exudyn.beam import solve_exudyn_beam
+from references.exudyn.four_bar import SOLVERS, solve_exudyn
+from references.paper.four_bar_minimal import trajectory
+from references.paper.gear import solve_gear
+from references.scipy.beam_reduced import reduced_motion
+from references.scipy.fully_implicit import solve_fully_implicit
+from references.scipy.index1 import METHODS, solve_index1
+from references.sundials.ida import FORMS, solve_ida
+from references.sundials.ida_c import solve_ida_c
 from tests.problems import pendulum, worst
 from twoloop.mechanisms import four_bar, very_flexible_beam
 from twoloop.run.record import Status

@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from references import expressions
-from references.expressions import Expressions, NotSymbolic, functions_of
-from references.ode import ode_result
-from references.straight_line import Program, Value, program_of, straight_line
-from studies.validation import MAKE
+from references.equations import expressions
+from references.equations.expressions import Expressions, NotSymbolic, functions_of
+from references.equations.ode import ode_result
+from references.equations.straight_line import Program, Value, program_of, straight_line
+from studies.validation.study import MAKE
 from twoloop import ConstrainedSystem, Statistics
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import double_pendulum, four_bar, heavy_top, n_four_bar, very_flexible_beam

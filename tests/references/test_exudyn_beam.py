@@ -12,9 +12,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from references.exudyn_beam import MODELS, solve_exudyn_beam
-from references.exudyn_four_bar import SOLVERS, solve_exudyn
-from references.ida import solve_ida
+from references.exudyn.beam import MODELS, solve_exudyn_beam
+from references.exudyn.four_bar import SOLVERS, solve_exudyn
+from references.sundials.ida import solve_ida
 from twoloop.mechanisms import ancf_beam, four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height
 from twoloop.run.record import Status

@@ -5,9 +5,9 @@ import pytest
 
 pytest.importorskip("exudyn")
 
-from references.exudyn_mechanisms import MODELS, has_model, solve_exudyn_mechanism
-from references.exudyn_model import frame
-from studies import validation
+from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn_mechanism
+from references.exudyn.model import frame
+from studies.validation import study as validation
 from twoloop import mechanisms
 
 PROBLEMS = {problem.name: problem for problem in (make() for make in validation.MAKE)}

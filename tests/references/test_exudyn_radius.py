@@ -7,12 +7,12 @@ pytest.importorskip("exudyn")
 
 import exudyn as exu
 
-from references import exudyn_run
-from references.exudyn_four_bar import _model, _positions
-from references.exudyn_mechanisms import MODELS, solve_exudyn_mechanism
-from studies import validation
-from studies.bench import Case
-from studies.solvers import CATALOGUE, RADII, RIVALS
+from references.exudyn import run as exudyn_run
+from references.exudyn.four_bar import _model, _positions
+from references.exudyn.mechanisms import MODELS, solve_exudyn_mechanism
+from studies.bench.collector import Case
+from studies.bench.solvers import CATALOGUE, RADII, RIVALS
+from studies.validation import study as validation
 from twoloop.mechanisms import four_bar
 
 PROBLEMS = {problem.name: problem for problem in (make() for make in validation.MAKE)}

@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from references import casadi_integrators, cvode_c, diffrax_dopri8, fully_implicit, index1
-from references.casadi_integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
-from references.cvode import solve_cvode
-from references.cvode_c import solve_cvode_c
+from references.casadi import integrators as casadi_integrators
+from references.casadi.integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
+from references.diffrax import dopri8 as diffrax_dopri8
 from references.driver import TimeLimit, user_call
-from references.four_bar_minimal import trajectory
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import solve_index1
-from studies.bench import Case, Run, attempt
-from studies.solvers import CATALOGUE, RIVALS
-from studies.validation import MAKE
+from references.paper.four_bar_minimal import trajectory
+from references.scipy import fully_implicit, index1
+from references.scipy.index1 import solve_index1
+from references.sundials import cvode_c
+from references.sundials.cvode import solve_cvode
+from references.sundials.cvode_c import solve_cvode_c
+from references.sundials.ida import solve_ida
+from references.sundials.ida_c import solve_ida_c
+from studies.bench.collector import Case, Run, attempt
+from studies.bench.solvers import CATALOGUE, RIVALS
+from studies.validation.study import MAKE
 from tests.problems import pendulum
 from twoloop.mechanisms import four_bar, projection_pendulum
 from twoloop.run.record import Status

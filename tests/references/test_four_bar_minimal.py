@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from references import four_bar_minimal
-from references.four_bar_minimal import MinimalFourBar, trajectory
+from references.paper import four_bar_minimal
+from references.paper.four_bar_minimal import MinimalFourBar, trajectory
 from twoloop.mechanisms import four_bar
 
 PROBLEMS = [four_bar(), four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0), four_bar((1.0, 1.2, 0.5), 1.0, math.pi, 1)]

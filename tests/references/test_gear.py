@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numba import njit
 
-from references import gear
-from references.accelerations import accelerations
-from references.four_bar_minimal import MinimalFourBar
-from references.gear import HIGHEST, STARTS, _formulas, solve_gear
+from references.equations.accelerations import accelerations
+from references.paper import gear
+from references.paper.four_bar_minimal import MinimalFourBar
+from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
 from tests.problems import (
     force_residual,
     moving_pivot,

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from references.four_bar_minimal import MinimalFourBar
-from references.ida import FORMS, solve_ida
+from references.paper.four_bar_minimal import MinimalFourBar
+from references.sundials.ida import FORMS, solve_ida
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.ida_options import ERROR_TESTS, SETTINGS
-from references.index1 import solve_index1
+from references.scipy.index1 import solve_index1
+from references.sundials.ida import solve_ida
+from references.sundials.ida_c import solve_ida_c
+from references.sundials.ida_options import ERROR_TESTS, SETTINGS
 from tests.problems import without_tangent
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import tip_height
@@ -20,7 +20,7 @@ CASES = {
 FOUR_BAR = four_bar()
 ORDER_2 = {"max_order": 2, "error_test": "positions"}
 
-# m, the tip's height at 0.1, 0.2 ... 2 s, by DOP853 on the index-1 equations (references.index1) with rtol = atol =
+# m, the tip's height at 0.1, 0.2 ... 2 s, by DOP853 on the index-1 equations (index1.py) with rtol = atol =
 # 3e-14. From 1e-12 to 3e-14 they change by less than 1e-13 m up to 1 s and 5e-11 m up to 2 s ("flexible"), and by less
 # than 1e-13 m ("stiff")
 TIPS = {

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from numba import njit
 
-from references import ida_c, sundials
-from references.four_bar_minimal import trajectory
-from references.ida import solve_ida
-from references.ida_c import OUTPUTS, solve_ida_c
-from references.ida_compiled import iteration_matrix_at, residual_at
+from references.paper.four_bar_minimal import trajectory
+from references.sundials import ida_c
+from references.sundials import library as sundials
+from references.sundials.ida import solve_ida
+from references.sundials.ida_c import OUTPUTS, solve_ida_c
+from references.sundials.ida_compiled import iteration_matrix_at, residual_at
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status

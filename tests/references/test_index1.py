@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from references.four_bar_minimal import MinimalFourBar
-from references.index1 import METHODS, ONE_STEP, STABILISATIONS, solve_index1
+from references.paper.four_bar_minimal import MinimalFourBar
+from references.scipy.index1 import METHODS, ONE_STEP, STABILISATIONS, solve_index1
 from tests.problems import (
     force_residual,
     moving_pivot,

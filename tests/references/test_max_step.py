@@ -2,11 +2,11 @@
 
 import pytest
 
-from references.cvode_c import solve_cvode_c
-from references.heyoka_taylor import solve_heyoka
-from references.ida import solve_ida
-from references.ida_c import solve_ida_c
-from references.index1 import METHODS, solve_index1
+from references.heyoka.taylor import solve_heyoka
+from references.scipy.index1 import METHODS, solve_index1
+from references.sundials.cvode_c import solve_cvode_c
+from references.sundials.ida import solve_ida
+from references.sundials.ida_c import solve_ida_c
 from twoloop.mechanisms import projection_pendulum
 
 T_END, MAX_STEP = 0.2, 1e-3

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from references import minimal_solvers
-from references.four_bar_minimal import MinimalFourBar
-from references.minimal import NoMinimalCoordinates, minimal
-from studies.cases.four_bar import SECOND
+from references.minimal import solvers as minimal_solvers
+from references.minimal.equations import NoMinimalCoordinates, minimal
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench.cases.four_bar import SECOND
 from twoloop import mechanisms
 
 MAKE = {

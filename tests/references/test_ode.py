@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from references.ode import ode_result
+from references.equations.ode import ode_result
 from twoloop import mechanisms, solve_dae
 from twoloop.run.record import Statistics
 

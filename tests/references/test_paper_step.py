@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from references.paper_step import Step, advance, independents, true_states
+from references.paper.paper_step import Step, advance, independents, true_states
 from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.methods.tableaux import sun_radau_iib

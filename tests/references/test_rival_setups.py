@@ -6,17 +6,17 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from references import cvode_c
-from references.casadi_integrators import solve_cvodes, solve_idas
-from references.cvode_c import solve_cvode_c
-from references.cvode_projection import projection_for_cvode
-from references.duals import Dual, functions_on_duals
-from references.expressions import FUNCTIONS, functions_of
-from references.ida_c import solve_ida_c
-from references.ida_options import NOT_TESTED, tolerances
-from references.straight_line import straight_line, straight_line_jacobian
-from studies.figures import STYLES
-from studies.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
+from references.casadi.integrators import solve_cvodes, solve_idas
+from references.equations.duals import Dual, functions_on_duals
+from references.equations.expressions import FUNCTIONS, functions_of
+from references.equations.straight_line import straight_line, straight_line_jacobian
+from references.sundials import cvode_c
+from references.sundials.cvode_c import solve_cvode_c
+from references.sundials.cvode_projection import projection_for_cvode
+from references.sundials.ida_c import solve_ida_c
+from references.sundials.ida_options import NOT_TESTED, tolerances
+from studies.bench.figures import STYLES
+from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
 from twoloop import ConstrainedSystem, callback
 from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
 
@@ -169,7 +169,7 @@ def test_cvode_keeps_the_constraints_that_it_projects_onto():
 
 
 def test_the_projection_is_the_shortest_one_and_projects_the_error():
-    sundials = pytest.importorskip("references.sundials")
+    sundials = pytest.importorskip("references.sundials.library")
     pytest.importorskip("sksundae")
     rng, t, f = np.random.default_rng(2), 0.3, DRIVEN.functions
     projection, size = projection_for_cvode(*f[2:5], 3, 2, 1)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from references.casadi_integrators import solve_collocation, solve_idas
-from references.cvode import solve_cvode
-from references.cvode_c import solve_cvode_c
-from references.diffrax_dopri8 import solve_diffrax
-from references.heyoka_taylor import solve_heyoka
-from references.index1 import solve_index1
+from references.casadi.integrators import solve_collocation, solve_idas
+from references.diffrax.dopri8 import solve_diffrax
+from references.heyoka.taylor import solve_heyoka
+from references.scipy.index1 import solve_index1
+from references.sundials.cvode import solve_cvode
+from references.sundials.cvode_c import solve_cvode_c
 from twoloop import ConstrainedSystem, callback
 from twoloop.mechanisms import four_bar, rolling_disc
 from twoloop.run.record import Status

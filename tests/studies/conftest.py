@@ -5,7 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from studies import ablation, energy, figures, motion, step_size, store, violation
+from studies import ablation, motion, step_size, violation
+from studies.bench import figures, store
+from studies.energy import study as energy
 
 
 @pytest.fixture(autouse=True)

@@ -24,10 +24,10 @@ from studies.ablation import (
     findings_of,
     verdict,
 )
-from studies.bench import attempt
-from studies.cli import Call, StudyError
-from studies.render import render
-from studies.store import Output
+from studies.bench.cli import Call, StudyError
+from studies.bench.collector import attempt
+from studies.bench.render import render
+from studies.bench.store import Output
 
 FACTORS = {PAPER: (1.0, 3.0, 1.8), FROZEN: (9.0, 9.0, 9.0), PROJECTED: (1.1, 1.2, 1.0)}
 FACTORS |= {STABILISED: (2.0, 2.1, 2.2), UNPROJECTED: (1.05, 1.1, 0.9)}

@@ -3,8 +3,10 @@
 import pandas as pd
 import pytest
 
-from studies import headline, index, rivals, tables, work_precision
-from studies.render import render
+from studies.bench import headline, index, tables
+from studies.bench.render import render
+from studies.work_precision import rivals
+from studies.work_precision import study as work_precision
 from tests.studies.test_index import case, energy
 from tests.studies.test_tables import rows
 

@@ -7,19 +7,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import beam, index
+from studies import beam
 from studies.beam import runs as beam_runs
 from studies.beam import study
 from studies.beam.findings import TARGETS, findings_of
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI, STOPPED_AT, frequencies, gauss_seidel_limit, jacobi_limit
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, cases, measure, runs
 from studies.beam.sensitivity import CHANGES, MESH, START
-from studies.bench import Run, attempt
-from studies.cases import load
-from studies.cases.beam import MAKE, SOFT, STIFF
-from studies.cli import Call, StudyError
-from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
-from studies.store import Output
+from studies.bench import index
+from studies.bench.cases import load
+from studies.bench.cases.beam import MAKE, SOFT, STIFF
+from studies.bench.cli import Call, StudyError
+from studies.bench.collector import Run, attempt
+from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
+from studies.bench.store import Output
 from twoloop import solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from references.driver import user_call
-from studies import bench
-from studies.bench import Case, NotApplicable, Run, Solver, collect
-from studies.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
-from studies.solvers import CATALOGUE
-from studies.store import KeptRows
+from studies.bench import collector as bench
+from studies.bench.collector import Case, NotApplicable, Run, Solver, collect
+from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
+from studies.bench.solvers import CATALOGUE
+from studies.bench.store import KeptRows
 from tests.problems import pendulum, pendulum_energy, pendulum_state, worst
 from twoloop import Status, solve_dae
 from twoloop.mechanisms import Problem

@@ -5,9 +5,9 @@ import subprocess
 import pytest
 
 from studies import bench_commits
+from studies.bench.cli import ROOT, StudyError
 from studies.bench_commits import compared, measure, work_tree
 from studies.bench_side import Instructions, benchmarks
-from studies.cli import ROOT, StudyError
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 

@@ -9,11 +9,11 @@ import pytest
 from studies import ablation as study
 from studies import claims
 from studies.beam.sensitivity import PARAMETERS
+from studies.bench.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, QUARTER, gear
 from studies.claims import beam_judges, experiments, judge_of, judged, judges
 from studies.claims.rows import STUDIES, Rows, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
-from studies.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, QUARTER, gear
-from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
+from studies.table3.causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from twoloop.mechanisms import four_bar
 
 CLAIMS = load()

@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies.bench.render import render
+from studies.bench.solvers import NEWMARK, QUARTER
 from studies.claims import experiments, findings_of, judge_of
 from studies.claims.rows import BEAMS, NotRun, Rows
 from studies.claims.verdicts import Judgement, Verdict, load, span_known
-from studies.render import render
-from studies.solvers import NEWMARK, QUARTER
 from twoloop import Result, paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
 

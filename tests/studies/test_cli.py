@@ -2,8 +2,8 @@
 
 import pytest
 
-from studies import cli
-from studies.cli import REPORTS, StudyError
+from studies.bench import cli
+from studies.bench.cli import REPORTS, StudyError
 
 
 def test_options_have_their_defaults(tmp_path):

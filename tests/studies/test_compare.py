@@ -6,9 +6,9 @@ import pandas as pd
 import pytest
 
 from studies import compare
-from studies.bench import Case
-from studies.cli import ROOT, StudyError
-from studies.render import render
+from studies.bench.cli import ROOT, StudyError
+from studies.bench.collector import Case
+from studies.bench.render import render
 from tests.problems import pendulum, pendulum_state
 from twoloop.mechanisms import Problem
 

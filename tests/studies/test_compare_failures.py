@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import compare, metrics, reference_motion
-from studies.bench import Case, Run, called_from
-from studies.solvers import CATALOGUE
+from studies import compare
+from studies.bench import metrics, reference_motion
+from studies.bench.collector import Case, Run, called_from
+from studies.bench.solvers import CATALOGUE
 
 MECHANISMS = """
 import dataclasses

@@ -15,8 +15,9 @@ from io import StringIO
 import pandas as pd
 import pytest
 
-from studies import compare_page, figures
-from studies.cli import REPORTS, StudyError
+from studies import compare_page
+from studies.bench import figures
+from studies.bench.cli import REPORTS, StudyError
 
 STAMP = "# full work_precision; `made up`"
 RUNS = [  # case, end, solver, family, called from, tolerance, repetition, CPU, status, message, evaluations, errors

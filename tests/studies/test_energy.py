@@ -7,12 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import energy
-from studies.bench import attempt
-from studies.cli import Call
-from studies.energy import pick
-from studies.energy_drift import DRIFTS, IRREGULAR, IS_LOST, NO_DRIFT, ROUNDS, SLOWLY, drift, verdict, windows
-from studies.energy_runs import (
+from studies.bench.cli import Call
+from studies.bench.collector import attempt
+from studies.bench.render import render
+from studies.bench.solvers import CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.bench.store import Output
+from studies.energy import study as energy
+from studies.energy.drift import DRIFTS, IRREGULAR, IS_LOST, NO_DRIFT, ROUNDS, SLOWLY, drift, verdict, windows
+from studies.energy.runs import (
     BASIC,
     EVEN,
     GAUSS,
@@ -33,9 +35,7 @@ from studies.energy_runs import (
     measure,
     runs,
 )
-from studies.render import render
-from studies.solvers import CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
-from studies.store import Output
+from studies.energy.study import pick
 
 RIVALS = (HEYOKA, CVODE_C, IDAS, DIFFRAX)
 PERIOD = 2.2489859198

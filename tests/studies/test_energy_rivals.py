@@ -2,11 +2,11 @@
 
 import pytest
 
-from references.casadi_integrators import solve_idas
-from studies.bench import attempt
-from studies.energy_runs import ADAPTERS, NOT_QUICK, OTHERS, QUICK, SWITCHING, case_of, measure, runs
-from studies.figures import STYLES
-from studies.solvers import CVODE_C, DIFFRAX, HEYOKA, IDAS
+from references.casadi.integrators import solve_idas
+from studies.bench.collector import attempt
+from studies.bench.figures import STYLES
+from studies.bench.solvers import CVODE_C, DIFFRAX, HEYOKA, IDAS
+from studies.energy.runs import ADAPTERS, NOT_QUICK, OTHERS, QUICK, SWITCHING, case_of, measure, runs
 
 PACKAGES = {HEYOKA: "heyoka", CVODE_C: "sksundae", IDAS: "casadi", DIFFRAX: "diffrax"}
 

@@ -8,10 +8,16 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.colors import to_hex
 
-from studies import energy, figures, honesty, honesty_picture, motion, rivals, step_size, table3, violation
+from studies import motion, step_size, violation
+from studies.bench import figures
+from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, IRK_LINE, NEWMARK, gear
+from studies.bench.study import key
+from studies.energy import study as energy
+from studies.honesty import picture as honesty_picture
+from studies.honesty import study as honesty
 from studies.motion import GRIDS
-from studies.solvers import CATALOGUE, GEAR_ORDERS, IRK, IRK_LINE, NEWMARK, gear
-from studies.study import key
+from studies.table3 import study as table3
+from studies.work_precision import rivals
 
 NEW = (  # of rivals that no table of styles knows, as a study may bring them
     *("IDA from C, q and v tested", "CVODE from C, BDF, projected", "CVODES, CasADi", "heyoka, minimal coordinates"),

@@ -8,8 +8,8 @@ import pytest
 
 from references import driver
 from references.driver import user_call
-from studies import first_calls
-from studies.solvers import CATALOGUE
+from studies.bench.solvers import CATALOGUE
+from studies.work_precision import first_calls
 
 
 def rows(*lines):

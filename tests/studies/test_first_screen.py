@@ -9,11 +9,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import first_calls, headline, honesty, index, rivals, table3, tables, work_precision
-from studies.bench import Case
-from studies.render import number, render
-from studies.takes import takes
-from studies.traps import FORCE
+from studies.bench import headline, index, tables
+from studies.bench.collector import Case
+from studies.bench.render import number, render
+from studies.bench.takes import takes
+from studies.honesty import study as honesty
+from studies.honesty.traps import FORCE
+from studies.table3 import study as table3
+from studies.work_precision import first_calls, rivals
+from studies.work_precision import study as work_precision
 from tests.studies.test_index import energy
 from tests.studies.test_table3 import found_of
 from tests.studies.test_table3 import rows as rows_of_table3

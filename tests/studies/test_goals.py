@@ -3,8 +3,9 @@
 import pandas as pd
 import pytest
 
-from studies import behind, goals, rivals, tables
-from studies.bench import Case
+from studies.bench import tables
+from studies.bench.collector import Case
+from studies.work_precision import behind, goals, rivals
 from tests.studies.test_rivals import Kept, compared, rows
 
 

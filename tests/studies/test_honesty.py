@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import honesty, honesty_solvers
-from studies.honesty_solvers import IDA_C, LIMITED, own, solvers, why_not
-from studies.render import render
-from studies.traps import (
+from studies.bench.render import render
+from studies.honesty import solvers as honesty_solvers
+from studies.honesty import study as honesty
+from studies.honesty.solvers import IDA_C, LIMITED, own, solvers, why_not
+from studies.honesty.traps import (
     FORCE,
     GROWN,
     HELD_OUT,

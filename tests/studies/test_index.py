@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from studies import __main__ as command
-from studies import index
-from studies.cli import StudyError
+from studies.bench import index
+from studies.bench.cli import StudyError
 
 
 def test_the_list_names_every_study_with_its_first_line(monkeypatch, capsys):

@@ -4,12 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from references.four_bar_minimal import MinimalFourBar
-from references.many_at_once import by_diffrax, by_heyoka
-from studies import many_runs
-from studies.many_runs import DIFFRAX, HEYOKA, SINGLE, SWEEP, TOLERANCES
-from studies.render import render
-from studies.sweep_linkages import drawn, linkage
+from references.equations.many_at_once import by_diffrax, by_heyoka
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench.render import render
+from studies.sweep_linkages import many_runs
+from studies.sweep_linkages.many_runs import DIFFRAX, HEYOKA, SINGLE, SWEEP, TOLERANCES
+from studies.sweep_linkages.study import drawn, linkage
 from tests.studies.test_sweep_linkages import made_up  # type: ignore[import-not-found, unused-ignore]
 from twoloop.mechanisms import double_pendulum
 
@@ -56,7 +56,7 @@ def rows(error=lambda way, tol: tol, **seconds):
 
 
 def said(times, **more):
-    from studies import sweep_linkages as study
+    from studies.sweep_linkages import study
 
     found = study.findings_of(pd.concat([made_up(), rows(**times, **more)], ignore_index=True))
     return render("sweep_linkages", found, {"scaling": "", "many": ""}, stamp="stamp", quick=False)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies import metrics
-from studies.reference_motion import ReferenceMotion
+from studies.bench import metrics
+from studies.bench.reference_motion import ReferenceMotion
 from tests.problems import pendulum, pendulum_energy, pendulum_state
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem

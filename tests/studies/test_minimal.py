@@ -3,10 +3,11 @@
 import pandas as pd
 import pytest
 
-from studies import minimal, rivals, work_precision
-from studies.bench import Run
-from studies.end_states import case_of
-from studies.solvers import CATALOGUE, MINIMAL, MINIMAL_FAMILY, OWN, RIVALS
+from studies.bench.collector import Run
+from studies.bench.end_states import case_of
+from studies.bench.solvers import CATALOGUE, MINIMAL, MINIMAL_FAMILY, OWN, RIVALS
+from studies.work_precision import minimal, rivals
+from studies.work_precision import study as work_precision
 from tests.studies.test_rivals import stated
 from tests.studies.test_tables import rows
 from twoloop import mechanisms

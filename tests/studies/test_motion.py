@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 
 from studies import motion
-from studies.cli import Call
+from studies.bench.cli import Call
+from studies.bench.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
+from studies.bench.store import Output
+from studies.bench.study import key
 from studies.motion import GRIDS, VISIBLE, find
-from studies.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
-from studies.store import Output
-from studies.study import key
 
 
 def rows():

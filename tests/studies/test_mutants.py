@@ -6,10 +6,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from studies import mutants
-from studies.cli import ROOT
-from studies.mutants import Mutant, mutants_of
-from studies.render import render
+from studies.bench.cli import ROOT
+from studies.bench.render import render
+from studies.planted_errors import mutants
+from studies.planted_errors.mutants import Mutant, mutants_of
 
 SOURCE = """
 NUMBER = 3

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from studies import planted_errors
-from studies.faults import TRACING, Fault, all_faults, pendulum_in_python, python_copy
-from studies.render import render
+from studies.bench.render import render
+from studies.planted_errors import study as planted_errors
+from studies.planted_errors.faults import TRACING, Fault, all_faults, pendulum_in_python, python_copy
 from twoloop import mechanisms
 
 FAULTS = {fault.name: fault for fault in all_faults()}

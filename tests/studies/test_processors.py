@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import processors, rivals
-from studies.cli import StudyError
+from studies.bench.cli import StudyError
+from studies.work_precision import processors, rivals
 
 
 def rows(processor, ours, theirs):

@@ -4,8 +4,8 @@ import jinja2
 import numpy as np
 import pytest
 
-from studies import render
-from studies.render import listed, number, percent, power, table
+from studies.bench import render
+from studies.bench.render import listed, number, percent, power, table
 
 
 @pytest.mark.parametrize(

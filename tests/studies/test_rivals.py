@@ -6,10 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from references.straight_line import program_of
-from studies import behind, goals, limit, rivals, scaling, tables, work_precision
-from studies.render import number, render
-from studies.solvers import CATALOGUE, OWN, RIVALS
+from references.equations.straight_line import program_of
+from studies.bench import tables
+from studies.bench.render import number, render
+from studies.bench.solvers import CATALOGUE, OWN, RIVALS
+from studies.work_precision import behind, goals, limit, rivals, scaling
+from studies.work_precision import study as work_precision
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from references.four_bar_minimal import MinimalFourBar
-from studies import robustness
-from studies.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, end_of_scaled, four_lengths, scaled
-from studies.render import render
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, end_of_scaled, four_lengths, scaled
+from studies.bench.render import render
+from studies.robustness import study as robustness
 from twoloop.mechanisms import four_bar
 
 

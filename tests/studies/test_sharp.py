@@ -4,10 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import robustness, sharp_runs
-from studies.sharp_forces import DRIVE_A, SIZE, T_END, families, force_along, made
-from studies.sharp_mechanisms import bars, chain, row, slider_crank, slider_in_space
-from studies.sharp_motion import LOOSENESS, RIGHT, SAID, SILENT, Motion, allowed, judged, march, off, positions
+from studies.bench.sharp_forces import DRIVE_A, SIZE, T_END, families, force_along, made
+from studies.bench.sharp_mechanisms import bars, chain, row, slider_crank, slider_in_space
+from studies.bench.sharp_motion import LOOSENESS, RIGHT, SAID, SILENT, Motion, allowed, judged, march, off, positions
+from studies.robustness import sharp_runs
+from studies.robustness import study as robustness
 from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 FORCE = made("gust", 3, (5.0, 0.1, 0.4), windows=((0.0, 1.1),))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from references.four_bar_minimal import trajectory
-from studies.bench import Case
-from studies.metrics import violations
-from studies.solvers import CATALOGUE, EXUDYN, IRK, LINE_UP, TOLERANCES, baumgarte, gear
+from references.paper.four_bar_minimal import trajectory
+from studies.bench.collector import Case
+from studies.bench.metrics import violations
+from studies.bench.solvers import CATALOGUE, EXUDYN, IRK, LINE_UP, TOLERANCES, baumgarte, gear
 from twoloop.mechanisms import four_bar
 
 T_END = 0.2

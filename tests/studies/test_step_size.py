@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 
 from studies import step_size
-from studies.cli import Call
-from studies.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.bench.cli import Call
+from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.bench.store import Output
+from studies.bench.study import key
 from studies.step_size import OTHERS, PAPER
-from studies.store import Output
-from studies.study import key
 
 
 def rows():

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import store
-from studies.cli import ROOT, Call, StudyError, processor
-from studies.store import KeptRows, Output, plain
+from studies.bench import store
+from studies.bench.cli import ROOT, Call, StudyError, processor
+from studies.bench.store import KeptRows, Output, plain
 
 STAMP = "`python -m studies.x`; 2026-01-01"
 

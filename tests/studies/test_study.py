@@ -3,8 +3,9 @@
 import pandas as pd
 import pytest
 
-from studies import energy, motion, step_size, violation
-from studies.study import key
+from studies import motion, step_size, violation
+from studies.bench.study import key
+from studies.energy import study as energy
 
 
 def rows_of(study, quick):

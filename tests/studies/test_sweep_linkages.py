@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import sweep_linkages as study
-from studies.cli import StudyError
-from studies.render import render
+from studies.bench.cli import StudyError
+from studies.bench.render import render
+from studies.sweep_linkages import study
 from twoloop import sweep
 from twoloop.mechanisms import four_bar
 

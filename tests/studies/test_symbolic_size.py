@@ -2,8 +2,8 @@
 
 import pandas as pd
 
-from studies import symbolic_size
-from studies.render import render
+from studies.bench.render import render
+from studies.symbolic_size import study as symbolic_size
 
 
 def rows():

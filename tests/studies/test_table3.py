@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import table3
-from studies.bench import REPEATS
-from studies.cli import Call
-from studies.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
-from studies.store import Output
-from studies.table3_causes import (
+from studies.bench.cli import Call
+from studies.bench.collector import REPEATS
+from studies.bench.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
+from studies.bench.store import Output
+from studies.table3 import study as table3
+from studies.table3.causes import (
     FAMILIES,
     PAPER_IRK,
     PAPER_NEWMARK,
@@ -167,7 +167,7 @@ def test_printed_times_are_the_papers():
 
 
 def test_the_study_lists_all_cells_once():
-    from studies.cases import four_bar
+    from studies.bench.cases import four_bar
 
     runs = table3.runs(*four_bar.cases(False), False)
     cells_ = [run for run in runs if run.group in FAMILIES and run.case.name == "four-bar"]

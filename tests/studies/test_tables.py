@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import figures, tables
-from studies.cli import Call
-from studies.store import Output
+from studies.bench import figures, tables
+from studies.bench.cli import Call
+from studies.bench.store import Output
 
 
 def rows(*lines, floor=1e-12):

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from studies.cli import ROOT
+from studies.bench.cli import ROOT
 
 NAMES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NPROC", "XLA_FLAGS")
 THREADS = "[open(f'/proc/self/task/{task}/comm').read().strip() for task in os.listdir('/proc/self/task')]"

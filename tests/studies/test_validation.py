@@ -6,10 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import deceived, end_states, validation
-from studies.bench import Run
-from studies.render import render
-from studies.solvers import CATALOGUE
+from studies.bench import end_states
+from studies.bench.collector import Run
+from studies.bench.render import render
+from studies.bench.solvers import CATALOGUE
+from studies.validation import deceived
+from studies.validation import study as validation
 from twoloop import mechanisms, solve_dae
 
 

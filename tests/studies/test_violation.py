@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from studies import violation
-from studies.cli import Call
-from studies.solvers import CATALOGUE, IDA_C, IRK, baumgarte, gear
-from studies.store import Output
-from studies.study import key
+from studies.bench.cli import Call
+from studies.bench.solvers import CATALOGUE, IDA_C, IRK, baumgarte, gear
+from studies.bench.store import Output
+from studies.bench.study import key
 from studies.violation import ALONG, LOOSE, TIGHT, grows, kind
 
 DRIFTS = {"violation_q": 1e-7, "violation_v": 1e-8, "growth_q": 2.0, "growth_v": 1.0, "early_q": 1e-9, "late_q": 1e-7}

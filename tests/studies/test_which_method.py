@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from studies.index import advice
-from studies.store import WHOLE_CALL
-from studies.takes import call, takes
+from studies.bench.index import advice
+from studies.bench.store import WHOLE_CALL
+from studies.bench.takes import call, takes
 from studies.which_method import page, table
 from tests.studies.test_index import energy
 

@@ -3,8 +3,9 @@
 import pandas as pd
 import pytest
 
-from studies import cases, work_precision
-from studies.solvers import RIVALS
+from studies.bench import cases
+from studies.bench.solvers import RIVALS
+from studies.work_precision import study as work_precision
 from tests.studies.test_tables import rows
 
 

@@ -8,6 +8,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from twoloop.problem.problem import Condition, Problem, Reference
+
 if TYPE_CHECKING:
     from twoloop.mechanisms.ancf_beam import ancf_beam, moderately_stiff_beam, very_flexible_beam
     from twoloop.mechanisms.andrews import andrews
@@ -25,12 +27,8 @@ if TYPE_CHECKING:
     from twoloop.mechanisms.spatial_four_bar import spatial_four_bar
     from twoloop.mechanisms.spatial_slider_crank import spatial_slider_crank
     from twoloop.mechanisms.sundials_slider_crank import sundials_slider_crank
-    from twoloop.problem.problem import Condition, Problem, Reference
 
 _ELSEWHERE = {  # names that are not those of their modules
-    "Condition": "problem",
-    "Problem": "problem",
-    "Reference": "problem",
     "closed_chain": "chain",
     "double_pendulum": "chain",
     "driven_slider_crank": "slider_crank",

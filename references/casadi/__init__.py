@@ -1,0 +1,1 @@
+"""CasADi's integrators."""

@@ -1,0 +1,1 @@
+"""The equations of a mechanism in the forms that other solvers take."""

@@ -1,0 +1,1 @@
+"""Exudyn: models of its own."""

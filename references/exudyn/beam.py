@@ -1,0 +1,168 @@
+"""The beam on a moving base as Exudyn models of its own: a cable without shear, or a geometrically exact beam.
+
+Nothing comes from twoloop's equations but the data of the beam and of its base. Both models are of slender beams, with
+E A, E I and, the second, G A: they know nothing of the stretch of the thickness, nor of Poisson's ratio otherwise. The
+elements of `twoloop.mechanisms.ancf_beam` approach them as the mesh gets finer and the section slender, where Poisson's
+ratio is 0. Where it is not, the elements lock, and it is a cable of (lambda + 2 mu)/E times the stiffness that they
+approach. How closely, tests/references/test_exudyn_beam.py says.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import exudyn as exu
+import numpy as np
+from exudyn.itemInterface import (
+    LoadMassProportional,
+    MarkerBodyMass,
+    MarkerNodeCoordinate,
+    NodePoint2DSlope1,
+    NodePointGround,
+    NodeRigidBody2D,
+    ObjectANCFCable2D,
+    ObjectBeamGeometricallyExact2D,
+    ObjectConnectorCoordinate,
+)
+from numpy.typing import NDArray
+
+from references.driver import check_choice, check_problem
+from references.exudyn.run import add_sensors, check_steps, run
+from twoloop.checks.arguments import check_size
+from twoloop.problem.problem import Problem
+from twoloop.result.result import Result
+
+Array = NDArray[np.float64]
+
+MODELS = {
+    "cable": "ANCFCable2D: cubic, the section stays normal to the centre line and has no rotary inertia",
+    "shear": "BeamGeometricallyExact2D: linear, the section turns by itself; shear stiffness G A uncorrected",
+}
+
+
+def solve_exudyn_beam(
+    problem: Problem,
+    t_end: float,
+    n_steps: int,
+    model: str = "cable",
+    *,
+    n_elements: int | None = None,
+    solver: str = "GeneralizedAlpha",
+    store_every: int = 1,
+    time_limit: float | None = None,
+) -> Result:
+    """Run the beam on its moving base with one of Exudyn's implicit solvers, with a fixed step.
+
+    Parameters
+    ----------
+    problem : Problem
+        From `twoloop.mechanisms.ancf_beam`; only `parameters` are read.
+    t_end : float
+        End, s; the run starts at 0.
+    n_steps : int
+        Number of steps.
+    model : {"cable", "shear"}
+        `MODELS` describes each in a line fit for a table. The first converges far faster with the mesh.
+    n_elements : int, optional
+        Number of equal elements. None: that of the problem.
+    solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
+        `references.exudyn.run.SOLVERS` describes each in a line fit for a table.
+    store_every : int
+        Store the start and every so many steps; `n_steps` must be a multiple of it.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s, looked at after every step. A run past it is a failed one. None: no
+        limit.
+
+    Returns
+    -------
+    Result
+        q, v, a (6 (n_elements + 1), n_t) in the order of `ancf_beam`, so that its `tip_height` and
+        `midpoint_deflection` read them. What the model has not is NaN: the directors, and with "shear" the slopes as
+        well. `lam` (2, n_t) is NaN too. All else as in `references.exudyn.four_bar.solve_exudyn`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong, naming it.
+    """
+    check_problem(problem, "youngs_modulus", "a beam of twoloop.mechanisms.ancf_beam")
+    t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
+    check_choice("model", model, MODELS)
+    p = problem.parameters
+    n_elements = p["n_elements"] if n_elements is None else check_size("n_elements", n_elements, 1)
+    _container, mbs, sensors, reference = _model(p, model, n_elements)
+    result = run(mbs, sensors, reference.ravel(), 2, t_end, n_steps, solver, store_every, time_limit)
+    q, v, a = (_ours(coordinates, n_elements) for coordinates in (result.q, result.v, result.a))
+    return replace(result, q=q, v=v, a=a)
+
+
+def _ours(coordinates: Array, n_elements: int) -> Array:
+    """Exudyn's coordinates of the nodes among six a node."""
+    nodes = coordinates.reshape(n_elements + 1, -1, coordinates.shape[1])
+    ours = np.full((n_elements + 1, 6, coordinates.shape[1]), np.nan)
+    kept = 4 if nodes.shape[1] == 4 else 2  # of x, y, slopes the first model has all, the second x, y and an angle
+    ours[:, :kept] = nodes[:, :kept]
+    return ours.reshape(-1, coordinates.shape[1])
+
+
+def _model(p: dict[str, Any], model: str, n_elements: int) -> tuple[Any, Any, list[list[int]], Array]:
+    """Exudyn's container, the system in it, the sensors [node][output], and the reference coordinates [node]."""
+    container = exu.SystemContainer()
+    mbs = container.AddSystem()
+    length = p["length"] / n_elements
+    node_type, straight = (NodePoint2DSlope1, [1.0, 0.0]) if model == "cable" else (NodeRigidBody2D, [0.0])
+    reference = np.array([[k * length, 0.0, *straight] for k in range(n_elements + 1)])
+    start = np.zeros_like(reference)
+    start[: 1 if p["start"] == "node" else None, 0] = p["amplitude"] * p["angular_frequency"]
+    nodes = [
+        mbs.AddNode(node_type(referenceCoordinates=position.tolist(), initialVelocities=velocity.tolist()))
+        for position, velocity in zip(reference, start, strict=True)
+    ]
+    element = _element(p, model, length)
+    for k in range(n_elements):
+        body = mbs.AddObject(element(nodes[k : k + 2]))
+        whole = mbs.AddMarker(MarkerBodyMass(bodyNumber=body))
+        mbs.AddLoad(LoadMassProportional(markerNumber=whole, loadVector=[0.0, -p["gravity"], 0.0]))
+    _hold(mbs, p, nodes[0])
+    sensors = [add_sensors(mbs, node) for node in nodes]
+    mbs.Assemble()
+    return container, mbs, sensors, reference
+
+
+def _element(p: dict[str, Any], model: str, length: float) -> Callable[[list[int]], Any]:
+    """An element of the beam between two nodes."""
+    area, second_moment = p["height"] * p["width"], p["width"] * p["height"] ** 3 / 12.0
+    section = {
+        "length": length,
+        "massPerLength": p["density"] * area,
+        "bendingStiffness": p["youngs_modulus"] * second_moment,
+        "axialStiffness": p["youngs_modulus"] * area,
+    }
+    if model == "cable":
+        return lambda ends: ObjectANCFCable2D(nodeNumbers=ends, **section)
+    return lambda ends: ObjectBeamGeometricallyExact2D(
+        nodeNumbers=ends,
+        crossSectionInertia=p["density"] * second_moment,
+        # without the correction for its distribution over the section, as the element of twoloop has it
+        shearStiffness=0.5 * p["youngs_modulus"] / (1.0 + p["poisson_ratio"]) * area,
+        **section,
+    )
+
+
+def _hold(mbs: Any, p: dict[str, Any], node: int) -> None:
+    """Move a node as amplitude sin(angular_frequency t) along x, and hold it along y."""
+    amplitude, frequency = p["amplitude"], p["angular_frequency"]
+
+    def place(mbs: Any, t: float, itemNumber: int, lOffset: float) -> float:
+        return float(amplitude * math.sin(frequency * t))
+
+    def speed(mbs: Any, t: float, itemNumber: int, lOffset: float) -> float:
+        return float(amplitude * frequency * math.cos(frequency * t))
+
+    ground = mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=mbs.AddNode(NodePointGround()), coordinate=0))
+    along, across = (mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=node, coordinate=k)) for k in range(2))
+    mbs.AddObject(
+        ObjectConnectorCoordinate(markerNumbers=[ground, along], offsetUserFunction=place, offsetUserFunction_t=speed)
+    )
+    mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=[ground, across]))

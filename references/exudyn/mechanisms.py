@@ -1,0 +1,202 @@
+"""Published mechanisms as Exudyn models: rigid bodies, joints, springs and weight of its own.
+
+Nothing comes from twoloop's equations but masses, inertias, geometry and the state at the start. Spatial bodies have
+Euler parameters, as ours have, but for the bars of A04, whose rotation matrices are computed from them.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
+from references.exudyn.run import check_radius, check_steps, run
+from twoloop.mechanisms import bricard, n_four_bar
+from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
+from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
+from twoloop.mechanisms.rotation import euler_parameters, rotated_rate, rotation_matrix
+from twoloop.problem.problem import Problem
+from twoloop.result.result import Result
+
+Array = NDArray[np.float64]
+X, Y, Z = np.eye(3)
+REDUNDANT = ("A02", "A04")  # beginnings of names: rows that depend on others, for good or where the motion passes
+
+
+def solve_exudyn_mechanism(
+    problem: Problem,
+    t_end: float,
+    n_steps: int,
+    solver: str = "GeneralizedAlpha",
+    *,
+    spectral_radius: float | None = None,
+    store_every: int = 1,
+    time_limit: float | None = None,
+) -> Result:
+    """Run a published mechanism with one of Exudyn's implicit solvers, with a fixed step.
+
+    Parameters
+    ----------
+    problem : Problem
+        One of those in `MODELS`, by its name, or of A02. Its parameters and its start are read, not its system.
+    t_end : float
+        End, s; the run starts at 0.
+    n_steps, solver, spectral_radius, store_every, time_limit
+        As of `references.exudyn.four_bar.solve_exudyn`.
+
+    Returns
+    -------
+    Result
+        As of `references.exudyn.four_bar.solve_exudyn`, in our coordinates; of A02 by its tips and of A04, whose
+        coordinates Exudyn does not have, `a` is NaN.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong, naming it.
+    """
+    if not has_model(problem):
+        raise ValueError(f"problem must be of A02 or one of {', '.join(MODELS)}; given {problem.name!r}")
+    t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
+    radius = check_radius(spectral_radius, solver)
+    model = (_n_four_bar if problem.name.startswith("A02") else MODELS[problem.name])(problem)
+    model.mbs.Assemble()
+    result = run(
+        model.mbs,
+        model.sensors,
+        np.concatenate(model.reference),
+        problem.system.n_c,
+        t_end,
+        n_steps,
+        solver,
+        store_every,
+        time_limit,
+        radius,
+        dependent_rows=problem.name.startswith(REDUNDANT),
+    )
+    if problem.name == bricard().name:
+        return _with_matrices(result)
+    tips = problem.name.startswith("A02") and len(problem.q0) != len(result.q)
+    return _with_tips(result, problem.parameters["n"]) if tips else result
+
+
+def has_model(problem: Problem) -> bool:
+    """Whether there is a model of a problem."""
+    return problem.name in MODELS or problem.name.startswith("A02")
+
+
+def _heavy_top(problem: Problem) -> Model:
+    p = problem.parameters
+    model = Model((0.0, 0.0, -p["gravity"]))
+    top = model.body(p["mass"], p["inertia"], problem.q0, problem.v0)
+    model.joint(GROUND, top, (0.0, 0.0, 0.0), np.eye(3), SPHERICAL)
+    return model
+
+
+def _states(problem: Problem) -> list[tuple[Array, Array]]:
+    """States (7,), (7,) of the bodies at the start."""
+    return list(zip(problem.q0.reshape(-1, 7), problem.v0.reshape(-1, 7), strict=True))
+
+
+def _spatial_slider_crank(problem: Problem) -> Model:
+    p = problem.parameters
+    model = Model((0.0, 0.0, -9.81))
+    for name, (q, v) in zip(("crank", "rod", "slider"), _states(problem), strict=True):
+        model.body(p["masses"][name], p["inertias"][name], q, v)
+    (centre, rod), (slider, _) = model.places[1:]
+    model.joint(GROUND, 0, p["A"], frame(z=X), REVOLUTE)
+    model.joint(0, 1, centre - 0.5 * p["rod"] * rod[:, 0], np.eye(3), SPHERICAL)
+    model.joint(1, 2, slider, frame(x=rod[:, 1], y=X), UNIVERSAL)
+    model.joint(GROUND, 2, slider, np.eye(3), PRISMATIC)
+    return model
+
+
+def _governor(problem: Problem) -> Model:
+    p = problem.parameters
+    model = Model((0.0, 0.0, -p["gravity"]))
+    bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
+    centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # of rod and ball, from the hinge
+    axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)
+    across += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
+    rod = (bar + BALL, (axial, across, across))
+    bodies = [(bar, box(bar, WIDTH, WIDTH, LENGTH)), (cube, box(cube, CUBE, CUBE, CUBE)), rod, rod]
+    for (mass, inertia), (q, v) in zip(bodies, _states(problem), strict=True):
+        model.body(mass, inertia, q, v)
+    model.joint(GROUND, 0, (0.0, 0.0, 0.0), frame(z=Z), REVOLUTE)
+    model.joint(0, 1, (0.0, 0.0, HEIGHT), frame(x=Z), PRISMATIC)
+    for body, side in ((2, 0.5 * CUBE), (3, -0.5 * CUBE)):
+        hinge = np.array([side, 0.0, LENGTH])
+        model.joint(0, body, hinge, frame(z=Y), REVOLUTE)
+        middle = hinge + 0.5 * LENGTH * model.places[body][1][:, 0]
+        model.spring(1, (side, 0.0, HEIGHT), body, middle, STIFFNESS, DAMPING, SLACK)
+    return model
+
+
+def _bricard(problem: Problem) -> Model:
+    model = Model((0.0, -problem.parameters["gravity"], 0.0))
+    width = problem.parameters["width"] ** 2 / 12.0
+    for (begin, end), R in zip(pairwise(CORNERS), FRAMES, strict=True):
+        q = np.concatenate([0.5 * (begin + end), euler_parameters(R)])
+        model.body(1.0, (2.0 * width, 1.0 / 12.0 + width, 1.0 / 12.0 + width), q, np.zeros(7))
+    for hinge, (corner, axis) in enumerate(zip(CORNERS, AXES, strict=True)):
+        after = hinge if hinge < 5 else GROUND
+        model.joint(hinge - 1 if hinge else GROUND, after, corner, frame(z=axis), REVOLUTE)
+    return model
+
+
+def _with_matrices(result: Result) -> Result:
+    """Bars by their centres and rotation matrices in place of Euler parameters."""
+    q, v = [], []
+    for x, u in zip(result.q.reshape(5, 7, -1), result.v.reshape(5, 7, -1), strict=True):
+        q += [x[:3], *np.array([rotation_matrix(e).T for e in x[3:].T]).reshape(-1, 9).T[None]]
+        rates = [np.array(rotated_rate.py_func(*x[3:], *u[3:], *axis)) for axis in np.eye(3)]
+        v += [u[:3], *rates]
+    return replace(result, q=np.concatenate(q), v=np.concatenate(v), a=np.full((60, result.t.size), np.nan))
+
+
+def _n_four_bar(problem: Problem) -> Model:
+    n = problem.parameters["n"]
+    start = n_four_bar(n, "bodies")
+    model = Model((0.0, -problem.parameters["gravity"], 0.0))
+    for q, v in zip(start.q0.reshape(-1, 3), start.v0.reshape(-1, 3), strict=True):
+        model.planar_body(1.0, 1.0 / 12.0, q, v)
+    for i in range(n + 1):
+        model.pin(i, (-0.5, 0.0), GROUND, (float(i), 0.0))
+    for j in range(n):
+        model.pin(n + 1 + j, (-0.5, 0.0), j, (0.5, 0.0))
+        model.pin(n + 1 + j, (0.5, 0.0), j + 1, (0.5, 0.0))
+    return model
+
+
+def _with_tips(result: Result, n: int) -> Result:
+    """The tips of the cranks in place of the bars."""
+    ground = np.column_stack([np.arange(n + 1.0), np.zeros(n + 1)])
+    q, v = (x.reshape(-1, 3, result.t.size)[: n + 1, :2] for x in (result.q, result.v))
+    tips = 2.0 * q - ground[:, :, None]
+    shape = (2 * n + 2, result.t.size)
+    return replace(result, q=tips.reshape(shape), v=(2.0 * v).reshape(shape), a=np.full(shape, np.nan))
+
+
+def _slider_crank(problem: Problem) -> Model:
+    p = problem.parameters
+    model = Model((0.0, -p["gravity"], 0.0))
+    starts = zip(problem.q0.reshape(3, 3), problem.v0.reshape(3, 3), strict=True)
+    for mass, inertia, (q, v) in zip(p["masses"], p["inertias"], starts, strict=True):
+        model.planar_body(mass, inertia, q, v)
+    model.pin(0, (-0.5 * p["crank"], 0.0), GROUND, (0.0, 0.0))
+    model.pin(1, (-0.5 * p["rod"], 0.0), 0, (0.5 * p["crank"], 0.0))
+    model.pin(2, (0.0, 0.0), 1, (0.5 * p["rod"], 0.0))
+    model.hold(2, 1)
+    model.hold(2, 2)
+    return model
+
+
+MODELS: dict[str, Callable[[Problem], Model]] = {
+    "redundant slider-crank": _slider_crank,  # without the redundant row
+    "heavy top": _heavy_top,
+    "spatial slider-crank": _spatial_slider_crank,
+    "A04 Bricard": _bricard,
+    "A05 governor": _governor,
+}

@@ -1,0 +1,133 @@
+"""What Exudyn models of rigid bodies are put together from: bodies, joints, springs and weight, all of its own."""
+
+from typing import Any
+
+import exudyn as exu
+import numpy as np
+from exudyn.itemInterface import (
+    GenericJoint,
+    LoadMassProportional,
+    MarkerBodyMass,
+    MarkerBodyPosition,
+    MarkerBodyRigid,
+    MarkerNodeCoordinate,
+    NodePointGround,
+    NodeRigidBody2D,
+    NodeRigidBodyEP,
+    ObjectConnectorCoordinate,
+    ObjectConnectorSpringDamper,
+    ObjectGround,
+    ObjectJointRevolute2D,
+    ObjectRigidBody,
+    ObjectRigidBody2D,
+)
+from numpy.typing import ArrayLike, NDArray
+
+from references.exudyn.run import add_sensors
+from twoloop.mechanisms.rotation import rotation_matrix
+
+Array = NDArray[np.float64]
+
+GROUND = -1
+# locked translations and rotations of the second body in the frame of a joint
+SPHERICAL, UNIVERSAL = [1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 1]  # x of the first and y of the second stay perpendicular
+REVOLUTE, PRISMATIC = [1, 1, 1, 1, 1, 0], [0, 1, 1, 1, 1, 1]  # about z, along x
+
+
+class Model:
+    """Exudyn's container and system, to which bodies and what connects them are added."""
+
+    def __init__(self, gravity: ArrayLike):
+        self.container = exu.SystemContainer()
+        self.mbs: Any = self.container.AddSystem()
+        self.gravity = np.asarray(gravity, dtype=float).tolist()
+        self.bodies: list[int] = []
+        self.nodes: list[int] = []
+        self.sensors: list[list[int]] = []
+        self.places: list[tuple[Array, Array]] = []  # centre and rotation matrix of each body at the start
+        self.reference: list[Array] = []
+        self.ground = self.mbs.AddObject(ObjectGround(referencePosition=[0.0, 0.0, 0.0]))
+
+    def _added(self, body: int, node: int, q: Array, place: tuple[Array, Array]) -> int:
+        whole = self.mbs.AddMarker(MarkerBodyMass(bodyNumber=body))
+        self.mbs.AddLoad(LoadMassProportional(markerNumber=whole, loadVector=self.gravity))
+        self.bodies.append(body)
+        self.nodes.append(node)
+        self.reference.append(np.asarray(q, dtype=float))
+        self.places.append(place)
+        self.sensors.append(add_sensors(self.mbs, node))
+        return len(self.bodies) - 1
+
+    def body(self, mass: float, inertia: ArrayLike, q: Array, v: Array) -> int:
+        """A body in space: principal moments, centre and Euler parameters (7,), and their rates."""
+        node = self.mbs.AddNode(NodeRigidBodyEP(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
+        moments = [*np.asarray(inertia, dtype=float).tolist(), 0.0, 0.0, 0.0]
+        body = self.mbs.AddObject(ObjectRigidBody(mass=mass, inertia=moments, nodeNumber=node))
+        return self._added(body, node, q, (q[:3], rotation_matrix(q[3:])))
+
+    def planar_body(self, mass: float, inertia: float, q: Array, v: Array) -> int:
+        """A body in the plane: centre and angle (3,), and their rates."""
+        node = self.mbs.AddNode(NodeRigidBody2D(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
+        body = self.mbs.AddObject(ObjectRigidBody2D(mass=mass, inertia=inertia, nodeNumber=node))
+        return self._added(body, node, q, (np.zeros(3), np.eye(3)))
+
+    def _local(self, body: int, point: ArrayLike) -> tuple[int, list[float], Array]:
+        """Exudyn's number of a body, a point of space in its axes, and its rotation matrix."""
+        point = np.asarray(point, dtype=float)
+        if body == GROUND:
+            return self.ground, point.tolist(), np.eye(3)
+        centre, R = self.places[body]
+        return self.bodies[body], (R.T @ (point - centre)).tolist(), R
+
+    def joint(self, i: int, j: int, point: ArrayLike, frame: Array, locked: list[int]) -> None:
+        """Lock motions of body j relative to i in the axes of a frame at a point, both as at the start in space."""
+        markers = []
+        for body in (i, j):
+            number, local, R = self._local(body, point)
+            place = exu.HT(rotation=R.T @ frame, translation=local)  # type: ignore[call-arg]  # its stub lags behind
+            markers.append(self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=number, localHT=place)))
+        self.mbs.AddObject(GenericJoint(markerNumbers=markers, constrainedAxes=locked))
+
+    def spring(self, i: int, a: ArrayLike, j: int, b: ArrayLike, *data: float) -> None:
+        """A spring-damper between points of space at the start: stiffness, damping, length."""
+        markers = []
+        for body, point in ((i, a), (j, b)):
+            number, local, _ = self._local(body, point)
+            markers.append(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=local)))
+        stiffness, damping, length = data
+        self.mbs.AddObject(
+            ObjectConnectorSpringDamper(
+                markerNumbers=markers, stiffness=stiffness, damping=damping, referenceLength=length
+            )
+        )
+
+    def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> None:
+        """A pin between points of two planar bodies, each in the axes of its body."""
+        markers = []
+        for body, (x, y) in ((i, a), (j, b)):
+            number = self.ground if body == GROUND else self.bodies[body]
+            markers.append(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=[x, y, 0.0])))
+        self.mbs.AddObject(ObjectJointRevolute2D(markerNumbers=markers))
+
+    def hold(self, body: int, coordinate: int) -> None:
+        """Keep a coordinate of a body."""
+        fixed = self.mbs.AddNode(NodePointGround())
+        markers = [
+            self.mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=node, coordinate=k))
+            for node, k in ((fixed, 0), (self.nodes[body], coordinate))
+        ]
+        self.mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=markers))
+
+
+def frame(x: ArrayLike | None = None, y: ArrayLike | None = None, z: ArrayLike | None = None) -> Array:
+    """A rotation matrix with one or two columns given."""
+    columns = [None if each is None else np.asarray(each, dtype=float) for each in (x, y, z)]
+    given = [k for k, each in enumerate(columns) if each is not None]
+    k, one = given[0], columns[given[0]]
+    assert one is not None
+    if len(given) == 1:
+        across = np.cross(one, np.eye(3)[int(np.argmin(np.abs(one)))])
+        columns[(k + 1) % 3] = across / np.linalg.norm(across)
+    missing = next(k for k, each in enumerate(columns) if each is None)
+    columns[missing] = np.cross(columns[(missing + 1) % 3], columns[(missing + 2) % 3])  # type: ignore[arg-type]
+    return np.column_stack(columns)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Mechanisms in minimal coordinates."""

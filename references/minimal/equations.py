@@ -1,0 +1,266 @@
+"""Equations of motion in minimal coordinates, where loops close in closed form: what one has without constraints.
+
+One or two angles and Lagrange's equations for them, by hand, from the parameters of a problem alone. Each equation is
+written once: for floats (`math`), for compiled code (numba takes `math` too), and for expressions (heyoka has functions
+of the same names).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.paper.four_bar_minimal import MinimalFourBar
+from twoloop.mechanisms import Problem
+
+Array = NDArray[np.float64]
+Equations = Callable[[Any], tuple[Any, ...]]  # [angles, rates] -> their rates
+
+INSTANTS = 1000  # of half a period, at which the dead centres of a four-bar are looked for
+NEAREST = 1e-2  # sine of the angle between the two other bars, below which an angle is near its dead centre
+
+
+class NoMinimalCoordinates(ValueError):
+    """Raised for a problem of which there are no equations in minimal coordinates."""
+
+
+@dataclass(frozen=True)
+class Minimal:
+    """A mechanism in minimal coordinates.
+
+    Attributes
+    ----------
+    equations : callable
+        equations(functions) -> rates, of which rates(y) gives y', y = [angles, their rates], by these functions: `math`
+        or a module with sin, cos and sqrt of its own.
+    start : tuple of float
+        y at the problem's start.
+    states : callable
+        states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates.
+    """
+
+    equations: Callable[[Any], Equations]
+    start: tuple[float, ...]
+    states: Callable[[Array], tuple[Array, Array]]
+
+
+def minimal(problem: Problem) -> Minimal:
+    """The equations of a problem in minimal coordinates.
+
+    Raises
+    ------
+    NoMinimalCoordinates
+        If there are none, or a four-bar has no angle that stays clear of its dead centres.
+    """
+    name = problem.system.name
+    if name not in MAKE:
+        raise NoMinimalCoordinates(f"there are equations in minimal coordinates of {', '.join(MAKE)}; given {name!r}")
+    return MAKE[name](problem)
+
+
+def _pendulum(problem: Problem) -> Minimal:
+    """One angle from the downward vertical: th'' = -g / L sin th."""
+    length, gravity = problem.parameters["length"], problem.parameters["gravity"]
+    pull = gravity / length
+
+    def equations(functions: Any) -> Equations:
+        sin = functions.sin
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            return y[1], -pull * sin(y[0])
+
+        return rates
+
+    def states(y: Array) -> tuple[Array, Array]:
+        s, c = np.sin(y[0]), np.cos(y[0])
+        return length * np.array([s, -c]), length * y[1] * np.array([c, s])
+
+    return Minimal(equations, _angles_of(problem, (0.0, 0.0)), states)
+
+
+def _double_pendulum(problem: Problem) -> Minimal:
+    """Two angles from the downward vertical; equal masses and lengths.
+
+    Lagrange: 2 th1'' + c th2'' = -s th2'^2 - 2 g/L sin th1 and c th1'' + th2'' = s th1'^2 - g/L sin th2, with c and s
+    of th1 - th2.
+    """
+    length, gravity = problem.parameters["length"], problem.parameters["gravity"]
+    pull = gravity / length
+
+    def equations(functions: Any) -> Equations:
+        sin, cos = functions.sin, functions.cos
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            s, c = sin(y[0] - y[1]), cos(y[0] - y[1])
+            first = -s * (y[3] * y[3]) - 2.0 * pull * sin(y[0])
+            second = s * (y[2] * y[2]) - pull * sin(y[1])
+            determinant = 2.0 - c * c
+            return y[2], y[3], (first - c * second) / determinant, (2.0 * second - c * first) / determinant
+
+        return rates
+
+    def states(y: Array) -> tuple[Array, Array]:
+        s, c = length * np.sin(y[:2]), length * np.cos(y[:2])
+        x, z = np.cumsum(s, axis=0), np.cumsum(-c, axis=0)
+        xv, zv = np.cumsum(c * y[2:], axis=0), np.cumsum(s * y[2:], axis=0)
+        return np.array([x[0], z[0], x[1], z[1]]), np.array([xv[0], zv[0], xv[1], zv[1]])
+
+    return Minimal(equations, _angles_of(problem, (0.0, 0.0)), states)
+
+
+def _angles_of(problem: Problem, pivot: Sequence[float]) -> tuple[float, ...]:
+    """Angles of a chain of links from the downward vertical and their rates, from points and their velocities."""
+    links = np.diff(np.vstack([pivot, problem.q0.reshape(-1, 2)]), axis=0)
+    speeds = np.diff(np.vstack([(0.0, 0.0), problem.v0.reshape(-1, 2)]), axis=0)
+    turns = (-links[:, 1] * speeds[:, 0] + links[:, 0] * speeds[:, 1]) / (links**2).sum(axis=1)
+    return (*np.arctan2(links[:, 0], -links[:, 1]).tolist(), *turns.tolist())
+
+
+def _slider_crank(problem: Problem) -> Minimal:
+    """The angle of the crank; the rod's is asin(-a sin th), as a < 1.
+
+    Both ends of the spring are at half the height of the pin, so that it is half as long as the slider is far.
+    """
+    a, J1, m2, J2, k, c, l0, F = (problem.parameters[name] for name in ("a", "J1", "m2", "J2", "k", "c", "l0", "F"))
+
+    def equations(functions: Any) -> Equations:
+        sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            s, w = sin(y[0]), y[1]
+            cc, s2 = cos(y[0]), -a * s
+            c2 = sqrt(1.0 - s2 * s2)
+            rod = -a * cc / c2  # derivatives by the angle: of the rod's, of the slider's place; then the second ones
+            slide = -s2 * rod - a * s
+            rod_2 = (s2 * (rod * rod) + a * s) / c2
+            slide_2 = -c2 * (rod * rod) - s2 * rod_2 - a * cc
+            length = 0.5 * (c2 + a * cc)
+            inertia = J1 + m2 * (slide * slide) + J2 * (rod * rod)
+            coupling = m2 * slide * slide_2 + J2 * rod * rod_2
+            spring = -0.5 * slide * (k * (length - l0) + 0.5 * c * slide * w)
+            push = F * (slide - s2 * rod)
+            return w, (spring + push - coupling * (w * w)) / inertia
+
+        return rates
+
+    def states(y: Array) -> tuple[Array, Array]:
+        s, cc = np.sin(y[0]), np.cos(y[0])
+        tilt = np.arcsin(-a * s)
+        rod = -a * cc / np.cos(tilt)
+        slide = -np.sin(tilt) * rod - a * s
+        return np.array([y[0], np.cos(tilt) + a * cc, tilt]), y[1] * np.array([np.ones_like(s), slide, rod])
+
+    return Minimal(equations, (float(problem.q0[0]), float(problem.v0[0])), states)
+
+
+def _four_bar(problem: Problem) -> Minimal:
+    """One angle: that of a bar such that the two others are not in line anywhere on the motion.
+
+    Where the others are, of lengths La and Lb, follows from R = La e_a + Lb e_b = (L, 0) - Lk e_k: e_a is along R by
+    (R^2 + La^2 - Lb^2) / (2 R^2) and across it by a root whose sign stays.
+    """
+    p = problem.parameters
+    lengths, ground, density, gravity = (p["L1"], p["L2"], p["L3"]), p["L"], p["density"], p["gravity"]
+    known = MinimalFourBar.from_parameters(p)
+    angles = known.states(np.linspace(0.0, 0.5 * known.period, INSTANTS))[0][2::3]
+    between = [np.sin(angles[b] - angles[a]) for _, a, b in OTHERS]
+    best = max(range(3), key=lambda k: np.abs(between[k]).min())
+    own, a, b = OTHERS[best]
+    if np.ptp(np.sign(between[best])) or np.abs(between[best]).min() < NEAREST:
+        raise NoMinimalCoordinates(f"every angle of {problem.name!r} comes to its dead centre on this motion")
+    side = -math.copysign(1.0, between[best][0])  # of e_a: to the left of R where e_b lies to the right
+    Lk, La, Lb = lengths[own], lengths[a], lengths[b]
+    masses = [density * length for length in lengths]
+    # x of the centre of bar i = sum of HALVES[i] L e: as factors of the three bars in the order k, a, b
+    arms = [[masses[i], *(HALVES[i][j] * lengths[j] for j in (own, a, b))] for i in range(3)]
+    (m1, k1, a1, b1), (m2, k2, a2, b2), (m3, k3, a3, b3) = arms
+    Jk, Ja, Jb = (masses[i] * lengths[i] ** 2 / 12.0 for i in (own, a, b))
+
+    def equations(functions: Any) -> Equations:
+        sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            ck, sk, w = cos(y[0]), sin(y[0]), y[1]
+            x, z = ground - Lk * ck, -Lk * sk
+            square = x * x + z * z
+            along = 0.5 * (square + (La * La - Lb * Lb)) / square
+            across = side * sqrt(La * La / square - along * along)
+            ax, az = along * x - across * z, along * z + across * x
+            ca, sa, cb, sb = ax / La, az / La, (x - ax) / Lb, (z - az) / Lb
+            sine = sb * ca - cb * sa
+            # derivatives of the two angles by the one: the closure's first, then its second, projected on e_b and e_a
+            na = -Lk * (sb * ck - cb * sk) / (La * sine)
+            nb = Lk * (sa * ck - ca * sk) / (Lb * sine)
+            ra, rb = na * na, nb * nb
+            wx, wz = Lk * ck + La * ra * ca + Lb * rb * cb, Lk * sk + La * ra * sa + Lb * rb * sb
+            da, db = (wx * cb + wz * sb) / (La * sine), -(wx * ca + wz * sa) / (Lb * sine)
+            # of the bars' vectors e, first and second
+            kx, kz, ax, az, bx, bz = -sk, ck, -sa * na, ca * na, -sb * nb, cb * nb
+            kxx, kzz = -ck, -sk
+            axx, azz = -ca * ra - sa * da, -sa * ra + ca * da
+            bxx, bzz = -cb * rb - sb * db, -sb * rb + cb * db
+            # of the centres
+            x1, z1 = k1 * kx + a1 * ax + b1 * bx, k1 * kz + a1 * az + b1 * bz
+            x2, z2 = k2 * kx + a2 * ax + b2 * bx, k2 * kz + a2 * az + b2 * bz
+            x3, z3 = k3 * kx + a3 * ax + b3 * bx, k3 * kz + a3 * az + b3 * bz
+            inertia = Jk + Ja * ra + Jb * rb
+            inertia = inertia + m1 * (x1 * x1 + z1 * z1) + m2 * (x2 * x2 + z2 * z2) + m3 * (x3 * x3 + z3 * z3)
+            coupling = Ja * na * da + Jb * nb * db
+            coupling = coupling + m1 * (x1 * (k1 * kxx + a1 * axx + b1 * bxx) + z1 * (k1 * kzz + a1 * azz + b1 * bzz))
+            coupling = coupling + m2 * (x2 * (k2 * kxx + a2 * axx + b2 * bxx) + z2 * (k2 * kzz + a2 * azz + b2 * bzz))
+            coupling = coupling + m3 * (x3 * (k3 * kxx + a3 * axx + b3 * bxx) + z3 * (k3 * kzz + a3 * azz + b3 * bzz))
+            weight = gravity * (m1 * z1 + m2 * z2 + m3 * z3)
+            return w, -(weight + coupling * (w * w)) / inertia
+
+        return rates
+
+    def directions(angle: Array) -> dict[int, Array]:
+        """e of the three bars, as complex numbers."""
+        own_e = np.exp(1j * angle)
+        chord = ground - Lk * own_e
+        along = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
+        across = side * np.sqrt(La**2 / np.abs(chord) ** 2 - along**2)
+        own_a = chord * (along + 1j * across) / La
+        return {own: own_e, a: own_a, b: (chord - La * own_a) / Lb}
+
+    def turns(angle: Array) -> dict[int, Array]:
+        """The three angles, continuous in the one: R turns with its bar only where that is longer than the ground."""
+        vector = directions(angle)
+        chord = ground - Lk * vector[own]
+        across = np.angle(chord) if Lk < ground else angle + np.angle(chord / vector[own] * -1.0) + math.pi
+        first = across + np.angle(vector[a] / chord)
+        return {own: angle, a: first, b: first + np.angle(vector[b] / vector[a])}
+
+    at_start = turns(np.array(problem.q0[3 * own + 2]))
+    whole = [2.0 * math.pi * round((problem.q0[3 * i + 2] - float(at_start[i])) / (2.0 * math.pi)) for i in range(3)]
+
+    def states(y: Array) -> tuple[Array, Array]:
+        vector = directions(y[0])
+        sine = (vector[b] * vector[a].conj()).imag
+        rate = {own: y[1]}
+        rate[a] = -Lk * (vector[b] * vector[own].conj()).imag / (La * sine) * y[1]
+        rate[b] = Lk * (vector[a] * vector[own].conj()).imag / (Lb * sine) * y[1]
+        q, v = np.empty((9, y.shape[1])), np.empty((9, y.shape[1]))
+        turned = turns(y[0])
+        for i in range(3):
+            q[3 * i + 2], v[3 * i + 2] = turned[i] + whole[i], rate[i]
+            place = sum(HALVES[i][j] * lengths[j] * vector[j] for j in range(3))
+            speed = sum(HALVES[i][j] * lengths[j] * 1j * vector[j] * rate[j] for j in range(3))
+            q[3 * i : 3 * i + 2], v[3 * i : 3 * i + 2] = (place.real, place.imag), (speed.real, speed.imag)
+        return q, v
+
+    return Minimal(equations, (float(problem.q0[3 * own + 2]), float(problem.v0[3 * own + 2])), states)
+
+
+OTHERS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # a bar and the two others
+HALVES = ((0.5, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.5))  # the way to a bar's centre, in lengths of the bars
+MAKE: dict[str, Callable[[Problem], Minimal]] = {
+    "four-bar": _four_bar,
+    "A01 pendulum": _pendulum,
+    "projection pendulum": _pendulum,
+    "double pendulum": _double_pendulum,
+    "SUNDIALS slider-crank": _slider_crank,
+}

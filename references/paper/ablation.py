@@ -1,0 +1,169 @@
+"""The paper's idea alone: five ways to keep the constraints in one Runge-Kutta code, which share all that is not it.
+
+Tableau, fixed-point loop over the stages, factorisations, convergence test and step-size control are the same for all.
+What differs is what becomes of a stage's coordinates and of the end of a step: the branches on `variant` in
+`references.paper.ablation_kernels`.
+"""
+
+import time
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from references.driver import TimeLimit, check_choice, check_run
+from references.paper import ablation_kernels as kernels
+from twoloop.checks.arguments import check_positive
+from twoloop.checks.consistency import check_start
+from twoloop.kernels.data.common import GAMMA_GIVEN, Kit
+from twoloop.methods.tableaux import Tableau
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
+
+Array = NDArray[np.float64]
+
+VARIANTS = {
+    "positions in every stage": "the paper: dependent q and v from the constraints at every stage, in every iteration",
+    "dependents frozen": "dependent q and v as at the beginning of the step, until its end",
+    "projected once a step": "index 1: all coordinates integrated, put onto the constraints at the end (Eich 1993)",
+    "stabilised index 2": "Gear, Gupta & Leimkuhler: M q' = M v - C_q^T mu, C = 0 and C_q v + C_t = 0 at the stages",
+    "unprojected": "index 1: all coordinates integrated, constraints left to themselves",
+}
+FROZEN_ORDER = 1  # of a step with dependents frozen, whatever the tableau
+
+LOOP_SHARE = 1e-4  # tolerance of the stage loop over that of the step, as 1e-9 over 1e-5 in the paper
+LEAST_LOOP = 1e-11  # on the beam rounding leaves 1e-12
+CHUNK = 100  # steps of a compiled call, after which the clock is read
+FIRST = 1e-3  # of the time span, the first step under control
+REASONS = {
+    kernels.NOT_CONVERGED: "the stage loop does not converge",
+    kernels.SINGULAR: "a matrix is singular, or the constraints cannot be solved",
+    kernels.TOO_SMALL: "the step has become too small",
+}
+
+
+def solve_variant(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    variant: str,
+    tableau: Tableau,
+    *,
+    step: float | None = None,
+    tol: float | None = None,
+    loop_tol: float | None = None,
+    time_limit: float | None = None,
+) -> tuple[Result, float]:
+    """Integrate by a Runge-Kutta tableau with one of five ways to keep the constraints.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        With `gamma`, and with constraints on positions that do not depend on one another.
+    t_span : (float, float)
+        Start and end, s.
+    q0, v0 : array_like (n_q,)
+        Consistent start.
+    variant : str
+        One of `VARIANTS`, which says what each does.
+    tableau : Tableau
+        With an invertible A, not an explicit one.
+    step : float, optional
+        A fixed step, s: the nearest that goes into t_span a whole number of times.
+    tol : float, optional
+        Instead of a fixed step: rtol = atol of eqs. (26), (27), (31), by a step and two halves, the latter kept.
+    loop_tol : float, optional
+        Change of a stage, relative to max(1, |y|), at which the loop over the stages ends. None: 1e-4 tol, at least
+        1e-11, as with fixed steps.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s.
+
+    Returns
+    -------
+    result : Result
+        At the ends of the steps; `a` and `lam` of eq. (6) there. Of the statistics: n_evaluations, times that forces
+        were evaluated and the equations of motion solved; n_factorizations, of C_qd, C_q M^-1 C_q^T, a varying M, and
+        partitions; n_outer, sweeps over all stages; n_inner, Newton iterations for positions.
+    mu : float
+        Largest |mu| of the stabilised form, of its M q' = M v - C_q^T mu; 0 of the others.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong.
+
+    Notes
+    -----
+    All stages of a sweep are made from those of the one before, the first from the accelerations at the beginning of
+    the step. The stabilised form has its multipliers from the residuals of the stages, by a Newton step with the
+    matrices of each stage; where the last stage is not the end of the step, the end is put onto the constraints as with
+    projection (U. Ascher and L. Petzold, SIAM J. Numer. Anal. 28 (1991) 1097-1120), else the method loses its order.
+    """
+    check_choice("variant", variant, VARIANTS)
+    if (step is None) == (tol is None):
+        raise ValueError(f"give either step, for fixed steps, or tol; given step={step!r}, tol={tol!r}")
+    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
+    check_positive("tol" if step is None else "step", tol if step is None else step)
+    if not system.functions.flags[GAMMA_GIVEN]:
+        raise ValueError(f"system must have gamma; given {system.name!r} without it")
+    if np.linalg.matrix_rank(tableau.A) < tableau.stages:
+        raise ValueError(f"tableau must have an invertible A; that of {tableau.name} is singular")
+    check_start(system, t0, q0, v0)
+    span, which = t1 - t0, list(VARIANTS).index(variant)
+    if loop_tol is None:
+        loop_tol = max(LOOP_SHARE * (tol or 0.0), LEAST_LOOP)
+    check_positive("loop_tol", loop_tol)
+
+    n, m, s = system.n_q, system.n_c, tableau.stages
+    limit = TimeLimit(time_limit)
+    order = FROZEN_ORDER if which == kernels.FROZEN else tableau.order
+    coefficients = [np.ascontiguousarray(x) for x in (tableau.A, tableau.b, tableau.c, np.linalg.inv(tableau.A))]
+    counters, where = np.zeros(kernels.N_COUNTERS, dtype=np.int64), np.zeros(kernels.N_PLACES)
+    n_steps = 0 if step is None else max(1, round(span / step))
+    where[kernels.T], where[kernels.H], where[kernels.LONGEST] = t0, span / n_steps if n_steps else FIRST * span, span
+    state = np.concatenate([q0, v0, np.zeros(n + m)])
+    chunks = [np.empty((1, 1 + 3 * n + m))]
+    given = (n, m, s, which, order, *coefficients, t0, t1, n_steps, 0.0 if tol is None else float(tol), float(loop_tol))
+    began = time.process_time()
+    code = kernels.run(Kit(system.functions), *given, state, where, chunks[0], counters)  # a and lam of the start
+    while code == kernels.DONE and where[kernels.T] < t1 and not limit.passed():
+        chunks.append(np.empty((CHUNK, 1 + 3 * n + m)))
+        before = counters[kernels.STEPS]
+        code = kernels.run(Kit(system.functions), *given, state, where, chunks[-1], counters)
+        chunks[-1] = chunks[-1][: counters[kernels.STEPS] - before]
+    cpu = time.process_time() - began
+    return _result(f"{tableau.name}, {variant}", n, m, chunks, code, counters, cpu, limit), float(where[kernels.MU])
+
+
+def _result(
+    name: str, n: int, m: int, chunks: list[Array], code: int, counters: NDArray[np.int64], cpu: float, limit: TimeLimit
+) -> Result:
+    rows = np.concatenate(chunks).T
+    t = float(rows[0, -1])
+    message = f"{name} reached the end, t = {t:g}."
+    if limit.exceeded:
+        message = limit.message(name, t, "take longer steps")
+    elif code != kernels.DONE:
+        message = f"{name} failed after t = {t:.10g}: {REASONS[code]}. Take shorter steps."
+    return Result(
+        t=rows[0],
+        q=rows[1 : 1 + n],
+        v=rows[1 + n : 1 + 2 * n],
+        a=rows[1 + 2 * n : 1 + 3 * n],
+        lam=rows[1 + 3 * n :],
+        h=np.diff(rows[0]),
+        status=Status.SOLVER_FAILED if code != kernels.DONE or limit.exceeded else Status.REACHED_END,
+        message=message,
+        stats=Statistics(
+            n_accepted=int(counters[kernels.STEPS]),
+            n_rejected_error=int(counters[kernels.REFUSED]),
+            n_rejected_convergence=int(counters[kernels.DIVERGED]),
+            n_outer=int(counters[kernels.SWEEPS]),
+            n_inner=int(counters[kernels.NEWTON]),
+            n_evaluations=int(counters[kernels.EVALUATIONS]),
+            n_partitions=int(counters[kernels.PARTITIONS]),
+            n_factorizations=int(counters[kernels.FACTORIZATIONS]),
+            cpu_time=cpu,
+        ),
+    )

@@ -1,0 +1,412 @@
+"""The compiled steps of `paper.ablation`: one stage loop, in which variants differ by branches on `variant`."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+
+from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve, lu_factor, lu_solve
+from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.data.common import CONSTANT_MASS, INTEGERS, KIT, MATRIX, VECTOR
+from twoloop.kernels.evaluation.partition import full_pivoting
+
+POSITIONS, FROZEN, PROJECTED, STABILISED, UNPROJECTED = range(5)
+
+SAFETY, FASTEST, SLOWEST = 0.9, 5.0, 0.5  # fac, facmax, facmin of the paper
+AGAIN, HELD = 0.7, 10  # of a step that did not converge the longest one allowed for so many steps
+MOST_SWEEPS, MOST_NEWTON = 100, 10
+HOPELESS = 1e3  # times the first change of the stages: the loop diverges
+KEPT = 1e-9  # correction of q at which the constraints are solved: what is left is its square
+LEAST_STEP = 1e-12  # of the time span
+ROUNDING = 1e-14  # of coefficients
+
+DONE, NOT_CONVERGED, SINGULAR, TOO_SMALL = range(4)
+EVALUATIONS, FACTORIZATIONS, SWEEPS, NEWTON, STEPS, REFUSED, DIVERGED, PARTITIONS, N_COUNTERS = range(9)
+T, H, LONGEST, HOLD, MU, N_PLACES = range(6)  # places in `where`: the step-size control, and the largest |mu|
+
+
+class _Space(NamedTuple):
+    """Arrays of one run."""
+
+    M: Any  # (n, n) factors of the mass matrix
+    Cq: Any  # (m, n)
+    W: Any  # (s, m, n) rows of C_q M^-1, by stage
+    S: Any  # (m, m) factors of C_q M^-1 C_q^T
+    D: Any  # (m, m) factors of C_qd
+    pivots: Any  # (m)
+    C: Any  # (m)
+    q: Any  # (s, n) stages
+    v: Any  # (s, n)
+    a: Any  # (s, n)
+    lam: Any  # (s, m)
+    mu: Any  # (s, m)
+    off: Any  # (2, s, m) corrections of the multipliers
+    Kq: Any  # (s, n)
+    Kv: Any  # (s, n)
+    order: Any  # (n) of the columns of C_q, dependents first
+    rows: Any  # (m)
+    largest: Any  # (m)
+    P: Any  # (m, n) scratch of the partition
+
+
+@njit(error_model="numpy")
+def _matrices(f, w, t, q, W, counters):  # type: ignore[no-untyped-def]
+    """C_q, C_q M^-1 and the factors of C_q M^-1 C_q^T at q; False if they are singular."""
+    m, n = w.Cq.shape
+    if f.flags[CONSTANT_MASS] == 0 or counters[EVALUATIONS] == 0:
+        w.M[:, :] = 0.0
+        f.mass(t, q, f.p, w.M)
+        counters[FACTORIZATIONS] += 1
+        if not ldl_factor(w.M):
+            return False
+    w.Cq[:, :] = 0.0
+    f.jacobian(t, q, f.p, w.Cq)
+    for i in range(m):
+        for j in range(n):
+            W[i, j] = w.Cq[i, j]
+        ldl_solve(w.M, W[i])
+        for k in range(i + 1):
+            w.S[k, i] = 0.0
+            for j in range(n):
+                w.S[k, i] += w.Cq[k, j] * W[i, j]
+    counters[FACTORIZATIONS] += 1
+    return ldl_factor(w.S)
+
+
+@njit(error_model="numpy")
+def _free(f, w, t, q, v, a, counters):  # type: ignore[no-untyped-def]
+    """a = M^-1 Q."""
+    a[:] = 0.0
+    f.force(t, q, v, f.p, a)
+    ldl_solve(w.M, a)
+    counters[EVALUATIONS] += 1
+
+
+@njit(error_model="numpy")
+def _loaded(a, W, lam):  # type: ignore[no-untyped-def]
+    """a -= M^-1 C_q^T lam."""
+    for i in range(lam.size):
+        for j in range(a.size):
+            a[j] -= W[i, j] * lam[i]
+
+
+@njit(error_model="numpy")
+def _accelerate(f, w, t, q, v, a, lam, W, counters):  # type: ignore[no-untyped-def]
+    """a and lam of eq. (6); False if it is singular."""
+    if not _matrices(f, w, t, q, W, counters):
+        return False
+    _free(f, w, t, q, v, a, counters)
+    lam[:] = 0.0
+    f.gamma(t, q, v, f.p, lam)
+    for i in range(lam.size):
+        lam[i] = -lam[i]
+        for j in range(a.size):
+            lam[i] += w.Cq[i, j] * a[j]
+    ldl_solve(w.S, lam)
+    _loaded(a, W, lam)
+    return True
+
+
+@njit(error_model="numpy")
+def _residual(f, w, t, q, v, r):  # type: ignore[no-untyped-def]
+    """r = C_q v + C_t, with the C_q of w."""
+    r[:] = 0.0
+    f.constraint_rate(t, q, f.p, r)
+    for i in range(r.size):
+        for j in range(v.size):
+            r[i] += w.Cq[i, j] * v[j]
+
+
+@njit(error_model="numpy")
+def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
+    """Dependent positions by eq. (15), to a last correction of `enough`, then dependent velocities by eq. (14)."""
+    m = w.C.size
+    correction, tries = np.inf, 0
+    while True:
+        w.Cq[:, :] = 0.0
+        f.jacobian(t, q, f.p, w.Cq)
+        for i in range(m):
+            for j in range(m):
+                w.D[i, j] = w.Cq[i, w.order[j]]
+        counters[FACTORIZATIONS] += 1
+        if not lu_factor(w.D, w.pivots) > 0.0:
+            return False
+        if correction <= enough:
+            break
+        if tries == MOST_NEWTON:
+            return False
+        tries += 1
+        counters[NEWTON] += 1
+        w.C[:] = 0.0
+        f.constraint(t, q, f.p, w.C)
+        lu_solve(w.D, w.pivots, w.C)
+        correction = 0.0
+        for j in range(m):
+            q[w.order[j]] -= w.C[j]
+            correction = max(correction, abs(w.C[j]) / max(1.0, abs(q[w.order[j]])))
+        if not np.isfinite(correction):
+            return False
+    _residual(f, w, t, q, v, w.C)
+    lu_solve(w.D, w.pivots, w.C)
+    for j in range(m):
+        v[w.order[j]] -= w.C[j]
+    return True
+
+
+@njit(error_model="numpy")
+def _project(f, w, t, q, v, counters):  # type: ignore[no-untyped-def]
+    """Put q and v onto the constraints by the least change in the norm of M; False if that does not converge."""
+    correction, tries = np.inf, 0
+    while True:
+        if not _matrices(f, w, t, q, w.W[0], counters):
+            return False
+        if correction <= KEPT:
+            break
+        if tries == MOST_NEWTON:
+            return False
+        tries += 1
+        counters[NEWTON] += 1
+        w.C[:] = 0.0
+        f.constraint(t, q, f.p, w.C)
+        correction = _least_change(w, w.W[0], q)
+    _residual(f, w, t, q, v, w.C)
+    _least_change(w, w.W[0], v)
+    return True
+
+
+@njit(error_model="numpy")
+def _least_change(w, W, x):  # type: ignore[no-untyped-def]
+    """x -= M^-1 C_q^T S^-1 C; the largest change over max(1, |x|)."""
+    ldl_solve(w.S, w.C)
+    largest = 0.0
+    for j in range(x.size):
+        change = 0.0
+        for i in range(w.C.size):
+            change += W[i, j] * w.C[i]
+        x[j] -= change
+        change = abs(change) / max(1.0, abs(x[j]))
+        if not change <= largest:  # also true for NaN
+            largest = change
+    return largest
+
+
+@njit(error_model="numpy")
+def _partition(f, w, t, q, counters):  # type: ignore[no-untyped-def]
+    """Choose the dependent coordinates by Gauss elimination with full pivoting; False if rows depend on one another."""
+    m, n = w.P.shape
+    w.P[:, :] = 0.0
+    f.jacobian(t, q, f.p, w.P)
+    for j in range(n):
+        w.order[j] = j
+    for i in range(m):
+        w.rows[i] = i
+    counters[FACTORIZATIONS] += 1
+    counters[PARTITIONS] += 1
+    return full_pivoting(w.P, w.order, w.rows, w.largest, 0, m, m) == m
+
+
+@njit(error_model="numpy")
+def _combine(y, h, weights, K, out):  # type: ignore[no-untyped-def]
+    """out = y + h sum(weights K)."""
+    for i in range(y.size):
+        total = 0.0
+        for j in range(weights.size):
+            total += weights[j] * K[j, i]
+        out[i] = y[i] + h * total
+
+
+@njit(error_model="numpy")
+def _update(y, h, K, new, largest):  # type: ignore[no-untyped-def]
+    """K becomes new; the largest change of h K over max(1, |y|), or `largest`."""
+    for i in range(y.size):
+        change = h * abs(new[i] - K[i]) / max(1.0, abs(y[i]))
+        if not change <= largest:  # also true for NaN
+            largest = change
+        K[i] = new[i]
+    return largest
+
+
+@njit(error_model="numpy")
+def _sweep(f, w, variant, A, c, inverse, t, h, q, v, loop_tol, counters):  # type: ignore[no-untyped-def]
+    """Make all stages from the last ones: the largest change; NaN if a matrix is singular."""
+    s, m = w.lam.shape
+    change = 0.0
+    for j in range(s):
+        t_j, q_j, v_j = t + c[j] * h, w.q[j], w.v[j]
+        _combine(q, h, A[j], w.Kq, q_j)
+        _combine(v, h, A[j], w.Kv, v_j)
+        if variant == POSITIONS:
+            if not _satisfy(f, w, t_j, q_j, v_j, np.sqrt(loop_tol), counters):
+                return np.nan
+        elif variant == FROZEN:
+            for k in range(m):
+                q_j[w.order[k]] = q[w.order[k]]
+                v_j[w.order[k]] = v[w.order[k]]
+        if variant == STABILISED:
+            if not _matrices(f, w, t_j, q_j, w.W[j], counters):
+                return np.nan
+            for k, y in enumerate((q_j, v_j)):
+                if k == 0:
+                    w.C[:] = 0.0
+                    f.constraint(t_j, q_j, f.p, w.C)
+                else:
+                    _residual(f, w, t_j, q_j, v_j, w.C)
+                _least_change(w, w.W[j], y)  # as the multipliers' corrections will move the stage
+                w.off[k, j] = w.C
+            _free(f, w, t_j, q_j, v_j, w.a[j], counters)
+        elif not _accelerate(f, w, t_j, q_j, v_j, w.a[j], w.lam[j], w.W[j], counters):
+            return np.nan
+    if variant == STABILISED:
+        for j in range(s):
+            for l in range(s):
+                for i in range(m):
+                    w.mu[j, i] += inverse[j, l] / h * w.off[0, l, i]
+                    w.lam[j, i] += inverse[j, l] / h * w.off[1, l, i]
+            _loaded(w.v[j], w.W[j], w.mu[j])
+            _loaded(w.a[j], w.W[j], w.lam[j])
+    for j in range(s):
+        change = _update(q, h, w.Kq[j], w.v[j], change)
+        change = _update(v, h, w.Kv[j], w.a[j], change)
+    counters[SWEEPS] += 1
+    return change
+
+
+@njit(error_model="numpy")
+def _ends_in_a_stage(A, b):  # type: ignore[no-untyped-def]
+    """Whether the last stage is the end of the step."""
+    return np.abs(A[-1] - b).max() < ROUNDING
+
+
+@njit(error_model="numpy")
+def _step(  # type: ignore[no-untyped-def]
+    f, w, variant, A, b, c, inverse, t, h, start, end, loop_tol, where, counters
+):
+    """A step from the state `start` = [q v a lam] to `end`; DONE or why not."""
+    s, n = w.q.shape
+    q, v = start[:n], start[n : 2 * n]
+    if variant <= FROZEN and not _partition(f, w, t, q, counters):
+        return SINGULAR
+    w.mu[:, :] = 0.0
+    for j in range(s):
+        w.Kq[j] = v
+        w.Kv[j] = start[2 * n : 3 * n]
+        w.lam[j] = start[3 * n :]
+    first, sweeps, change = 0.0, 0, np.inf
+    while not change <= loop_tol:
+        change = _sweep(f, w, variant, A, c, inverse, t, h, q, v, loop_tol, counters)
+        sweeps += 1
+        first = change if sweeps == 1 else first
+        if sweeps == MOST_SWEEPS or not change <= HOPELESS * first:
+            return NOT_CONVERGED
+    q1, v1 = end[:n], end[n : 2 * n]
+    _combine(q, h, b, w.Kq, q1)
+    _combine(v, h, b, w.Kv, v1)
+    kept = True
+    if variant <= FROZEN:
+        kept = _satisfy(f, w, t + h, q1, v1, KEPT, counters)
+    elif variant == PROJECTED or (variant == STABILISED and not _ends_in_a_stage(A, b)):
+        kept = _project(f, w, t + h, q1, v1, counters)
+    if not kept:
+        return SINGULAR
+    where[MU] = max(where[MU], np.abs(w.mu).max() if w.mu.size else 0.0)
+    if not _accelerate(f, w, t + h, q1, v1, end[2 * n : 3 * n], end[3 * n :], w.W[0], counters):
+        return SINGULAR
+    return DONE
+
+
+@njit(error_model="numpy")
+def _error(n, tol, states):  # type: ignore[no-untyped-def]
+    """Eq. (27), over positions and velocities of a step's beginning, its end by one step, half way, and by two."""
+    total = 0.0
+    for i in range(2 * n):
+        scale = tol + tol * max(abs(states[0, i]), abs(states[1, i]))
+        total += ((states[1, i] - states[3, i]) / scale) ** 2
+    return np.sqrt(total / (2 * n))
+
+
+def _compile_now(function: Callable[..., Any]) -> Any:
+    """Compile for any mechanism and keep the machine code on disk until it or something that it calls changes."""
+    i8, f8 = types.int64, types.float64
+    sizes, tableau = (i8, i8, i8, i8, i8), (MATRIX, VECTOR, VECTOR, MATRIX)
+    signature = i8(KIT, *sizes, *tableau, f8, f8, i8, f8, f8, VECTOR, VECTOR, MATRIX, INTEGERS)
+    return compile_kept(function, signature, watch(function), error_model="numpy")
+
+
+@_compile_now
+def run(  # type: ignore[no-untyped-def]
+    f, n, m, s, variant, order, A, b, c, inverse, t0, t1, n_steps, tol, loop_tol, state, where, rows, counters
+):
+    """As many steps as `rows` has, each a row [t q v a lam], of `n_steps` equal ones or, if that is 0, under control.
+
+    The first call fills its one row with the start.
+    """
+    w = _Space(
+        np.zeros((n, n)),
+        np.zeros((m, n)),
+        np.zeros((s, m, n)),
+        np.zeros((m, m)),
+        np.zeros((m, m)),
+        np.zeros(m, dtype=np.int64),
+        np.zeros(m),
+        np.zeros((s, n)),
+        np.zeros((s, n)),
+        np.zeros((s, n)),
+        np.zeros((s, m)),
+        np.zeros((s, m)),
+        np.zeros((2, s, m)),
+        np.zeros((s, n)),
+        np.zeros((s, n)),
+        np.zeros(n, dtype=np.int64),
+        np.zeros(m, dtype=np.int64),
+        np.zeros(m),
+        np.zeros((m, n)),
+    )
+    if rows.shape[0] == 1:
+        a, lam = state[2 * n : 3 * n], state[3 * n :]
+        good = _accelerate(f, w, t0, state[:n], state[n : 2 * n], a, lam, w.W[0], counters)
+        rows[0, 0] = t0
+        rows[0, 1:] = state
+        return DONE if good else SINGULAR
+    w.M[:, :] = 0.0
+    f.mass(where[T], state[:n], f.p, w.M)
+    ldl_factor(w.M)
+    states = np.zeros((4, state.size))  # beginning, end by one step, half way, end by two
+    made = 0
+    while made < rows.shape[0] and where[T] < t1:
+        t, h = where[T], where[H]
+        last = counters[STEPS] + 1 == n_steps if n_steps > 0 else t + 1.01 * h >= t1
+        if n_steps == 0 and h < LEAST_STEP * (t1 - t0):
+            return TOO_SMALL
+        h = t1 - t if last else h
+        states[0] = state
+        code, part = DONE, 0
+        while code == DONE and part < (1 if n_steps > 0 else 3):
+            begin, share, start = ((0.0, 1.0, 0), (0.0, 0.5, 0), (0.5, 0.5, 2))[part]
+            place = (t + begin * h, share * h, states[start], states[part + 1])
+            code = _step(f, w, variant, A, b, c, inverse, *place, loop_tol, where, counters)
+            part += 1
+        if n_steps > 0 and code != DONE:
+            return code
+        if code != DONE:
+            counters[DIVERGED] += 1
+            where[LONGEST], where[HOLD], where[H] = AGAIN * h, HELD, 0.5 * h
+            continue
+        if n_steps == 0:
+            error = _error(n, tol, states)
+            factor = min(FASTEST, max(SLOWEST, SAFETY * max(error, 1e-12) ** (-1.0 / (order + 1))))
+            if not error <= 1.0:
+                counters[REFUSED] += 1
+                where[H] = h * min(factor, SAFETY)
+                continue
+            where[HOLD] -= 1.0
+            if where[HOLD] <= 0.0:
+                where[LONGEST] = t1 - t0
+            where[H] = min(h * factor, where[LONGEST])
+        counters[STEPS] += 1
+        where[T] = t1 if last else t0 + counters[STEPS] * h if n_steps > 0 else t + h
+        state[:] = states[part]
+        rows[made, 0] = where[T]
+        rows[made, 1:] = state
+        made += 1
+    return DONE

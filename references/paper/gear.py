@@ -1,0 +1,420 @@
+"""Backward differentiation with a fixed step and order on the index-3 form: the stand-in for ADAMS GSTIFF.
+
+ADAMS is not at hand. What it calls GSTIFF is Gear's method on the index-3 equations in variable order and step, with
+fixed coefficients and its own error test and starting procedure. This is a stand-in for it, not a copy: the same
+formulas and the same equations, at a step and an order that stay as they are given, as a run with HMAX = HINIT is
+meant. Numbers from here say what such formulas do; they are not numbers of ADAMS.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+from numpy.typing import ArrayLike, NDArray
+
+from references.driver import TimeLimit, check_choice, check_run, user_call
+from references.equations.accelerations import accelerations
+from references.scipy.index1 import solve_index1
+from twoloop.checks.arguments import check_positive, check_size, check_times
+from twoloop.checks.consistency import check_start
+from twoloop.kernels.algebra.linalg import lu_factor, lu_solve
+from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
+
+Array = NDArray[np.float64]
+
+LABEL = "fixed-step BDF, order {order}, index 3 (stand-in for ADAMS GSTIFF)"
+STARTS = {
+    "ramp": "orders 1, 2, ... at the full step until the order is reached",
+    "accurate": "first states by DOP853 with projection, to 1e-12",
+}
+HIGHEST = 6  # BDF of order 7 is unstable for any step
+
+START_TOLERANCE = 1e-12
+MAX_NEWTON = 10
+SLOW = 0.1  # a correction that is not this much smaller than the last one asks for a new Newton matrix
+DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |q|)
+FIRST_STEPS = 100  # of the first call of the compiled loop, when there is a time limit
+CALL = 0.05  # s; the steps of a call are doubled until one takes that long, for a call itself costs some 0.1 ms
+WHOLE = 1e-6  # how far, in steps, the length of t_span may be from a whole number of them
+
+DONE, NOT_CONVERGED, SINGULAR, NOT_FINITE = range(4)
+_REASONS = {
+    NOT_CONVERGED: f"Newton's method does not converge in {MAX_NEWTON} iterations",
+    SINGULAR: "Newton's matrix is singular",
+    NOT_FINITE: "Newton's method meets values that are not finite",
+}
+NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # places in the counters
+_INTEGRATE = types.int64(
+    KIT,
+    types.int64,
+    MATRIX,
+    MATRIX,
+    types.int64,
+    types.int64,
+    types.float64,
+    types.float64,
+    types.int64,
+    MATRIX,
+    types.float64,
+    INTEGERS,
+    MATRIX,
+    INTEGERS,
+)
+
+
+def solve_gear(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    step: float,
+    order: int = 2,
+    *,
+    start: str = "ramp",
+    newton_tol: float = 1e-12,
+    t_eval: ArrayLike | None = None,
+    time_limit: float | None = None,
+) -> Result:
+    """Integrate the index-3 equations by BDF with a fixed step and order: the stand-in for ADAMS GSTIFF.
+
+    At t_{n+1} the unknowns q, v and lam satisfy q' = v and M v' + C_q^T lam = Q, with q' and v' by the backward
+    differentiation formula of the order, and C = 0. Neither C_q v + C_t = 0 nor C_q a = Q_d is asked for.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem.
+    t_span : (float, float)
+        Start and end, s; a whole number of steps apart.
+    q0, v0 : array_like (n_q,)
+        Consistent initial coordinates and velocities.
+    step : float
+        Step size, s.
+    order : int
+        1 to 6.
+    start : {"ramp", "accurate"}
+        Where the first `order` states come from.
+
+        "ramp": the order grows from 1 by one a step, as in Gear's codes (C. W. Gear, Commun. ACM 14 (1971) 176-179),
+        GSTIFF among them. Those choose a small first step; here the first step is as long as the others, and the
+        start costs an error of order 2 in the step, whatever the order. Where the start is not at rest, the first
+        few multipliers and accelerations are wrong by what does not vanish with the step: after the first step the
+        centripetal part of them is half of what it should be.
+
+        "accurate": by `solve_index1` with projection and tolerances 1e-12, what a start under tight error control
+        would give. Not counted in cpu_time. Shows the error of the formula alone.
+    newton_tol : float
+        Newton's method ends when no coordinate is corrected by more than this, relative to max(1, |q|).
+    t_eval : array_like, optional
+        Increasing times in t_span, t_span[0] and multiples of the step from there, at which to store the solution.
+        None: every step.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s, an accurate start included, looked at about
+        every `CALL` seconds. A run past it is a failed one. None: no limit.
+
+    Returns
+    -------
+    Result
+        `a` is the BDF derivative of v, `lam` (with the sign of M a + C_q^T lam = Q) what Newton's method found; in the
+        states of the start that no formula made, both are those of eq. (6). `h` holds all steps made. Of the
+        statistics: n_accepted, n_outer (Newton iterations) and n_factorizations (Newton matrices, their derivatives by
+        differences). When Newton's method fails, what was computed before it, `Status.SOLVER_FAILED` and the time. A
+        run that reaches the end may be wrong: nothing controls the error. At small steps an undamped motion loses
+        energy at the orders 1, 2, 5 and 6 and gains it at 3 and 4.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
+
+    Notes
+    -----
+    With q = q* + h b v and v = v* + h b a, where q* and v* are combinations of the past and b is the formula's
+    coefficient, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
+    Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] then has a condition number that does not grow as h becomes small.
+    """
+    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
+    check_positive("step", step)
+    n_steps = round((t1 - t0) / step)
+    if n_steps < 1 or abs((t1 - t0) / step - n_steps) > WHOLE:
+        raise ValueError(
+            f"step must go a whole number of times into t_span, whose length is {t1 - t0!r}; given {step!r}"
+        )
+    if check_size("order", order, 1) > HIGHEST:
+        raise ValueError(f"order must be at most {HIGHEST}, BDF of higher order is unstable; given {order}")
+    check_choice("start", start, STARTS)
+    check_positive("newton_tol", newton_tol)
+    times = None if t_eval is None else check_times(t_eval, t0, t1, step)
+    check_start(system, t0, q0, v0)
+
+    h = (t1 - t0) / n_steps
+    n_given = min(order, n_steps) if start == "accurate" else 1
+    limit = TimeLimit(time_limit)
+    first = _first_states(system, np.array([t0 + k * h for k in range(n_given)]), q0, v0, limit)
+    if not first.success:
+        message = f"The accurate start failed. {first.message}"
+        if limit.passed():
+            message = limit.message("The accurate start", float(first.t[-1]), "take start='ramp'")
+        return replace(first, message=message)
+    keep = np.arange(n_steps + 1) if times is None else np.rint((times - t0) / h).astype(np.int64)
+    rows = np.empty((keep.size, 3 * system.n_q + system.n_c))
+    counters = np.zeros(N_COUNTERS, dtype=np.int64)
+    given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
+    past = np.zeros((HIGHEST, given.shape[1]))
+    code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
+    formulas = _formulas()
+    with user_call as clock:
+        while code == DONE and made < n_steps and not limit.passed():
+            called = time.monotonic()
+            last = min(made + stride, n_steps)
+            code = _integrate(
+                Kit(system.functions),
+                system.n_q,
+                given,
+                past,
+                made + 1,
+                last,
+                t0,
+                h,
+                order,
+                formulas,
+                float(newton_tol),
+                keep,
+                rows,
+                counters,
+            )
+            made = last
+            stride *= 2 if time.monotonic() - called < CALL else 1
+    return _result(system, order, t0, h, code, keep, rows, counters, clock.seconds or 0.0, limit)
+
+
+def _first_states(system: ConstrainedSystem, times: Array, q0: Array, v0: Array, limit: TimeLimit) -> Result:
+    """States at the first times; of a failed run those before its failure."""
+    if times.size > 1:
+        span = (float(times[0]), float(times[-1]))
+        return solve_index1(
+            system,
+            span,
+            q0,
+            v0,
+            "DOP853",
+            START_TOLERANCE,
+            START_TOLERANCE,
+            stabilisation="projection",
+            t_eval=times,
+            time_limit=limit.left(),
+        )
+    a, lam = accelerations(system, times, q0[:, None], v0[:, None])
+    return Result(
+        times, q0[:, None], v0[:, None], a, lam, np.empty(0), Status.REACHED_END, "the state given", Statistics()
+    )
+
+
+def _formulas() -> Array:
+    """Coefficients of orders 1 to 6, a row each: b and alpha_i, then the weights that extrapolate from k past values.
+
+    y_0 = h b y'_0 + sum_i alpha_i y_-i, from sum_{j=1}^k 1/j nabla^j y_0 = h y'_0 (Hairer, Norsett & Wanner I, III.1).
+    """
+    table = np.zeros((HIGHEST, 1 + 2 * HIGHEST))
+    for k in range(1, HIGHEST + 1):
+        c = [sum((-1) ** i * math.comb(j, i) / j for j in range(max(i, 1), k + 1)) for i in range(k + 1)]
+        table[k - 1, 0] = 1.0 / c[0]
+        for i in range(1, k + 1):
+            table[k - 1, i] = -c[i] / c[0]
+            table[k - 1, HIGHEST + i] = (-1) ** (i + 1) * math.comb(k, i)
+    return table
+
+
+def _result(
+    system: ConstrainedSystem,
+    order: int,
+    t0: float,
+    h: float,
+    code: int,
+    keep: NDArray[np.int64],
+    rows: Array,
+    counters: NDArray[np.int64],
+    cpu: float,
+    limit: TimeLimit,
+) -> Result:
+    n, made, stored = system.n_q, int(counters[STEPS]), int(counters[STORED])
+    failed = code != DONE or limit.exceeded
+    message = f"BDF of order {order} reached the end, t = {t0 + made * h:g}."
+    if limit.exceeded:
+        message = limit.message(f"BDF of order {order}", t0 + made * h, "take a larger step")
+    elif code != DONE:
+        message = (
+            f"BDF of order {order} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. Take a "
+            f"smaller step{' or a lower order' if order > 1 else ''}."
+        )
+    columns = rows[:stored].T
+    return Result(
+        t=np.asarray(t0 + h * keep[:stored], dtype=np.float64),
+        q=columns[:n],
+        v=columns[n : 2 * n],
+        a=columns[2 * n : 3 * n],
+        lam=columns[3 * n :],
+        h=np.full(made, h),
+        status=Status.SOLVER_FAILED if failed else Status.REACHED_END,
+        message=message,
+        stats=Statistics(
+            n_accepted=made,
+            n_outer=int(counters[NEWTON]),
+            n_factorizations=int(counters[MATRICES]),
+            cpu_time=cpu,
+        ),
+    )
+
+
+class _Space(NamedTuple):
+    """Arrays of one run."""
+
+    M: Any  # (n_q, n_q)
+    Cq: Any  # (n_c, n_q)
+    Q: Any  # (n_q)
+    C: Any  # (n_c)
+    v: Any  # (n_q)
+
+
+@njit(error_model="numpy")
+def _residual(f, w, t, q, forces, q_past, v_past, hb, r):  # type: ignore[no-untyped-def]
+    """r = [(h b)^2 (M a - Q) + C_q^T forces, C] at q, with v left in w.v and C_q in w.Cq."""
+    n, m = q.size, forces.size
+    w.M[:, :] = 0.0
+    w.Cq[:, :] = 0.0
+    w.Q[:] = 0.0
+    w.C[:] = 0.0
+    for i in range(n):
+        w.v[i] = (q[i] - q_past[i]) / hb
+    f.mass(t, q, f.p, w.M)
+    f.force(t, q, w.v, f.p, w.Q)
+    f.jacobian(t, q, f.p, w.Cq)
+    f.constraint(t, q, f.p, w.C)
+    for i in range(n):
+        r[i] = -hb * hb * w.Q[i]
+        for j in range(n):
+            r[i] += w.M[i, j] * (q[j] - q_past[j] - hb * v_past[j])
+    for k in range(m):
+        r[n + k] = w.C[k]
+        for i in range(n):
+            r[i] += w.Cq[k, i] * forces[k]
+
+
+@njit(error_model="numpy")
+def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J):  # type: ignore[no-untyped-def]
+    """Derivative of the residual r by [q, forces]; those of the equation of motion by q by differences."""
+    n, m = q.size, forces.size
+    J[:, :] = 0.0
+    for k in range(m):
+        for i in range(n):
+            J[i, n + k] = w.Cq[k, i]
+            J[n + k, i] = w.Cq[k, i]
+    for j in range(n):
+        before = q[j]
+        q[j] += DIFFERENCE * max(1.0, abs(before))
+        displacement = q[j] - before
+        _residual(f, w, t, q, forces, q_past, v_past, hb, there)
+        q[j] = before
+        for i in range(n):
+            J[i, j] = (there[i] - r[i]) / displacement
+
+
+@njit(error_model="numpy")
+def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, counters):  # type: ignore[no-untyped-def]
+    """Solve for q and forces = (h b)^2 lam, from what they hold; return DONE or why not."""
+    n = q.size
+    before, renew = np.inf, True
+    for _ in range(MAX_NEWTON):
+        _residual(f, w, t, q, forces, q_past, v_past, hb, r)
+        counters[NEWTON] += 1
+        if renew:
+            _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J)
+            counters[MATRICES] += 1
+            if not lu_factor(J, pivots) > 0.0:
+                return SINGULAR if np.isfinite(r).all() else NOT_FINITE
+        lu_solve(J, pivots, r)
+        size, correction = 1.0, 0.0
+        for i in range(n):
+            q[i] -= r[i]
+            size = max(size, abs(q[i]))
+            correction = max(correction, abs(r[i]))
+        for k in range(forces.size):
+            forces[k] -= r[n + k]
+        if not np.isfinite(r).all():
+            return NOT_FINITE
+        if correction <= tol * size:
+            return DONE
+        renew = correction > SLOW * before
+        before = correction
+    return NOT_CONVERGED
+
+
+def _compile_now(function: Callable[..., Any]) -> Any:
+    """Compile for `_INTEGRATE` and keep the machine code on disk until it or something that it calls changes."""
+    return compile_kept(function, _INTEGRATE, watch(function), error_model="numpy")
+
+
+@_compile_now
+def _integrate(  # type: ignore[no-untyped-def]
+    f,
+    n,
+    given,
+    past,
+    first,
+    last,
+    t0,
+    h,
+    order,
+    formulas,
+    tol,
+    keep,
+    rows,
+    counters,
+):
+    """Steps `first` to `last`; `keep` holds the numbers of those to store.
+
+    `given`, `past` and `rows` hold states [q v a lam]: of the start, of step i in row i % HIGHEST, those stored.
+    """
+    m = given.shape[1] - 3 * n
+    w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))
+    r, there, J, pivots = np.zeros(n + m), np.zeros(n + m), np.zeros((n + m, n + m)), np.zeros(n + m, dtype=np.int64)
+    combined, new = np.zeros(2 * n), past[(first - 1) % HIGHEST].copy()
+    for step in range(first, last + 1):
+        if step < given.shape[0]:
+            new[:] = given[step]
+        else:
+            k = min(order, step)
+            hb = h * formulas[k - 1, 0]
+            combined[:] = 0.0
+            new[n : 2 * n] = 0.0
+            for i in range(1, k + 1):
+                for j in range(2 * n):
+                    combined[j] += formulas[k - 1, i] * past[(step - i) % HIGHEST, j]
+                for j in range(n, 2 * n):
+                    new[j] += formulas[k - 1, HIGHEST + i] * past[(step - i) % HIGHEST, j]
+            for j in range(n):
+                new[j] = combined[j] + hb * new[n + j]
+            forces = new[3 * n :] * (hb * hb)
+            q_past, v_past, t = combined[:n], combined[n:], t0 + step * h
+            code = _newton(f, w, t, new[:n], forces, q_past, v_past, hb, tol, r, there, J, pivots, counters)
+            if code != DONE:
+                return code
+            for j in range(n):
+                new[n + j] = (new[j] - combined[j]) / hb
+                new[2 * n + j] = (new[n + j] - combined[n + j]) / hb
+            for j in range(m):
+                new[3 * n + j] = forces[j] / (hb * hb)
+        past[step % HIGHEST] = new
+        counters[STEPS] = step
+        if counters[STORED] < keep.size and keep[counters[STORED]] == step:
+            rows[counters[STORED]] = new
+            counters[STORED] += 1
+    return DONE

@@ -1,0 +1,1 @@
+"""SUNDIALS: IDA and CVODE through scikit-sundae, and driven from C."""

@@ -1,0 +1,131 @@
+"""CVODE's projection onto C = 0 and C_q v + C_t = 0 as machine code, for `references.sundials.cvode_c`."""
+
+import ctypes
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import carray, cfunc, njit, types
+from numba.core.dispatcher import Dispatcher
+
+from references.sundials.ida_compiled import RAISED
+from references.sundials.library import REALS, library
+
+MOST_ITERATIONS = 10  # of Newton's, which is done after one or two
+AGAIN = 1  # what a projection returns that failed, for CVODE to try a shorter step
+SMALLEST_PIVOT = 1e-12  # of C_q C_q^T, relative to its diagonal: the row follows from those before
+
+
+@lru_cache(maxsize=64)
+def projection_for_cvode(
+    constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher, n: int, m: int, n_p: int
+) -> tuple[Any, int]:
+    """CVODE's projection function, and the number of floats that its user data must hold.
+
+    Positions move by the shortest Newton corrections onto C = 0 until one is below CVODE's bound in its own norm, then
+    velocities by the shortest one onto C_q v + C_t = 0; the estimate of the error is projected onto what the
+    constraints leave free, as SUNDIALS' example of the pendulum does. The user data are [p, rtol, atol, work]; the
+    sizes are constants of the machine code.
+    """
+    ends = np.cumsum([n_p, 2, m * n, m * m, m, n]).tolist()
+    after_p, after_tol, after_Cq, after_S, after_r, n_memory = ends
+    array_of, size = library().N_VGetArrayPointer, 2 * n
+    # the same function of an integer, which can be compared with 0, the address of no vector
+    array_at = ctypes.CFUNCTYPE(REALS, ctypes.c_ssize_t)(ctypes.cast(array_of, ctypes.c_void_p).value or 0)
+
+    @njit(error_model="numpy")
+    def factor(t, q, p, Cq, S):  # type: ignore[no-untyped-def]
+        """Cholesky's factor of C_q C_q^T at q, in the lower half of S; zero in the columns of redundant rows."""
+        Cq[:, :] = 0.0
+        jacobian(t, q, p, Cq)
+        for i in range(m):
+            for k in range(i + 1):
+                S[i, k] = 0.0
+                for j in range(n):
+                    S[i, k] += Cq[i, j] * Cq[k, j]
+        for k in range(m):
+            diagonal = S[k, k]
+            for j in range(k):
+                S[k, k] -= S[k, j] * S[k, j]
+            if S[k, k] <= SMALLEST_PIVOT * diagonal:
+                for i in range(k, m):
+                    S[i, k] = 0.0
+                continue
+            S[k, k] = np.sqrt(S[k, k])
+            for i in range(k + 1, m):
+                for j in range(k):
+                    S[i, k] -= S[i, j] * S[k, j]
+                S[i, k] /= S[k, k]
+
+    @njit(error_model="numpy")
+    def shortest(Cq, S, r, x):  # type: ignore[no-untyped-def]
+        """The shortest x (n,) with C_q x = r; r is used up."""
+        for i in range(m):
+            for j in range(i):
+                r[i] -= S[i, j] * r[j]
+            r[i] = r[i] / S[i, i] if S[i, i] != 0.0 else 0.0
+        for i in range(m - 1, -1, -1):
+            for j in range(i + 1, m):
+                r[i] -= S[j, i] * r[j]
+            r[i] = r[i] / S[i, i] if S[i, i] != 0.0 else 0.0
+        x[:] = 0.0
+        for i in range(m):
+            for j in range(n):
+                x[j] += Cq[i, j] * r[i]
+
+    @njit(error_model="numpy")
+    def remove(Cq, S, r, x, from_v):  # type: ignore[no-untyped-def]
+        """Take from a velocity what the constraints do not allow; r has C_t, or zeros."""
+        for i in range(m):
+            for j in range(n):
+                r[i] += Cq[i, j] * from_v[j]
+        shortest(Cq, S, r, x)
+        for j in range(n):
+            from_v[j] -= x[j]
+
+    pointer = types.voidptr
+
+    @cfunc(types.int32(types.float64, pointer, pointer, types.float64, types.intp, pointer), error_model="numpy")
+    def projection(t, y, corr, bound, err, memory):  # type: ignore[no-untyped-def]
+        given, state, data = (
+            carray(array_of(y), (size,)),
+            carray(array_of(corr), (size,)),
+            carray(memory, (n_memory,), np.float64),
+        )
+        p, rtol, atol = data[:after_p], data[after_p], data[after_p + 1]
+        Cq, S = data[after_tol:after_Cq].reshape((m, n)), data[after_Cq:after_S].reshape((m, m))
+        r, x = data[after_S:after_r], data[after_r:]
+        for k in range(size):  # the assignment of one slice to another doubles the time of compiling
+            state[k] = given[k]
+        q, v = state[:n], state[n:]
+        try:
+            for iteration in range(MOST_ITERATIONS):
+                factor(t, q, p, Cq, S)
+                r[:] = 0.0
+                constraint(t, q, p, r)
+                shortest(Cq, S, r, x)
+                total = 0.0
+                for j in range(n):
+                    q[j] -= x[j]
+                    total += (x[j] / (rtol * abs(given[j]) + atol)) ** 2
+                if total <= bound * bound * size:
+                    break
+                if iteration == MOST_ITERATIONS - 1 or not np.isfinite(total):
+                    return AGAIN
+            factor(t, q, p, Cq, S)
+            r[:] = 0.0
+            constraint_rate(t, q, p, r)
+            remove(Cq, S, r, x, v)
+        except Exception:
+            return RAISED
+        for k in range(size):
+            state[k] -= given[k]
+        if err != 0:
+            estimate = carray(array_at(err), (size,))
+            r[:] = 0.0
+            remove(Cq, S, r, x, estimate[:n])
+            r[:] = 0.0
+            remove(Cq, S, r, x, estimate[n:])
+        return 0
+
+    return projection, n_memory

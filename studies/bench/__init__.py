@@ -1,0 +1,1 @@
+"""What the studies share: runs become rows, rows become findings, findings fill templates."""

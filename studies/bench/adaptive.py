@@ -1,0 +1,189 @@
+"""Rows of many solvers on many mechanisms in bounded time: each from its loosest setting on, until more is of no use.
+
+A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit at two settings
+running (a loose one may take longer than the next), has failed at two tolerances running after one that ended, or has
+taken more than `FAR` times as long as the fastest so far for no smaller an error, at two settings running. Where two of
+its errors lie more than a decade apart it is asked between them, so that nothing need be interpolated over more, and
+beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes `OUTCLASSED`
+times as long as another of its side is not repeated. A part of `studies.work_precision`.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from studies.bench.collector import NOTHING_RUN, Run
+from studies.bench.store import KeptRows, Row
+from studies.bench.tables import DECADE, LOOSEST, NEAR, TIGHTEST
+
+FAR = 20.0
+RUNNING = 2
+ROUNDS = 4  # of asking between settings
+OUTCLASSED = 10.0  # times the least time of its side: such a run decides nothing, and is made once
+CLOSE = 5.0  # times the time of the fastest: what costs more is not asked between its settings
+ENDING = (*NOTHING_RUN, "RAISED")
+FEWEST_STEPS, MOST_STEPS = 10, 10**6  # of a solver of fixed steps, beyond its grid
+COARSER = 10.0**0.5  # of steps where a tolerance changes by a decade
+
+Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
+
+
+class _Progress:
+    """How one solver has done on one mechanism so far."""
+
+    def __init__(self) -> None:
+        self.ended, self.reached, self.failed, self.far, self.stopped = False, False, 0, 0, 0
+
+    def judge(self, row: Row, fastest: float | None, all_asked: bool, tolerances: bool) -> None:
+        """Take a first repetition into account; `fastest`: the least time so far for no larger an error."""
+        self.reached = self.reached or row["error_q"] is not None
+        self.failed = self.failed + 1 if row["error_q"] is None and self.reached else 0
+        self.stopped = self.stopped + 1 if row["status"] == "TIME_LIMIT" else 0
+        far = fastest is not None and (row["call_s"] or 0.0) > FAR * fastest
+        self.far = self.far + 1 if far and row["error_q"] is not None else 0
+        hopeless = (tolerances and self.failed >= RUNNING) or (self.far >= RUNNING and not all_asked)
+        self.ended = row["status"] in ENDING or self.stopped >= RUNNING or hopeless
+
+
+def collect(
+    todo: Sequence[Run],
+    kept: KeptRows,
+    make: Callable[[Run, int, Built], Row],
+    all_asked: Callable[[Run], bool] = lambda run: False,
+    errors: Sequence[float] = (),
+) -> pd.DataFrame:
+    """Rows of all runs that are of use, the repetitions interleaved.
+
+    Parameters
+    ----------
+    todo : sequence of Run
+        Those of one solver on one mechanism from its loosest setting on.
+    kept : KeptRows
+    make : callable
+        make(run, repeat, built) -> row, with case, status, error_q and call_s.
+    all_asked : callable, optional
+        all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
+    errors : sequence of float, optional
+        The accuracies that are compared, for which solvers that are not far behind are asked between their settings.
+
+    Returns
+    -------
+    DataFrame
+        In the order of the runs, the repetitions of a run one below the other.
+    """
+    built: Built = set()
+    progress: dict[tuple[str, str], _Progress] = {}
+    reached: dict[str, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
+    todo = list(todo)
+
+    def first(run: Run) -> None:
+        if run.key(0) not in kept:
+            kept.add(run.key(0), make(run, 0, built))
+        row, runs = kept[run.key(0)], reached.setdefault(run.case.name, [])
+        good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
+        who = progress.setdefault((run.case.name, run.solver.name), _Progress())
+        who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
+        if row["error_q"] is not None and row["call_s"]:
+            runs.append((row["error_q"], row["call_s"]))
+
+    for run in todo:
+        who = progress.get((run.case.name, run.solver.name))
+        if who is None or not who.ended:
+            first(run)
+    for _ in range(ROUNDS if errors else 0):
+        more = [run for own in _by_solver(todo) for run in between(own, kept, reached, errors)]
+        for run in more:
+            first(run)
+        todo += more
+    again = _repeated(todo, kept)
+    for repeat in range(1, max((run.repeats for run in todo), default=0)):
+        for run in again:
+            if repeat < run.repeats and run.key(repeat) not in kept:
+                kept.add(run.key(repeat), make(run, repeat, built))
+    keys = [run.key(k) for run in todo for k in range(run.repeats)]
+    return pd.DataFrame([kept[key] for key in keys if key in kept])
+
+
+def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in todo:
+        groups.setdefault((run.case.name, run.solver.name), []).append(run)
+    return list(groups.values())
+
+
+def between(
+    own: Sequence[Run], kept: KeptRows, reached: Mapping[str, Sequence[tuple[float, float]]], errors: Sequence[float]
+) -> list[Run]:
+    """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
+    rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
+    made = sorted((value for value, row in rows.items() if row["error_q"]), reverse=True)
+    if not made:
+        return []
+    error = {value: max(float(rows[value]["error_q"]), float(rows[value].get("floor") or 0.0)) for value in made}
+    fastest = [
+        min((cpu for each, cpu in reached[own[0].case.name] if each <= error[value]), default=np.inf) for value in made
+    ]
+    close = {value: rows[value]["call_s"] <= CLOSE * least for value, least in zip(made, fastest, strict=True)}
+    asked = []
+    for loose, tight in itertools.pairwise(made):
+        apart, inside = error[loose] / error[tight], any(error[tight] < each < error[loose] for each in errors)
+        if inside and apart > DECADE and loose / tight > NEAR and (close[loose] or close[tight]):
+            asked.append(float(np.sqrt(loose * tight)))
+    asked += _beyond(own[0], made, error, close, sorted(rows), errors)
+    tidy = [_tidy(own[0], value) for value in asked]
+    return [replace(own[0], value=value) for value in dict.fromkeys(tidy) if value not in rows]
+
+
+def _tidy(run: Run, value: float) -> float:
+    """The nearest tolerance of two digits, or the nearest step of which the motion takes a whole number."""
+    return float(f"{value:.2g}") if run.solver.setting == "tol" else run.case.t_end / round(run.case.t_end / value)
+
+
+def _beyond(
+    run: Run,
+    made: Sequence[float],
+    error: Mapping[float, float],
+    close: Mapping[float, bool],
+    tried: Sequence[float],
+    errors: Sequence[float],
+) -> list[float]:
+    """Settings looser and tighter than those that a solver ended with (`made`, loose to tight) where these are close.
+
+    Steps so long that it failed are no end: between these and the longest that it ended with it is asked, too.
+    """
+    first, last, asked = made[0], made[-1], []
+    loosest, tightest, decade = LOOSEST, TIGHTEST, DECADE
+    if run.solver.setting != "tol":
+        loosest, tightest, decade = run.case.t_end / FEWEST_STEPS, run.case.t_end / MOST_STEPS, COARSER
+    if error[first] < max(errors) / DECADE and close[first]:
+        failed = [value for value in tried if value > first]
+        if not failed and first < loosest:
+            asked.append(min(loosest, decade * first))
+        elif run.solver.setting != "tol" and failed and failed[0] / first > NEAR:
+            asked.append(float(np.sqrt(first * failed[0])))
+    if last == tried[0] and error[last] > min(errors) and last > tightest and close[last]:
+        asked.append(max(tightest, last / decade))
+    return asked
+
+
+def _repeated(todo: Sequence[Run], kept: KeptRows) -> list[Run]:
+    """The runs that are repeated: those that were made and ended, and whose times may decide who is the fastest.
+
+    These are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error.
+    """
+    sides: dict[tuple[str, bool], list[tuple[float, float, Run]]] = {}
+    for run in todo:
+        if run.key(0) in kept and (row := kept[run.key(0)])["error_q"] is not None:
+            side = run.case.name, run.solver.family == "two-loop"
+            sides.setdefault(side, []).append((row["error_q"], row["call_s"] or 0.0, run))
+    found = set()
+    for ended in sides.values():
+        least = np.inf
+        for _, seconds, run in sorted(ended, key=lambda each: each[:2]):
+            least = min(least, seconds)
+            if seconds <= OUTCLASSED * least:
+                found.add(run.key(0))
+    return [run for run in todo if run.key(0) in found]

@@ -1,0 +1,111 @@
+"""How every study is called: one parser, one stamp, errors and Ctrl-C of one line."""
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+REPORTS = ROOT / "reports"
+PACKAGES = ("twoloop", "numpy", "scipy", "numba", "scikit-sundae", "exudyn")
+
+
+class StudyError(Exception):
+    """What ends a study with one line: a folder in use, rows that are missing, a file that cannot be read."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """How a study was called.
+
+    Attributes
+    ----------
+    study : str
+    quick : bool
+        The small version of some seconds.
+    out : Path
+        Folder of the report.
+    redraw : bool
+        Make report and figures again from the saved rows.
+    command : str
+        For the stamp.
+    """
+
+    study: str
+    quick: bool
+    out: Path
+    redraw: bool
+    command: str
+
+
+def parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """The options that all studies have; `name` is what follows `python -m studies.`."""
+    made = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=description)
+    made.add_argument("--quick", action="store_true", help="a small version in seconds, into reports/quick")
+    made.add_argument("--out", type=Path, help="folder for the report (default: reports)")
+    made.add_argument("--redraw", action="store_true", help="write report and figures again from the saved rows")
+    return made
+
+
+def call_of(name: str, given: argparse.Namespace, words: Sequence[str] | None) -> Call:
+    """The call that a parsed command line stands for."""
+    out = given.out or (REPORTS / "quick" if given.quick else REPORTS)
+    command = " ".join(["python -m", f"studies.{name}", *(sys.argv[1:] if words is None else words)])
+    return Call(name, given.quick, out, given.redraw, command)
+
+
+def parse(name: str, description: str | None, words: Sequence[str] | None) -> Call:
+    """Read the command line of a study that has the common options only."""
+    return call_of(name, parser(name, description).parse_args(words), words)
+
+
+def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | None = None) -> None:
+    """Run `work(words)`; a `StudyError` and Ctrl-C end the process with one line and a status that is not 0."""
+    try:
+        work(words)
+    except StudyError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("Interrupted. Finished runs are kept: the same command continues from them.", file=sys.stderr)
+        sys.exit(130)
+
+
+def stamp(command: str) -> str:
+    """One line: command, date, commit, machine, versions."""
+    versions = []
+    for package in PACKAGES:
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            versions.append(f"{package} (not installed)")
+    machine = f"{processor()}, {os.cpu_count()} cores"
+    system = f"{platform.system()}, Python {platform.python_version()}"
+    return "; ".join([f"`{command}`", date.today().isoformat(), f"commit {_commit()}", machine, system, *versions])
+
+
+def _commit() -> str:
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--", "twoloop", "references", "studies")
+        return git("rev-parse", "--short=10", "HEAD") + (" with uncommitted changes" if changed else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown (not a git checkout)"
+
+
+@cache
+def processor() -> str:
+    """The model of this machine's processor, as the system names it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

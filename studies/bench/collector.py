@@ -1,0 +1,400 @@
+"""The bench: a case (a mechanism and its reference) x a solver x a setting x a repetition is a row; one collector.
+
+A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechanisms stand in `cases/`, solvers in
+`solvers.py`, what a row says of the quality of a run in `metrics.py`.
+"""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from references.driver import user_call
+from studies.bench import metrics
+from studies.bench.reference_motion import ReferenceMotion, make_reference
+from studies.bench.store import KeptRows, Row
+from twoloop import Result, Statistics
+from twoloop.mechanisms import Problem
+
+Array = NDArray[np.float64]
+
+INSTANTS = 1000  # common instants of a case that names none
+WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
+COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
+AROUND = 10.0  # times the limit of a run, for all that an adapter does beside the user's call: building, output
+MOST_CALLS = 3
+REPEATS = 5
+NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
+ONCE = (*NOTHING_RUN, "TIME_LIMIT")  # which is not asked again
+
+
+class NotApplicable(Exception):
+    """Raised by a solver of the catalogue for a case that it cannot run; the text says why."""
+
+
+class TimeLimit(Exception):
+    """Raised in a run that has used up its CPU time."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A mechanism, a time span, and what runs are measured by.
+
+    Attributes
+    ----------
+    name : str
+        In tables and rows.
+    problem : Problem
+    t_end : float
+        s; runs start at 0.
+    known : callable or None
+        known() -> ReferenceMotion where the motion is known; None: two unlike methods make one.
+    n_instants : int
+        Common instants, evenly spaced in (0, t_end].
+    conserved : bool or None
+        Whether the problem's energy is an invariant of the true motion. None: as the problem says, and where it does
+        not, as the reference shows.
+    invariants : mapping
+        Further ones: column to invariant(t, q, v), for columns of states.
+    watched : tuple of int or None
+        Coordinates by which "out of phase" is judged. None: all.
+    step_sizes : tuple of float or None
+        s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
+    tolerances : tuple of float or None
+        For solvers that have one. None: those of the solver, from 1e-3 down; a stiff case asks for looser ones.
+    time_limit : float
+        CPU seconds that the call of a run may use that its user writes.
+    timed : float
+        s of CPU time: a shorter run is timed by calling it again until it has used so much.
+    tags : tuple of str
+        Class of the problem, "smooth", "stiff", "long", for tables over several cases.
+    note : str
+        What is assumed.
+    """
+
+    name: str
+    problem: Problem
+    t_end: float
+    known: Callable[[], ReferenceMotion] | None = None
+    n_instants: int = INSTANTS
+    conserved: bool | None = None
+    invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
+    watched: tuple[int, ...] | None = None
+    step_sizes: tuple[float, ...] | None = None
+    tolerances: tuple[float, ...] | None = None
+    time_limit: float = 60.0
+    timed: float = 0.02
+    tags: tuple[str, ...] = ()
+    note: str = ""
+
+    @cached_property
+    def instants(self) -> Array:
+        """The common instants (n_instants,), the last of which is t_end."""
+        return np.linspace(0.0, self.t_end, self.n_instants + 1)[1:]
+
+    @cached_property
+    def reference(self) -> ReferenceMotion:
+        """The motion against which errors are measured; made when first asked for."""
+        return make_reference(self.problem, self.t_end) if self.known is None else self.known()
+
+    @cached_property
+    def scale(self) -> metrics.Scale:
+        """Largest kinetic energy and ranges of the reference."""
+        conserved = self.problem.conserved if self.conserved is None else self.conserved
+        if conserved is None:
+            conserved = metrics.keeps_energy(self.problem, self.reference, self.instants)
+        return metrics.Scale(self.problem, self.reference, self.instants, conserved)
+
+    def steps(self) -> tuple[float, ...]:
+        """Fixed steps, s."""
+        return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A solver of the catalogue.
+
+    Attributes
+    ----------
+    name : str
+        Its line in tables and figures.
+    family : str
+        Whose it is: "two-loop" (this project), "SUNDIALS", "SciPy", "Exudyn", "stand-in".
+    called_from : str
+        What calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call.
+    keeps_constraints : bool
+        Whether the positions stay on the constraints to the solver's tolerance; False: they drift, or are off by the
+        solver's errors.
+    setting : str
+        What the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s).
+    run : callable
+        run(case, value, repeat) -> Result, from 0 to case.t_end, within case.time_limit where the solver has such a
+        limit. `repeat` counts from 0; a solver whose error scatters with rounding alone varies its input by it.
+    values : tuple of float
+        Values of the setting, loose to tight. Empty: those of the case, for "h".
+    fixed : mapping
+        Settings that do not vary, numbers or texts, for the row.
+    traces : bool
+        Whether it runs the mechanism's functions once, or has a model of its own, and calls none during a run.
+    own_accelerations : bool
+        Whether the accelerations in its results are not those of eq. (6) at its q and v.
+    used : callable or None
+        used(value, result) -> what a solver that chooses among methods took, between which nothing is interpolated.
+    builds_each : bool
+        Whether it compiles or builds anew for each value of the setting, not once a case.
+    builds_span : bool
+        Whether what it builds holds the time span, so that its warm-up is a whole run.
+    """
+
+    name: str
+    family: str
+    called_from: str
+    keeps_constraints: bool
+    setting: str
+    run: Callable[[Case, float, int], Result]
+    values: tuple[float, ...] = ()
+    fixed: Mapping[str, float | str] = field(default_factory=dict)
+    own_accelerations: bool = False
+    traces: bool = False
+    used: Callable[[float, Result], str] | None = None
+    builds_each: bool = False
+    builds_span: bool = False
+
+    def took(self, value: float, result: Result | None) -> str:
+        """The method that a run took, where the solver chooses; else nothing."""
+        return "" if self.used is None or result is None else self.used(value, result)
+
+    def grid(self, case: Case) -> tuple[float, ...]:
+        """The values of the setting to run on a case."""
+        if self.setting == "tol" and case.tolerances:
+            return case.tolerances
+        return self.values or case.steps()
+
+
+@dataclass(frozen=True)
+class Run:
+    """One cell: a solver on a case at one value of its setting, repeated.
+
+    Attributes
+    ----------
+    group : str
+        Part of the study to which the rows belong.
+    """
+
+    case: Case
+    solver: Solver
+    value: float
+    group: str = ""
+    repeats: int = REPEATS
+
+    @property
+    def settings(self) -> dict[str, float | str]:
+        """Names and values of the settings, for the row."""
+        return {**self.solver.fixed, self.solver.setting: self.value}
+
+    def key(self, repeat: int) -> str:
+        """What tells one row from all others of the study."""
+        settings = " ".join(f"{name}={value!r}" for name, value in sorted(self.settings.items()))
+        return f"{self.group} | {self.case.name} to {self.case.t_end!r} | {self.solver.name} | {settings} | {repeat}"
+
+
+Timed = tuple[Result | None, str, str, dict[str, Any]]  # result, status, message, columns of times
+Measure = Callable[[Run, Result], dict[str, Any]]
+
+
+def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None) -> pd.DataFrame:
+    """Make the rows of all runs that are not kept yet: one row a repetition.
+
+    The repetitions of a run are interleaved with those of all others, so that a slow minute of the machine falls on all
+    alike; what hits its limit or cannot be run is asked once. A run that fails, exceeds its time limit, or cannot be
+    made is a row whose status and message say so.
+
+    Parameters
+    ----------
+    runs : iterable of Run
+        No two with the same key.
+    kept : KeptRows
+        Of the study's `Output`; rows are on disk as soon as they are made.
+    measure : callable, optional
+        measure(run, result) -> further columns, of values that JSON holds. Not called where there is no result.
+
+    Returns
+    -------
+    DataFrame
+        In the order of the runs, the repetitions of a run one below the other.
+
+    Raises
+    ------
+    ValueError
+        If two runs have the same key.
+    """
+    runs = list(runs)
+    order = {run.key(k): (run, k) for run in runs for k in range(run.repeats)}
+    if len(order) < sum(run.repeats for run in runs):
+        raise ValueError("two runs of the study have the same group, case, solver and settings")
+    rounds = range(max((run.repeats for run in runs), default=0))
+    left = [(run, k) for k in rounds for run in runs if k < run.repeats and run.key(k) not in kept]
+    for case in {id(run.case): run.case for run, _ in left}.values():
+        _ = case.scale  # makes the reference, which is not to be timed with anything
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, disable=not sys.stdout.isatty())
+    with closing(_rows_of(left, kept, measure)) as made, bar as progress:
+        task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
+        for run, k, row in made:
+            kept.add(run.key(k), row)
+            progress.update(task, advance=1, description=f"{run.case.name}: {run.solver.name}"[:50].ljust(50))
+    return pd.DataFrame([kept[key] for key in order if key in kept])
+
+
+def _rows_of(
+    left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None
+) -> Generator[tuple[Run, int, Row], None, None]:
+    warm: set[tuple[int, str, float]] = set()
+    for run, k in left:
+        if k == 0 or kept[run.key(0)]["status"] not in ONCE:
+            yield run, k, row_of(run, k, measure, warm)
+
+
+def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
+    """Make a repetition of a run and measure it over the motion; `warm` is what `build` has compiled."""
+    case, solver = run.case, run.solver
+    row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
+    row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
+    row |= {**run.settings, "t_end": case.t_end, "repeat": k}
+    warm_up(run, k, warm)
+    result, status, message, times = timed(run, k)
+    stats = Statistics() if result is None else result.stats
+    row |= {**times, "status": status, "message": message, "used": solver.took(run.value, result)}
+    rejected = [n for n in (stats.n_rejected_error, stats.n_rejected_convergence) if n is not None]
+    row |= {"n_steps": stats.n_accepted, "n_rejected": sum(rejected) if rejected else None}
+    for name in ("n_evaluations", "n_outer", "n_inner", "n_partitions", "n_factorizations", "n_jacobians"):
+        row[name] = getattr(stats, name)
+    row["floor"] = case.reference.floor
+    if result is None:
+        return row | metrics.COLUMNS
+    invariants = dict(case.invariants)
+    try:
+        given = case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants
+        row |= metrics.measure(*given)
+        return row if measure is None else row | measure(run, result)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:  # the rest of the night goes on
+        why = f"{status}, but it cannot be measured: {type(error).__name__}: {error}"
+        return row | metrics.COLUMNS | {"status": "NOT_MEASURED", "message": why}
+
+
+def timed(run: Run, repeat: int) -> Timed:
+    """A run, its status and message, and what it takes, each call the same: all studies time in this place.
+
+    call_s is the CPU time of the call that a user writes, the mean over `calls` of them until their sum can be read
+    off the clock: of solve_dae all of it, of another project's solver what its adapter marks (`references.driver`).
+    inside_s is what the solver says of the time in its own loop.
+    """
+    result, status, message, spent = attempt(run, repeat)
+    if result is None:
+        return None, status, message, {"call_s": None, "inside_s": None, "calls": 0}
+    calls, inside = [spent], [result.stats.cpu_time]
+    while result.success and sum(calls) < run.case.timed and len(calls) < MOST_CALLS:
+        again, _, _, spent = attempt(run, repeat)
+        if again is None:
+            break
+        calls.append(spent)
+        inside.append(again.stats.cpu_time)
+    n = len(calls)
+    return result, status, message, {"call_s": sum(calls) / n or None, "inside_s": sum(inside) / n or None, "calls": n}
+
+
+def warm_up(run: Run, repeat: int, warm: set[tuple[int, str, float]], limit: float = COMPILING) -> None:
+    """Let a run compile what it calls, by the beginning of it, unless `warm` has it; a failure comes in the run."""
+    what = (id(run.case), run.solver.name, run.value if run.solver.builds_each else 0.0)
+    if what in warm:
+        return
+    warm.add(what)
+    if not run.solver.builds_span:
+        span = 10.0 * run.value if run.solver.setting == "h" else WARM_UP * run.case.t_end
+        run = replace(run, case=replace(run.case, t_end=min(span, run.case.t_end), time_limit=limit))
+    attempt(run, repeat, limit)
+
+
+def called_from(run: Run) -> str:
+    """What calls the mechanism: Python wherever functions that are called are Python themselves."""
+    in_python = run.case.problem.system.called_in_python and not run.solver.traces
+    return "Python" if in_python else run.solver.called_from
+
+
+def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result | None, str, str, float]:
+    """Make a run: its result, where there is one, a status, a message, and the CPU time of the user's call in s.
+
+    The limit is that of the user's call; all that an adapter does may take `around` s, by default AROUND times as much.
+    """
+    result, status, message, spent = None, "", "", 0.0
+    user_call.forget()
+    limit = run.case.time_limit
+    try:
+        with _Alarm(limit, AROUND * limit if around is None else around) as alarm:
+            began = time.process_time()
+            result = run.solver.run(run.case, run.value, repeat)
+            spent = time.process_time() - began
+    except NotApplicable as why:
+        status, message = "NOT_APPLICABLE", str(why)
+    except ImportError as error:
+        status, message = "NOT_AVAILABLE", str(error)
+    except RuntimeError as error:
+        # references/ say so what is to be installed for a package that is not there
+        status = "NOT_AVAILABLE" if isinstance(error.__context__, ImportError) else "RAISED"
+        message = str(error)
+    except Exception as error:  # a solver that raises must not end a night of runs: the row says what it raised
+        status, message = "RAISED", f"{type(error).__name__}: {error}"
+    if alarm.rang:  # whatever a foreign library has made of the exception
+        return None, "TIME_LIMIT", alarm.rang, 0.0
+    if result is None:
+        return None, status, message, 0.0
+    spent = spent if user_call.seconds is None else user_call.seconds
+    if result.status.name == "INTERRUPTED":  # Ctrl-C, which solve_dae turns into a partial result
+        raise KeyboardInterrupt
+    if not result.success and "time_limit =" in result.message:  # as the adapters in references/ say it
+        return result, "TIME_LIMIT", result.message, spent
+    return result, result.status.name, result.message, spent
+
+
+class _Alarm:
+    """Raise TimeLimit in this process when a user's call, or all around it, has used up its CPU time, where it can.
+
+    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised.
+    """
+
+    def __init__(self, seconds: float, around: float):
+        self.seconds, self.around, self.rang = seconds, around, ""
+        self._can = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+        self._began, self._before = 0.0, None
+
+    def __enter__(self) -> Self:
+        if self._can:
+            self._began = time.process_time()
+            # a timer of wall-clock time: one of CPU time makes the clocks of CPU time advance in ticks of 4 ms on Linux
+            self._before = signal.signal(signal.SIGALRM, self._look)  # type: ignore[assignment]
+            # again and again: an exception raised in a callback of a foreign solver may be swallowed by it
+            signal.setitimer(signal.ITIMER_REAL, 1.1 * self.seconds, min(1.0, 0.5 * self.seconds))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._can:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._before)
+
+    def _look(self, *_: object) -> None:
+        if user_call.so_far() >= 1.1 * self.seconds:  # a solver's own limit comes first
+            self.rang = f"Stopped after {self.seconds:g} s of CPU time, the limit of a run."
+        elif time.process_time() - self._began >= self.around:
+            self.rang = f"Stopped after {self.around:g} s of CPU time, the limit of all that an adapter does."
+        if self.rang:
+            raise TimeLimit

@@ -1,0 +1,261 @@
+"""One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
+
+import zlib
+from collections.abc import Iterable, Sequence
+from functools import cache
+from io import BytesIO
+from itertools import product
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
+from studies.bench.store import Output
+from studies.bench.tables import DECADE, SETTINGS, time_for, used
+
+MOST_LINES = 9
+FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
+MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA"), ("SciPy", ""))  # family, how names begin
+ERROR = "largest position error over the run (m, rad)"
+LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: not run, or failed"
+
+mpl.rcParams.update(
+    {
+        "figure.dpi": 130,
+        "savefig.bbox": "tight",
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "font.size": 9,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+        "lines.linewidth": 1.2,
+        "lines.markersize": 5,
+        "svg.hashsalt": "twoloop",  # the same figure is the same file
+        "svg.fonttype": "none",
+    }
+)
+
+# Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
+VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default, and of Taylor and others
+
+STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
+    "DOP853 (two-loop)": (RED, "o"),
+    "Adams": (BLACK, "o"),
+    "auto": (VIOLET, "s"),
+    "Taylor": (MAGENTA, "D"),
+    "auto, compiled": (VIOLET, "*"),
+    "Taylor, compiled": (MAGENTA, "*"),
+    "Adams, compiled": (BLACK, "*"),
+    "DOP853, compiled": (RED, "*"),
+    "TRBDF2": (SKY, "v"),
+    "ESDIRK4": (GREY, "v"),
+    "Gauss12": (BLUE, "s"),
+    "Gauss6": (SKY, "D"),
+    "SunRadau5": (PINK, "v"),
+    "RadauIIA5": (ORANGE, "^"),
+    "RadauIIA9": (BROWN, "^"),
+    "RadauIIA13": (MAGENTA, "^"),
+    "RadauIIA5, by differences": (GREY, "^"),
+    "Gauss6, Newton": (SKY, "X"),
+    "BDF": (GREEN, "P"),
+    "Newmark": (GREY, "h"),
+    "PaperIRK": (YELLOW, "H"),
+    "PaperIRK, Atol = Rtol varied": (YELLOW, "H"),
+    "PaperNewmark (beta = 1/2)": (GREY, "X"),
+    "PaperNewmark, beta = 1/4": (BLACK, "X"),
+    "Gauss6, momenta, symmetric": (BLACK, "D"),
+    "Gauss16": (BLUE, "D"),
+    "heyoka": (GREEN, "*"),
+    "CVODE from C, Adams": (SKY, ">"),
+    "CVODE from C, BDF": (ORANGE, ">"),
+    "CVODE from C, BDF, projected": (PINK, ">"),
+    "CVODE, Adams": (ORANGE, "<"),
+    "Dopri8, diffrax": (PINK, "X"),
+    "Pr9, index 1": (ORANGE, "p"),
+    "IDAS, CasADi": (RED, "d"),
+    "CVODES, CasADi": (BLUE, "d"),
+    "CVODES, CasADi, Adams": (GREEN, "d"),
+    "collocation, CasADi": (GREY, "d"),
+    "IDA from C, stabilised": (BLACK, ">"),
+    "IDA from C, q and v tested": (BLACK, "<"),
+    "IDA from C, order 2, positions tested": (BLUE, ">"),
+    "IDA, stabilised": (GREY, "<"),
+    "IDA, index1": (SKY, "<"),
+    "LSODA, index 1": (BROWN, "p"),
+    "DOP853, index 1": (PINK, "*"),
+    "DOP853, projected": (ORANGE, "*"),
+    "DOP853, Baumgarte 10": (GREEN, "s"),
+    "GSTIFF stand-in, order 1": (VIOLET, "1"),
+    "GSTIFF stand-in, order 2": (MAGENTA, "2"),
+    "GSTIFF stand-in, order 3": (GREEN, "3"),
+    "GSTIFF stand-in, order 4": (ORANGE, "4"),
+    "GSTIFF stand-in, order 5": (BLUE, "+"),
+    "GSTIFF stand-in, order 6": (BROWN, "x"),
+    "Radau, index 1": (PINK, "d"),
+    "BDF, index 1": (YELLOW, "d"),
+    "Exudyn, GeneralizedAlpha": (RED, "8"),
+    "Exudyn, GeneralizedAlpha 0.6": (ORANGE, "8"),
+    "Exudyn, GeneralizedAlpha 1": (BLACK, "8"),
+    "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
+}
+SAME = {  # a tableau looks like the preset that is made of it
+    "Sun Radau IIB(3)": "SunRadau5",
+    "Gauss(3)": "Gauss6",
+    "Gauss(3), symmetric partition": "Gauss6",
+    "Radau IIA(3)": "RadauIIA5",
+    "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
+}
+COLORS = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY, BROWN, VIOLET, MAGENTA, BLACK, YELLOW)
+MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
+
+
+@cache
+def looks() -> dict[str, tuple[str, str]]:
+    """Colour and marker of all solvers that are known: of those without an entry above, the next that are free."""
+    free = [pair for pair in _pairs() if pair not in STYLES.values()]
+    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES), free, strict=False))
+
+
+def _pairs() -> list[tuple[str, str]]:
+    return [(color, marker) for marker, color in product(MARKERS, COLORS)]
+
+
+def _look_of(solver: str) -> tuple[str, str]:
+    """That of a solver; of one that nobody knows, by its name, one that nobody has."""
+    known = looks()
+    if (name := SAME.get(solver, solver)) in known:
+        return known[name]
+    free = [pair for pair in _pairs() if pair not in known.values()]
+    return free[zlib.crc32(name.encode()) % len(free)]
+
+
+def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, object]:
+    """Colour, marker and line of a solver, the same in all figures; an open marker where the constraints drift."""
+    color, marker = _look_of(solver)
+    line: dict[str, object] = {"linestyle": "-", "linewidth": 1.7} if family == "two-loop" else {"linestyle": "--"}
+    made = line | {"color": color, "marker": marker}
+    return made if keeps_constraints else made | {"markerfacecolor": "white"}
+
+
+def look(row: pd.Series) -> dict[str, Any]:
+    """Colour, marker and line of the row's solver, labelled with its name."""
+    return style(row["solver"], row["family"], bool(row["keeps_constraints"])) | {"label": row["solver"]}
+
+
+def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None) -> None:
+    """One legend for all panels, right of them, each label once."""
+    entries: dict[str, Any] = {}
+    for panel in axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(entries.values(), entries.keys(), loc="outside right upper", title=title)
+
+
+def save(figure: Figure, output: Output, name: str) -> None:
+    """Write NAME.png and NAME.svg, a quick one marked as such, and close the figure."""
+    if output.call.quick:
+        figure.text(0.005, 0.005, "quick run: shorter and coarser than the report", fontsize=7, color=RED, va="top")
+    for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+        stream = BytesIO()
+        figure.savefig(stream, format=suffix, metadata=metadata)
+        output.write(f"{name}.{suffix}", stream.getvalue())
+    plt.close(figure)
+
+
+def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
+    """At most so many solvers of a case, those with the best places at the targets; in the order of the rows."""
+    places: dict[str, list[int]] = {}
+    for target in targets:
+        times = {solver: time_for(runs, target) for solver, runs in rows.groupby("solver", sort=False)}
+        ranked = sorted((time, str(solver)) for solver, time in times.items() if time == time)
+        for place, (_, solver) in enumerate(ranked):
+            places.setdefault(solver, []).append(place)
+    missing = len(rows["solver"].unique())
+    score = {solver: sum(got) + missing * (len(targets) - len(got)) for solver, got in places.items()}
+    best = sorted(score, key=score.__getitem__)[:most]
+    return [solver for solver in dict.fromkeys(rows["solver"]) if solver in best]
+
+
+def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
+    """The solvers that a figure of a case shows, of those with errors that can be told.
+
+    The default, compiled too, and the paper's procedure; the cheapest of the main rivals that got anywhere; of ours the
+    cheapest others, as many as there is room for.
+    """
+    seen = rows[_told(rows)]
+    first = [name for name in FIRST if (seen["solver"] == name).any()][:most]
+    rivals: list[str] = []
+    for family, begins in MAIN_RIVALS:
+        own = seen[(seen["family"] == family) & seen["solver"].str.startswith(begins)]
+        if not own.empty:
+            best = own.loc[own["error_q"].astype(float).idxmin(), "solver"]
+            rivals += cheapest_lines(rows[rows["solver"].isin(own["solver"])], targets, 1) or [best]
+    ours = seen[(seen["family"] == "two-loop") & ~seen["solver"].isin(first)]["solver"]
+    room = max(0, most - len(first) - len(rivals))
+    return [*first, *cheapest_lines(rows[rows["solver"].isin(ours)], targets, room), *rivals]
+
+
+def _told(rows: pd.DataFrame) -> pd.Series:
+    """Whether the reference resolves the error of a run, and the run has not lost the motion."""
+    resolved = rows["error_q"].astype(float) > rows["floor"].astype(float)
+    return resolved & ~rows["astray"].isin((True, "True")) if "astray" in rows else resolved
+
+
+def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
+    """The runs of one solver from its loosest setting on, with an empty row wherever no line is to be drawn.
+
+    As in `tables`, nothing is told between runs of errors more than a decade apart or of different methods, nor across
+    a run that failed. Runs whose errors cannot be told are left out.
+    """
+    settings = runs[[name for name in SETTINGS if name in runs]].astype(float)
+    setting = settings.bfill(axis=1).iloc[:, 0] if settings.shape[1] else pd.Series(np.nan, runs.index)
+    runs = runs.assign(error_q=runs["error_q"].astype(float).where(_told(runs)))
+    runs = runs.iloc[np.lexsort((-runs["error_q"], -setting))].reset_index(drop=True)
+    size = np.log(runs["error_q"])
+    methods = pd.Series([used(run) for _, run in runs.iterrows()])
+    apart = (size.diff().abs() > np.log(DECADE)) | (methods != methods.shift(fill_value=methods.get(0)))
+    return runs.reindex(sorted([*runs.index, *(runs.index[apart] - 0.5)]))
+
+
+def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR) -> Figure:
+    """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
+
+    `error` says what the column error_q is. Lines have the gaps of `with_gaps`.
+
+    Raises
+    ------
+    ValueError
+        If there are more than nine lines.
+    """
+    if len(solvers) > MOST_LINES:
+        raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.8), sharex=True, layout="constrained")
+    for solver in solvers:
+        runs = with_gaps(rows[rows["solver"] == solver])
+        known = runs[runs["error_q"].notna()]
+        if known.empty:
+            continue
+        called = "P" if known["called_from"].iloc[0] == "Python" else "c"
+        one = look(known.iloc[0]) | {"label": f"{solver} [{called}]"}
+        errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
+        spread = [times - runs["call_q1"].astype(float), runs["call_q3"].astype(float) - times]
+        left.errorbar(errors, times, yerr=spread, elinewidth=0.8, **one)
+        if known["n_evaluations"].notna().any():
+            right.plot(errors, runs["n_evaluations"].astype(float), **one)
+    for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
+        axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
+    legend(figure, [left], f"{LEGEND}\nleft out: motion lost\n[c] compiled, [P] Python")
+    figure.suptitle(title, fontsize=10)
+    return figure

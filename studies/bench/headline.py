@@ -1,0 +1,120 @@
+"""The headline of the comparisons: the default, the compiled default, the best of ours afterwards, against all rivals.
+
+In this order: a user gets the first, with one argument the second, and the third by choosing among our methods when all
+have been run. Each is compared with the best of the same rivals, on each mechanism at each error, by the time of the
+whole call.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pandas as pd
+
+from studies.bench import tables
+from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
+
+OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
+BEST = "best of ours"
+STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
+PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
+FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of which counts
+SCIPY = "SciPy's best"
+
+
+def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
+    """How each of the three stands on one case at one error, by the best of each; `rows`: medians, of all solvers."""
+    ours = rows["family"] == "two-loop"
+    own, others = tables.costs_at(rows[ours], error), tables.costs_at(rows[~ours], error, doubt=True)
+    sides = {DEFAULT: _only(own, DEFAULT), OWN_CODE: _only(own, OWN_CODE), BEST: own}
+    found = {
+        name: _told(side) | {"rival": _told(others)} | tables.compared(side, others) for name, side in sides.items()
+    }
+    for standing in found.values():
+        if standing["verdict"] == "alone" and not asked(rows[~ours], error):
+            standing["verdict"] = "unasked"
+    return found
+
+
+def asked(rivals: pd.DataFrame, error: float) -> bool:
+    """Whether rivals were put to a case (a refusal is our adapter's), and all of these to the end of what they can."""
+    put = tables.put(rivals)
+    return len(put) > 0 and all(tables.missed(own, error) for _, own in put.groupby("solver"))
+
+
+def _told(costs: tables.Costs) -> dict[str, Any]:
+    """The cheapest."""
+    best = min(costs, key=lambda name: costs[name][0], default=None)
+    return {"solver": best, "call_s": None if best is None else costs[best][0]}
+
+
+def _only(costs: tables.Costs, name: str) -> tables.Costs:
+    return {name: costs[name]} if name in costs else {}
+
+
+def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:
+    """Of many pairs of mechanism and error, in how many each of the three is ahead, behind, undecided, alone, missing.
+
+    `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
+    unbeaten the mechanisms, of n_mechanisms, at no error of which it is behind or missing where others get to.
+    """
+    mechanisms = [list(own) for own in found]
+    pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
+    made = []
+    for name in (DEFAULT, OWN_CODE, BEST):
+        verdicts = [each[name]["verdict"] for each in pairs]
+        line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
+        by_mechanism = [{each[name]["verdict"] for each in own} for own in mechanisms]
+        line["unbeaten"] = sum(not each & {"behind", "missed"} and each != {"none"} for each in by_mechanism)
+        line["n_mechanisms"] = len(mechanisms)
+        # "none" counts, too: the one in question does not get there, another of ours does
+        made.append(
+            {"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line[verdict] for verdict in STANDINGS)}
+        )
+    return made
+
+
+def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any] | None:
+    """What a call takes on one mechanism at PRICED, and the first call where code is built; None: it was not run.
+
+    Parameters
+    ----------
+    rows : DataFrame
+        Medians, of all mechanisms and solvers.
+    firsts : DataFrame
+        Rows of `studies.work_precision.first_calls`.
+    case : str
+
+    Returns
+    -------
+    dict
+        case, t_end, errors, first_at (tolerance of the first calls, None without them), and lines: name, first_s or
+        None, and at each error solver, call_s, keeps (the constraints) and from_python, or in their place why there is
+        none: "not run", "not reached", "not asked".
+    """
+    rows = rows[rows["case"] == case]
+    if rows.empty:
+        return None
+    first = firsts[(firsts["case"] == case) & firsts["first_call_s"].notna()] if "first_call_s" in firsts else firsts
+    own = {name: rows["solver"] == name for name in (DEFAULT, OWN_CODE, HEYOKA)}
+    sundials = {name: (rows["family"] == "SUNDIALS") & rows["solver"].str.startswith(name) for name in FROM_C}
+    lines = []
+    for name, which in (own | sundials | {SCIPY: rows["family"] == "SciPy"}).items():
+        runs = rows[which]
+        built = first[first["solver"].isin(runs["solver"])] if len(first) else first
+        first_s = float(built["first_call_s"].min()) if len(built) else None
+        lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error) for error in PRICED]})
+    found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
+    return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None}
+
+
+def _priced(runs: pd.DataFrame, error: float) -> dict[str, Any]:
+    by_solver = [(tables.time_for(own, error), str(name)) for name, own in runs.groupby("solver")]
+    best = min(((time, name) for time, name in by_solver if time == time), default=None)  # not NaN
+    if best is not None:
+        line = runs[runs["solver"] == best[1]].iloc[0]
+        told = {"keeps": bool(line["keeps_constraints"]), "from_python": bool(line["called_from"] == "Python")}
+        return {"solver": best[1], "call_s": float(best[0]), "why": None} | told
+    put = tables.put(runs)
+    missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
+    why = "not run" if put.empty else "not reached" if missed else "not asked"
+    return {"solver": None, "call_s": None, "why": why, "keeps": True, "from_python": False}

@@ -1,0 +1,207 @@
+"""The first screen, reports/README.md: which method to take, from the findings of all studies in the folder."""
+
+import importlib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from studies.bench.cli import StudyError
+from studies.bench.headline import BEST
+from studies.bench.render import number, power, render
+from studies.bench.store import TIMED, WHOLE_CALL, Output
+from studies.bench.takes import takes
+
+# claims and compare_page read the others' rows
+STUDIES = (
+    *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam", "validation"),
+    *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "claims"),
+    "compare_page",
+)
+CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen
+    ("smooth",): "smooth, rigid",
+    ("stiff", "vibrations irrelevant"): "stiff, vibrations irrelevant",
+    ("stiff", "vibrations wanted"): "stiff, vibrations wanted",
+}
+LONG = "long and conservative"
+WHOSE = ("ours", "others")
+COSTS = ("call_s", "n_evaluations", "violation_q", "called_from", "keeps")
+
+
+def findings(folder: Path) -> dict[str, dict[str, Any]]:
+    """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
+
+    Raises
+    ------
+    StudyError
+        If a file is damaged.
+    """
+    found = {}
+    for name in STUDIES:
+        path = folder / f"{name}.json"
+        if path.is_file():
+            try:
+                told = json.loads(path.read_text())
+            except ValueError as error:
+                raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{name} again") from None
+            if name not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
+                found[name] = told
+    return found
+
+
+def cases_of(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The mechanisms compared, in the order of their classes."""
+    known = list(CLASSES)
+    cases: list[dict[str, Any]] = found["work_precision"]["cases"] if "work_precision" in found else []
+    return sorted(cases, key=lambda case: [*known, tuple(case["tags"])].index(tuple(case["tags"])))
+
+
+def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """One entry a class of problem and mechanism: the cheapest of ours and of others at each accuracy."""
+    made = []
+    for case in cases_of(found):
+        label = CLASSES.get(tuple(case["tags"]), ", ".join(case["tags"]) or "other")
+        made.append(_entry(label, case, [_at_error(at) for at in case["at"]]))
+    if "energy" in found:
+        long = found["energy"]["long"]
+        case = {"name": f"four-bar, {long['case']}", "t_end": long["t_end"]}
+        made.append(_entry(LONG, case, [_at_energy(at, long["equal"], "no_drift", "drift") for at in long["at"]]))
+        made[-1]["without_drift"] = picks([_at_energy(at, long["equal"], "no_drift") for at in long["at"]])
+    return made
+
+
+def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[str, Any]:
+    reached = [line for line in at if line["ours"] and "ida" in line]
+    over = [line["ida"]["call_s"] / line["ours"]["call_s"] for line in reached if line["ida"]]
+    missed = [line for line in reached if line["ida_missed"]]
+    made = {"class": label, "name": case["name"], "t_end": case["t_end"], "at": at, "picks": picks(at)}
+    made |= {"ida_over": over, "ida_misses": [line["accuracy"] for line in missed], "without_drift": []}
+    return made | {"ida_tightest": max((line["ida_tightest"] for line in missed), default=None)}
+
+
+def _at_error(at: dict[str, Any]) -> dict[str, Any]:
+    """The line of a largest position error."""
+    told = {key: at[key] for key in ("ida", "ida_missed", "ida_tightest", "standing")}
+    line: dict[str, Any] = {"accuracy": power(at["error"]), **told, **dict.fromkeys(WHOSE)}
+    line["undecided"] = at["standing"] is not None and at["standing"][BEST]["verdict"] == "undecided"
+    for which in (which for which in WHOSE if at[which]):
+        line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
+    return line
+
+
+def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
+    """The line of a largest energy error, from runs with a drift, without, or both.
+
+    These are made once: times that differ by less than a share `equal` are not told apart.
+    """
+    line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
+    for which in WHOSE:
+        runs = [at[kind][which] for kind in kinds if at[kind][which]]
+        if runs:
+            best = min(runs, key=lambda run: float(run["call_s"]))
+            line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": best["drifts"]}
+    costs = sorted(line[which]["call_s"] for which in WHOSE if line[which])
+    return line | {"undecided": len(costs) > 1 and costs[0] > (1.0 - equal) * costs[1]}
+
+
+def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The cheapest solvers of all, each with the accuracies at which it is that, its times, and those of others."""
+    made: dict[str, dict[str, Any]] = {}
+    for line in at:
+        runs = [(line[which]["call_s"], which) for which in WHOSE if line[which]]
+        if runs:
+            which = min(runs)[1]
+            best, other = line[which], line["others" if which == "ours" else "ours"]
+            new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours", "asked": True}
+            new["undecided"] = []
+            pick = made.setdefault(best["solver"], new | {"accuracies": [], "call_s": [], "over": []})
+            pick["accuracies"].append(line["accuracy"])
+            pick["call_s"].append(best["call_s"])
+            pick["undecided"] += [line["accuracy"]] if line["undecided"] else []
+            pick["over"] += [other["call_s"] / best["call_s"]] if other else []
+            # of no other time is known: none gets there only if all were asked to their end, which for energies none is
+            standing = line["standing"]
+            alone = standing is not None and standing[BEST]["verdict"] == "alone"
+            pick["asked"] = pick["asked"] and (other is not None or alone)
+    return list(made.values())
+
+
+def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """The entries in groups: of one class and with the same solvers to pick."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for entry in entries:
+        same = [(pick["solver"], *pick["accuracies"]) for pick in entry["picks"]]
+        groups.setdefault((entry["class"], *same), []).append(entry)
+    return list(groups.values())
+
+
+def overall(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Solvers that are the cheapest of all at any error of any entry, and at how many; the most frequent first.
+
+    Errors at which ours and others are not told apart count for nobody.
+    """
+    chosen: Counter[str] = Counter()
+    for pick in (pick for entry in entries for pick in entry["picks"]):
+        chosen[pick["solver"]] += len(pick["accuracies"]) - len(pick["undecided"])
+    return [{"solver": solver, "n": n} for solver, n in chosen.most_common() if n]
+
+
+def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
+    """CPU times of an evaluation in µs in the table's first class, by what calls the mechanism."""
+    times: dict[str, list[float]] = {"compiled": [], "Python": []}
+    first = [at for entry in entries if entry["class"] == entries[0]["class"] for at in entry["at"]]
+    for best in (at[which] for at in first for which in WHOSE):
+        if best and best["n_evaluations"]:
+            times[best["called_from"]].append(1e6 * best["call_s"] / best["n_evaluations"])
+    return times
+
+
+def _render(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
+    default = found["work_precision"]["default"] if "work_precision" in found else ""
+    entries = classes(found)
+    groups = advice(entries)
+    more |= {"classes": entries, "cases": cases_of(found), "default": default, "takes": takes(found, groups)}
+    return render(template, found, {}, **more)
+
+
+def first_screen(folder: Path, quick: bool) -> str:
+    """The text of README.md of a folder of reports."""
+    studies = []
+    for name in STUDIES:
+        about = (importlib.import_module(f"studies.{name}").__doc__ or "").splitlines()[0].rstrip(".").split(":")[0]
+        names = ("compare.html",) if name == "compare_page" else (f"{name}.md", f"{name}.png")
+        files = [each for each in names if (folder / each).is_file()]
+        studies.append({"name": name, "about": about, "file": files[0] if files else None})
+    figure = (folder / "energy_cost.png").is_file()
+    found = findings(folder)
+    entries = classes(found)
+    more = {"studies": studies, "energy_figure": figure, "times": per_evaluation(entries), "overall": overall(entries)}
+    told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
+    more["drifting"] = any(best["drifts"] for best in told)
+    more["n_undecided"] = sum(at["undecided"] for entry in entries for at in entry["at"])
+    more["n_errors"] = sum(len(entry["at"]) for entry in entries)
+    more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
+    more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]
+    return _render("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
+
+
+def write_index(output: Output) -> None:
+    """Write README.md of the folder anew."""
+    output.write("README.md", first_screen(output.path, output.call.quick))
+
+
+def readme_block(found: dict[str, dict[str, Any]]) -> str:
+    """The generated piece of the project's README."""
+    return _render("readme", found, docs="docs/", reports="reports", every=False)
+
+
+def put_in_readme(folder: Path, readme: Path) -> None:
+    """Write the generated piece of the project's README, between its two marks, from the findings in a folder."""
+    found = findings(folder)
+    if "work_precision" not in found:
+        lacks = f"there is no work_precision.json in {folder} with times of the whole call"
+        raise StudyError(f"{lacks}; run python -m studies.work_precision")
+    begin, end = "<!-- generated: begin -->\n", "<!-- generated: end -->"
+    before, rest = readme.read_text().split(begin, 1)
+    readme.write_text(f"{before}{begin}{readme_block(found)}{end}{rest.split(end, 1)[1]}")

@@ -1,0 +1,146 @@
+"""The motion against which errors are measured: a known one, or one made of two unlike methods at tight tolerance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.scipy.index1 import solve_index1
+from studies.bench.cli import StudyError
+from twoloop import Result, solve_dae
+from twoloop.mechanisms import Problem
+
+Array = NDArray[np.float64]
+
+TIGHT = 1e-13  # tolerance of both runs of the smooth pair
+STIFF = 1e-11  # of the pair for stiff problems, which IDA does not follow below
+REFINED = 4  # parts of a step of the second run, at whose ends the first one is stored
+
+
+@dataclass(frozen=True)
+class ReferenceMotion:
+    """A motion known at all times.
+
+    Attributes
+    ----------
+    states : callable
+        states(t (n_t,)) -> q, v (n_q, n_t).
+    floor : float
+        Largest error of a position that it may have: smaller errors of a run cannot be told.
+    source : str
+        Where it comes from.
+    """
+
+    states: Callable[[Array], tuple[Array, Array]]
+    floor: float
+    source: str
+
+
+def make_reference(problem: Problem, t_end: float, time_limit: float | None = None) -> ReferenceMotion:
+    """Integrate by two unlike methods; their largest difference over the run, positions, is the floor.
+
+    Tried first is Gauss16 (two-loop) beside SciPy's DOP853 on the projected index-1 equations, at 1e-13, or, where the
+    mass matrix is singular, as with Euler parameters, which these do not take, beside DOP853 of two-loop; where either
+    fails, RadauIIA5 (two-loop, Newton's method) beside IDA on the stabilised index-1 form, at 1e-11. The first of a
+    pair is stored at four instants in each step of the second, between which the quintic in q, v and a is used.
+
+    Parameters
+    ----------
+    problem : Problem
+    t_end : float
+        s.
+    time_limit : float, optional
+        Wall-clock time that each run may take, s. None: no limit.
+
+    Raises
+    ------
+    StudyError
+        If no pair reaches t_end.
+    """
+    span, start = (0.0, t_end), (problem.q0, problem.v0)
+    said, smooth = [], False
+    for name, second, method, tolerance in (
+        ("Gauss16 (two-loop) and SciPy's DOP853, projected", _explicit, "Gauss16", TIGHT),
+        ("Gauss16 and DOP853 (both two-loop)", _own_explicit, "Gauss16", TIGHT),
+        ("RadauIIA5 (two-loop) and IDA, stabilised", _ida, "RadauIIA5", STIFF),
+    ):
+        if second is _own_explicit and smooth:
+            continue
+        try:
+            other = second(problem, t_end, tolerance, time_limit)
+        except (ValueError, RuntimeError) as error:  # it does not take this mechanism, or is not installed
+            said.append(str(error))
+            continue
+        smooth = True  # SciPy's solver takes the mechanism
+        if not other.success:
+            said.append(other.message)
+            continue
+        parts = [other.t[:-1] + k / REFINED * np.diff(other.t) for k in range(REFINED)]
+        fine = np.append(np.sort(np.concatenate(parts)), t_end)
+        given = (*start, method, tolerance, tolerance)
+        first = solve_dae(problem.system, span, *given, t_eval=fine, time_limit=time_limit)
+        if not first.success:
+            said.append(first.message)
+            continue
+        motion = Quintic(first.t, first.q, first.v, first.a)
+        differ = np.abs(motion(other.t)[0] - other.q).max()
+        floor = max(float(differ), motion.uncertainty(), 1e-15)
+        return ReferenceMotion(motion, floor, f"{name}, tolerances {tolerance:.0e}, which differ by {differ:.1e}")
+    raise StudyError(f"no reference for {problem.name!r}: {' / '.join(said)}")
+
+
+def _explicit(problem: Problem, t_end: float, tolerance: float, time_limit: float | None) -> Result:
+    run, tolerances = (problem.system, (0.0, t_end), problem.q0, problem.v0), (tolerance, tolerance)
+    return solve_index1(*run, "DOP853", *tolerances, stabilisation="projection", time_limit=time_limit)
+
+
+def _own_explicit(problem: Problem, t_end: float, tolerance: float, time_limit: float | None) -> Result:
+    run, tolerances = (problem.system, (0.0, t_end), problem.q0, problem.v0), (tolerance, tolerance)
+    return solve_dae(*run, "DOP853", *tolerances, time_limit=time_limit)
+
+
+def _ida(problem: Problem, t_end: float, tolerance: float, time_limit: float | None) -> Result:
+    from references.sundials.ida import solve_ida
+
+    run, tolerances = (problem.system, (0.0, t_end), problem.q0, problem.v0), (tolerance, tolerance)
+    return solve_ida(*run, "stabilised", *tolerances, time_limit=time_limit)
+
+
+def check_published(problem: Problem, motion: ReferenceMotion, t_end: float) -> float | None:
+    """Largest difference of the positions from the state that the problem gives; None where there is none by t_end."""
+    known = problem.reference
+    if known is None or known.t > t_end:
+        return None
+    return float(np.abs(motion.states(np.array([known.t]))[0][:, 0] - known.q).max())
+
+
+class Quintic:
+    """Piecewise polynomial of degree 5 through positions, velocities and accelerations at given instants."""
+
+    def __init__(self, t: Array, q: Array, v: Array, a: Array):
+        self._t, self._q, self._v, self._a = t, q, v, a
+
+    def uncertainty(self) -> float:
+        """Estimated largest error of q between the instants: from every second one, of which it falls with h^6."""
+        coarse = Quintic(self._t[::2], self._q[:, ::2], self._v[:, ::2], self._a[:, ::2])
+        skipped = self._t[1::2][: self._t[::2].size - 1]
+        return float(np.abs(coarse(skipped)[0] - self(skipped)[0]).max()) / 2**6
+
+    def __call__(self, times: Array) -> tuple[Array, Array]:
+        """q, v (n_q, n_t) at times within the instants."""
+        times = np.asarray(times, dtype=np.float64)
+        k = np.clip(np.searchsorted(self._t, times, side="right") - 1, 0, self._t.size - 2)
+        h = self._t[k + 1] - self._t[k]
+        s = (times - self._t[k]) / h
+        q0, v0, a0 = self._q[:, k], h * self._v[:, k], h * h * self._a[:, k]
+        # the remainder over the Taylor polynomial of the left end, from the conditions at the right end
+        dq = self._q[:, k + 1] - q0 - v0 - 0.5 * a0
+        dv = h * self._v[:, k + 1] - v0 - a0
+        da = h * h * self._a[:, k + 1] - a0
+        c3 = 10.0 * dq - 4.0 * dv + 0.5 * da
+        c4 = -15.0 * dq + 7.0 * dv - da
+        c5 = 6.0 * dq - 3.0 * dv + 0.5 * da
+        q = q0 + s * (v0 + s * (0.5 * a0 + s * (c3 + s * (c4 + s * c5))))
+        v = (v0 + s * (a0 + s * (3.0 * c3 + s * (4.0 * c4 + s * 5.0 * c5)))) / h
+        return q, v

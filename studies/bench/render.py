@@ -1,0 +1,116 @@
+"""Reports from templates: Jinja2 that fails on what is not defined, and one style of numbers."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+TEMPLATES = Path(__file__).parents[1] / "templates"
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """A number with `digits` significant digits: 0.012, 3.4, 120, 2.4e-5; "–" for one that does not exist.
+
+    Integers below 10,000 are written in full, powers of ten without a mantissa of 1 (1e-9).
+    """
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        value = float(value)  # a numpy scalar; anything else raises
+        if math.isnan(value):
+            return "–"
+    if value == 0:
+        return "0"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if isinstance(value, int) and abs(value) < 10_000:
+        return f"{value}".replace("-", "−")
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    place = int(exponent)
+    if -2 <= place <= 3:
+        text = f"{float(f'{mantissa}e{place}'):.{max(digits - 1 - place, 0)}f}"
+    else:
+        mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
+        text = f"{mantissa}e{place}"
+    return f"−{text[1:]}" if text[0] == "-" else text
+
+
+def power(value: float) -> str:
+    """A tolerance or an error level: one digit and a power of ten, 1e-2."""
+    mantissa, exponent = f"{value:.0e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def brief(stamp: str) -> str:
+    """Command, date, commit and machine of a stamp; the first line of the CSV has the versions, too."""
+    return "; ".join(stamp.split("; ")[:4])
+
+
+def percent(share: float) -> str:
+    """A share as a percentage of two significant digits."""
+    return f"{number(100.0 * share)} %"
+
+
+def listed(words: Iterable[str]) -> str:
+    """ "a", "a and b", "a, b and c"."""
+    texts = list(words)
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}" if texts else "none"
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A markdown table; texts are printed as they are, numbers by `number`; the first column to the left."""
+    lines = ["| " + " | ".join(header) + " |", "|---" + "|--:" * (len(header) - 1) + "|"]
+    for row in rows:
+        cells = [cell if isinstance(cell, str) else number(cell) for cell in row]
+        if len(cells) != len(header):
+            raise ValueError(f"a row of {len(cells)} cells under {len(header)} headings: {cells}")
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def environment() -> jinja2.Environment:
+    """The environment of all templates: `table(header, rows)`, and filters for numbers, lists, code and stamps."""
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,  # markdown, from our own data
+    )
+    made.filters |= {"code": "`{}`".format, "num": number, "power": power, "pct": percent, "listed": listed}
+    made.filters["brief"] = brief
+    made.globals["table"] = table
+    return made
+
+
+def render(name: str, findings: Mapping[str, Any], tables: Mapping[str, str], **more: Any) -> str:
+    """The text of templates/NAME.md.j2.
+
+    Parameters
+    ----------
+    name : str
+    findings : mapping
+        `f` in the template: the numbers and booleans that are saved as NAME.json.
+    tables : mapping
+        `tables` in the template: ready markdown.
+    **more
+        Further names, such as the stamp.
+
+    Raises
+    ------
+    jinja2.UndefinedError
+        If the template uses a name that is not defined.
+    """
+    text = environment().get_template(f"{name}.md.j2").render(f=findings, tables=tables, **more)
+    while "\n\n\n" in text:  # left by conditions that did not hold
+        text = text.replace("\n\n\n", "\n\n")
+    return text.strip("\n") + "\n"
+
+
+def number_of_words(text: str) -> int:
+    """Words of a report outside its tables and figures."""
+    lines = [line for line in text.splitlines() if not line.startswith(("|", "!["))]
+    return sum(len(line.split()) for line in lines)

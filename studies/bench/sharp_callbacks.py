@@ -1,0 +1,150 @@
+"""Callbacks of the mechanisms under the forces of `sharp_forces`, whose parameters come after their own."""
+
+from studies.bench.sharp_forces import drive, force_along
+from twoloop.kernels.compile.callbacks import callback
+from twoloop.mechanisms import spatial
+
+GRAVITY = 9.81  # m/s^2
+spatial_force = spatial.force
+
+# --- callbacks of a chain of points, p = [n lengths, n masses, ...], that hangs from a pivot driven along x
+
+
+@callback("mass")
+def chain_mass(t, q, p, M):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    for i in range(q.size):
+        M[i, i] = p[n + i // 2]
+
+
+@callback("force")
+def chain_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    for k in range(n):
+        Q[2 * k + 1] = -GRAVITY * p[n + k]
+    Q[2 * n - 2] += force_along(t, q[2 * n - 2], v[2 * n - 2], p)
+
+
+@callback("constraint")
+def chain_constraint(t, q, p, C):  # type: ignore[no-untyped-def]
+    for k in range(C.size):
+        x = q[2 * k] - (drive(t, p)[0] if k == 0 else q[2 * k - 2])
+        y = q[2 * k + 1] - (0.0 if k == 0 else q[2 * k - 1])
+        C[k] = 0.5 * (x * x + y * y - p[k] * p[k])
+
+
+@callback("jacobian")
+def chain_jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    for k in range(Cq.shape[0]):
+        x = q[2 * k] - (drive(t, p)[0] if k == 0 else q[2 * k - 2])
+        y = q[2 * k + 1] - (0.0 if k == 0 else q[2 * k - 1])
+        Cq[k, 2 * k] = x
+        Cq[k, 2 * k + 1] = y
+        if k > 0:
+            Cq[k, 2 * k - 2] = -x
+            Cq[k, 2 * k - 1] = -y
+
+
+@callback("constraint_rate")
+def chain_rate(t, q, p, Ct):  # type: ignore[no-untyped-def]
+    f, rate, _ = drive(t, p)
+    Ct[0] = -(q[0] - f) * rate
+
+
+@callback("gamma")
+def chain_gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
+    f, rate, second = drive(t, p)
+    for k in range(Qd.size):
+        x = v[2 * k] - (rate if k == 0 else v[2 * k - 2])
+        y = v[2 * k + 1] - (0.0 if k == 0 else v[2 * k - 1])
+        Qd[k] = -(x * x + y * y)
+    Qd[0] += (q[0] - f) * second
+
+
+# --- of a slider-crank of points, p = [crank, rod, two masses, ...]: x, y of the crank's end and x of the slider
+
+
+@callback("mass")
+def crank_mass(t, q, p, M):  # type: ignore[no-untyped-def]
+    M[0, 0] = p[2]
+    M[1, 1] = p[2]
+    M[2, 2] = p[3]
+
+
+@callback("force")
+def crank_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    Q[1] = -GRAVITY * p[2]
+    Q[2] = force_along(t, q[2], v[2], p)
+
+
+@callback("constraint")
+def crank_constraint(t, q, p, C):  # type: ignore[no-untyped-def]
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - p[0] * p[0])
+    C[1] = 0.5 * ((q[2] - q[0]) ** 2 + q[1] * q[1] - p[1] * p[1])
+
+
+@callback("jacobian")
+def crank_jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    Cq[0, 0] = q[0]
+    Cq[0, 1] = q[1]
+    Cq[1, 0] = q[0] - q[2]
+    Cq[1, 1] = q[1]
+    Cq[1, 2] = q[2] - q[0]
+
+
+@callback("gamma")
+def crank_gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
+    Qd[0] = -(v[0] * v[0] + v[1] * v[1])
+    Qd[1] = -((v[2] - v[0]) ** 2 + v[1] * v[1])
+
+
+# --- of two masses on springs with x1 + x2 = the drive, p = [two stiffnesses, two masses, ...]
+
+
+@callback("mass")
+def row_mass(t, q, p, M):  # type: ignore[no-untyped-def]
+    M[0, 0] = p[2]
+    M[1, 1] = p[3]
+
+
+@callback("force")
+def row_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    Q[0] = -p[0] * q[0]
+    Q[1] = -p[1] * q[1] + force_along(t, q[1], v[1], p)
+
+
+@callback("constraint")
+def row_constraint(t, q, p, C):  # type: ignore[no-untyped-def]
+    C[0] = q[0] + q[1] - drive(t, p)[0]
+
+
+@callback("jacobian")
+def row_jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    Cq[0, 0] = 1.0
+    Cq[0, 1] = 1.0
+
+
+@callback("constraint_rate")
+def row_rate(t, q, p, Ct):  # type: ignore[no-untyped-def]
+    Ct[0] = -drive(t, p)[1]
+
+
+@callback("gamma")
+def row_gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
+    Qd[0] = drive(t, p)[2]
+
+
+# --- of ready mechanisms: a torque on the first bar of the four-bar linkage, a force along the slider in space
+
+
+@callback("force")
+def four_bar_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    for i in range(3):
+        Q[3 * i + 1] = -p[i] * GRAVITY
+    Q[2] += force_along(t, q[2], v[2], p)
+
+
+@callback("force")
+def slider_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    spatial_force(t, q, v, p, Q)
+    Q[14] += force_along(t, q[14], v[14], p)

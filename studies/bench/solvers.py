@@ -1,0 +1,362 @@
+"""The catalogue: every solver that the studies compare, one entry each, usable on any case.
+
+An adapter that needs a model of its own (Exudyn) or compiled functions (IDA from C) raises `NotApplicable` for a case
+that it cannot run, which becomes a row. Foreign packages are imported when they are used, so that one that is not
+installed is a row too.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from references.scipy.index1 import solve_index1
+from studies.bench.collector import Case, NotApplicable, Solver
+from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
+from twoloop.methods.auto import LOOSE, TIGHTEST
+from twoloop.methods.plan import Method
+from twoloop.methods.tableaux import gauss, sun_radau_iib
+
+TOLERANCES = tuple(float(f"1e-{k}") for k in range(3, 14))  # of all solvers that have one: no gap of over a decade
+ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
+ERR_IN = 1e-9  # err_in and ...
+PAPER_TOL = 1e-5  # ... Atol = Rtol of the paper
+NEWTON_SHARE = 0.1  # of the steps with a new Jacobian, from which on a run of the default counts as implicit
+STORED = 5000  # about as many steps of a fixed-step solver are stored
+NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is shown
+
+IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
+IRK_LINE = "PaperIRK, Atol = Rtol varied"
+IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
+IDA_C_STATES = "IDA from C, q and v tested"
+CANONICAL = "Gauss6, momenta, symmetric"
+ADAMS, TAYLOR = "Adams", "Taylor"
+OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
+DEFAULT = "auto"  # of solve_dae
+# with code made for the mechanism, and the method of each
+COMPILED = {
+    "auto, compiled": DEFAULT,
+    "Taylor, compiled": TAYLOR,
+    "Adams, compiled": ADAMS,
+    "DOP853, compiled": "DOP853",
+}
+RADAU = ("RadauIIA5", "RadauIIA9", "RadauIIA13")
+IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", *RADAU, "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
+PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
+# of ours, beside the rivals
+OWN = (
+    *(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT),
+    *("Gauss12", "Gauss16", *RADAU, "TRBDF2", OWN_BDF),
+)
+IDA_FORMS = ("index1", "stabilised")
+EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
+RADII = (1.0, 0.6)  # spectral radii of GeneralizedAlpha, besides Exudyn's default of 0.9; 1 fails on index 3
+HEYOKA, CVODE_C, DIFFRAX, IDAS = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax", "IDAS, CasADi"
+CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
+ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
+GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
+GEAR_STARTS = ("accurate", "ramp")
+
+# other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
+RIVALS = (
+    *(HEYOKA, CVODE_C, "CVODE from C, BDF", CVODE_C_PROJECTED, IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX),
+    *(IDAS, "CVODES, CasADi", "CVODES, CasADi, Adams", "collocation, CasADi", "CVODE, Adams"),
+    *("LSODA, index 1", "DOP853, index 1"),
+    *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised"),
+    *("Radau, solve_dae", "Radau9, solve_dae"),
+    *("Exudyn, GeneralizedAlpha", "Exudyn, GeneralizedAlpha 0.6", "Exudyn, TrapezoidalIndex2"),
+)
+
+# in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
+MINIMAL_FAMILY = "minimal coordinates"
+MINIMAL = ("heyoka, minimal coordinates", "CVODE from C, minimal coordinates")
+
+# of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
+COMPARED_OWN = ("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF")
+COMPARED = (
+    *(*COMPARED_OWN, HEYOKA, CVODE_C, "CVODE from C, BDF"),
+    *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
+)
+
+
+def _start(case: Case) -> tuple[Any, Any, Any, Any]:
+    return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
+
+
+def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: bool = False) -> Result:
+    limit = case.time_limit
+    return solve_dae(*_start(case), method, tolerance, tolerance, time_limit=limit, compiled=compiled)
+
+
+def _chosen(tolerance: float, result: Result) -> str:
+    """What the default took: Newton's method, of which there are three by tolerance, or an explicit one."""
+    stats = result.stats
+    if (stats.n_jacobians or 0) < NEWTON_SHARE * (stats.n_accepted or 1):
+        return "explicit"
+    return "Newton, " + ("loose" if tolerance >= LOOSE else "tight" if tolerance >= TIGHTEST else "tightest")
+
+
+def _traced(method: str, compiled: bool, case: Case, tolerance: float, repeat: int) -> Result:
+    """`NotApplicable` where the callbacks cannot be run on symbols, which is a ValueError of `solve_dae`."""
+    try:
+        return _preset(method, case, tolerance, repeat, compiled)
+    except ValueError as why:
+        raise NotApplicable(str(why)) from None
+
+
+def _paper_irk(case: Case, tolerance: float, repeat: int) -> Result:
+    err_out = max(1e-4 * tolerance, 1e-14)  # smaller ones are below rounding
+    method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, err_out)
+    return _preset(method, case, tolerance, repeat)
+
+
+def _paper_irk_out(err_in: float, case: Case, err_out: float, repeat: int) -> Result:
+    return _preset(paper_irk(err_in, err_out), case, PAPER_TOL, repeat)
+
+
+def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repeat: int) -> Result:
+    return _preset(paper_newmark(err_in, err_out, beta), case, PAPER_TOL, repeat)
+
+
+def _canonical(case: Case, step: float, repeat: int) -> Result:
+    method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
+    return solve_dae(*_start(case), method=method, step_size=step, time_limit=case.time_limit)
+
+
+def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.sundials.ida import solve_ida
+
+    # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
+    rtol, times = tolerance * (1.0 + NUDGE * repeat), np.append(0.0, case.instants)
+    return solve_ida(*_start(case), form, rtol, tolerance, t_eval=times, time_limit=case.time_limit)
+
+
+def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
+    from references.sundials.ida_c import solve_ida_c
+
+    if case.problem.system.called_in_python:
+        raise NotApplicable("IDA from C needs compiled functions; this mechanism is plain Python (see IDA, stabilised)")
+    rtol, times = tolerance * (1.0 + NUDGE * repeat), np.append(0.0, case.instants)
+    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=times, time_limit=case.time_limit, **options)
+
+
+def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.scipy.fully_implicit import solve_fully_implicit
+
+    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, time_limit=case.time_limit)
+
+
+def _by_expressions(run: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
+    """Run a solver that takes expressions; `NotApplicable` where there are none."""
+    from references.equations.expressions import NotSymbolic
+
+    try:
+        return run(*arguments, **options)
+    except NotSymbolic as why:
+        raise NotApplicable(str(why)) from None
+
+
+def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.heyoka.taylor import solve_heyoka
+
+    times = np.append(0.0, case.instants)
+    return _by_expressions(solve_heyoka, *_start(case), tolerance, t_eval=times, time_limit=case.time_limit)
+
+
+def _cvode_c(method: str, projected: bool, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.sundials.cvode_c import solve_cvode_c
+
+    setting = (method, tolerance, tolerance)
+    options = {"projected": projected, "t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
+    return _by_expressions(solve_cvode_c, *_start(case), *setting, **options)
+
+
+def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
+    from references.minimal.equations import NoMinimalCoordinates
+    from references.minimal.solvers import solve_cvode_minimal, solve_heyoka_minimal
+
+    more: dict[str, Any] = {"t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
+    try:
+        if kind == "heyoka":
+            return solve_heyoka_minimal(case.problem, case.t_end, tolerance, **more)
+        return solve_cvode_minimal(case.problem, case.t_end, tolerance, tolerance, **more)
+    except NoMinimalCoordinates as why:
+        raise NotApplicable(str(why)) from None
+
+
+def _cvode(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.sundials.cvode import solve_cvode
+
+    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
+    return solve_cvode(*_start(case), "Adams", *tolerances, t_eval=times, time_limit=case.time_limit)
+
+
+def _diffrax(case: Case, tolerance: float, repeat: int) -> Result:
+    from references.diffrax.dopri8 import solve_diffrax
+
+    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
+    return _by_expressions(solve_diffrax, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
+
+
+def _casadi(method: str | None, case: Case, tolerance: float, repeat: int) -> Result:
+    """IDAS, or CVODES by a method."""
+    from references.casadi.integrators import solve_cvodes, solve_idas
+
+    solve = solve_idas if method is None else partial(solve_cvodes, method=method)
+    options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": case.time_limit}
+    return _by_expressions(solve, *_start(case), t_eval=np.append(0.0, case.instants), **options)
+
+
+def _collocation(case: Case, step: float, repeat: int) -> Result:
+    from references.casadi.integrators import solve_collocation
+
+    n_steps = round(case.t_end / step)
+    return _by_expressions(solve_collocation, *_start(case), n_steps, time_limit=case.time_limit)
+
+
+def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
+    return solve_index1(*_start(case), rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
+
+
+def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
+    from references.exudyn.four_bar import solve_exudyn
+    from references.exudyn.mechanisms import has_model, solve_exudyn_mechanism
+
+    n_steps = round(case.t_end / step)
+    store_every = max(1, n_steps // STORED)
+    n_steps = store_every * round(n_steps / store_every)  # of which it asks for a multiple
+    more = {"store_every": store_every, "time_limit": case.time_limit, **options}
+    if has_model(case.problem):
+        return solve_exudyn_mechanism(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
+    if "L3" not in case.problem.parameters:  # of the four-bar linkage
+        raise NotApplicable(
+            f"Exudyn needs a model of its own for every mechanism; there is none of {case.problem.name!r}"
+        )
+    return solve_exudyn(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
+
+
+def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Result:
+    from references.paper.gear import solve_gear
+
+    n_steps = round(case.t_end / step)
+    kept = np.append(np.arange(0, n_steps, max(1, n_steps // STORED)) * step, case.t_end)
+    return solve_gear(*_start(case), step, order, start=start, t_eval=kept, time_limit=case.time_limit)
+
+
+def baumgarte(method: str, alpha: float) -> str:
+    """Name of one of SciPy's solvers with Baumgarte's stabilisation."""
+    return f"{method}, Baumgarte {alpha:g}"
+
+
+def gear(order: int, start: str = "accurate") -> str:
+    """Name of the stand-in for ADAMS GSTIFF."""
+    return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
+
+
+def paper_irk_at(err_in: float) -> Solver:
+    """The paper's Runge-Kutta procedure along err_out, Atol = Rtol = 1e-5."""
+    run, fixed = partial(_paper_irk_out, err_in), {"err_in": err_in, "tol": PAPER_TOL}
+    return Solver(IRK, "two-loop", "compiled", True, "err_out", run, ERR_OUT, fixed)
+
+
+def paper_newmark_at(err_in: float, beta: float = 0.5) -> Solver:
+    """The paper's Newmark procedure along err_out."""
+    name, run = NEWMARK if beta == 0.5 else QUARTER, partial(_paper_newmark, beta, err_in)
+    return Solver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
+
+
+def _solver(name: str, family: str, called_from: str, setting: str, run: Any, **more: Any) -> Solver:
+    values = TOLERANCES if setting == "tol" else ()
+    return Solver(name, family, called_from, more.pop("keeps", True), setting, run, values, **more)
+
+
+def _index_1(name: str, keeps: bool, method: str, stabilisation: str, **fixed: float) -> Solver:
+    run = partial(_index1, {"method": method, "stabilisation": stabilisation, **fixed})
+    return _solver(name, "SciPy", "Python", "tol", run, keeps=keeps, fixed=fixed, own_accelerations=bool(fixed))
+
+
+def _all() -> Iterator[Solver]:
+    yield paper_irk_at(ERR_IN)
+    yield _solver(IRK_LINE, "two-loop", "compiled", "tol", _paper_irk)
+    yield paper_newmark_at(ERR_IN)
+    yield paper_newmark_at(ERR_IN, 0.25)
+    for preset in dict.fromkeys((*PRESETS, *OWN)):
+        run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
+        if preset == TAYLOR or preset in COMPILED:
+            run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
+        # the default compiles another method at other tolerances
+        more: dict[str, Any] = {"builds_each": True, "traces": True} if preset in COMPILED else {}
+        used = _chosen if COMPILED.get(preset, preset) == DEFAULT else None
+        yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, **more)
+    yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
+    own: dict[str, Any] = {"own_accelerations": True}
+    model = own | {"traces": True}
+    for form in IDA_FORMS:
+        keeps, run = form == "stabilised", partial(_ida, form)
+        yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
+    of_ida: dict[str, dict[str, Any]] = {
+        IDA_C: {},
+        IDA_C_STATES: {"error_test": "states"},
+        IDA_C_ORDER_2: {"max_order": 2, "error_test": "positions"},
+    }
+    for name, options in of_ida.items():
+        yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
+    yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True, traces=True)
+    for name, kind in zip(MINIMAL, ("heyoka", "CVODE"), strict=True):
+        more = {"traces": True, "builds_each": kind == "heyoka"}
+        yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
+    for name, method in ((CVODE_C, "Adams"), ("CVODE from C, BDF", "BDF"), (CVODE_C_PROJECTED, "BDF")):
+        keeps = name == CVODE_C_PROJECTED
+        run = partial(_cvode_c, method, keeps)
+        yield _solver(name, "SUNDIALS", "compiled", "tol", run, keeps=keeps, traces=True)
+    yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
+    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
+    more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
+    for name, integrator in ((IDAS, None), ("CVODES, CasADi", "BDF"), ("CVODES, CasADi, Adams", "Adams")):
+        yield _solver(name, "CasADi", "compiled", "tol", partial(_casadi, integrator), **more)
+    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, **more)
+    for name in ("Radau", "Radau9", "BDF"):
+        yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
+    for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
+        yield _index_1(f"{name}, index 1", False, name, "none")
+    run = partial(_index1, {"method": "Pr9"})
+    yield _solver("Pr9, index 1", "extensisq", "Python", "tol", run, keeps=False)
+    for name in ("DOP853", "RK45"):
+        yield _index_1(f"{name}, projected", True, name, "projection")
+    for name, alpha in product(("LSODA", "DOP853"), ALPHAS):
+        yield _index_1(baumgarte(name, alpha), False, name, "baumgarte", alpha=alpha)
+    for solver in EXUDYN:
+        keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
+        yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **model)
+    for radius in RADII:
+        fixed = {"spectral_radius": radius}
+        run = partial(_exudyn, "GeneralizedAlpha", fixed)
+        yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **model)
+    for order, start in product(GEAR_ORDERS, GEAR_STARTS):
+        run, fixed = partial(_gear, order, start), {"order": order}
+        yield _solver(gear(order, start), "stand-in", "compiled", "h", run, fixed=fixed, **own)
+
+
+CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
+
+# one sensible setting of each, for studies that show a run of every solver: two-loop procedures first
+LINE_UP: dict[str, float] = {
+    IRK: 1e-9,
+    NEWMARK: 1e-9,
+    QUARTER: 1e-9,
+    **dict.fromkeys(PRESETS, 1e-8),
+    "Newmark": 1e-6,  # of order 2: ten times the steps at 1e-8
+    CANONICAL: 0.01,
+    **{f"IDA, {form}": 1e-8 for form in IDA_FORMS},
+    IDA_C: 1e-8,
+    "LSODA, index 1": 1e-8,
+    "DOP853, index 1": 1e-8,
+    "DOP853, projected": 1e-8,
+    baumgarte("DOP853", 10.0): 1e-8,
+    **{f"Exudyn, {solver}": 1e-3 for solver in EXUDYN},
+    "Exudyn, GeneralizedAlpha 0.6": 1e-3,
+    "Exudyn, GeneralizedAlpha 1": 1e-3,
+    **{gear(order): 1e-3 for order in (2, 5)},
+}

@@ -1,0 +1,330 @@
+"""The folder of a report: one run at a time in it, atomic writes, rows that survive an interruption.
+
+Nothing is written through a symbolic link: a file is made under a new name in the folder and then renamed.
+"""
+
+import fcntl
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping
+from importlib.metadata import version
+from io import BytesIO, StringIO
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from studies.bench.cli import ROOT, Call, StudyError, processor
+
+Row = dict[str, Any]
+
+FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes kept rows worthless
+NUMERICS = ("numpy", "scipy", "numba")
+# studies whose times are compared, so that no two run at once
+TIMED = (
+    "work_precision",
+    "compare",
+    "table3",
+    "beam",
+    "energy",
+    "violation",
+    "symbolic_size",
+    "sweep_linkages",
+    "ablation",
+)
+WHOLE_CALL = "whole call"  # what their times are of, in their findings
+LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
+NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+
+
+class Output:
+    """The files of one run of a study; a context manager that holds the folder's lock.
+
+    Parameters
+    ----------
+    call : Call
+        Its `out` is made if it is not there.
+
+    Raises
+    ------
+    StudyError
+        If the folder cannot be written to, or another run is using it; if another full run of a study that compares
+        times goes on anywhere on the machine.
+    """
+
+    def __init__(self, call: Call):
+        self.call = call
+        self.path = call.out.resolve()
+        self._lock: int | None = None
+        self._machine: int | None = None
+
+    def __enter__(self) -> Self:
+        lock = self.path / ".lock"
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | NO_LINK, 0o644)
+            tempfile.TemporaryFile(dir=self.path).close()
+        except OSError as error:
+            self._unlock()
+            raise StudyError(f"cannot write to {self.path}: {error.strerror}; choose another folder by --out") from None
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._unlock()
+            raise StudyError(
+                f"another run is writing to {self.path}; wait for it, or choose another folder by --out"
+            ) from None
+        if self.call.study in TIMED and not (self.call.quick or self.call.redraw):
+            try:
+                self._machine = alone()
+            except StudyError:
+                self._unlock()
+                raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._unlock()
+
+    def _unlock(self) -> None:
+        if self._machine is not None:
+            os.close(self._machine)
+            self._machine = None
+        if self._lock is not None:
+            os.close(self._lock)  # which releases the lock, as the end of the process does
+            self._lock = None
+
+    def file(self, name: str) -> Path:
+        """Path of a file of the report to read, which must not be a link out of the folder."""
+        path = self.path / name
+        if path.is_symlink() and not path.resolve().is_relative_to(self.path):
+            raise StudyError(f"{path} is a link to {path.resolve()}, outside the folder; remove the link")
+        return path
+
+    def write(self, name: str, content: str | bytes) -> Path:
+        """Write a file, whole or not at all."""
+        path = self.file(name)
+        data = content.encode() if isinstance(content, str) else content
+        handle, new = tempfile.mkstemp(dir=self.path, prefix=f".{name}.")
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.chmod(new, 0o644)
+            os.replace(new, path)
+        except OSError as error:
+            Path(new).unlink(missing_ok=True)
+            raise StudyError(f"cannot write {path}: {error.strerror}") from None
+        return path
+
+    def save_rows(self, rows: pd.DataFrame, line: str) -> None:
+        """Write NAME.csv; its first line says study, quick or full, and the stamp `line`."""
+        self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False)}")
+
+    def load_rows(self) -> tuple[pd.DataFrame, str]:
+        """Read what `save_rows` wrote, and its stamp.
+
+        Raises
+        ------
+        StudyError
+            If there are no rows, or they are damaged, of another study, or quick where full ones are asked for.
+        """
+        path = self.file(f"{self.call.study}.csv")
+        rerun = f"make it again by python -m studies.{self.call.study}"
+        if not path.is_file():
+            raise StudyError(f"there is no {path} to redraw from; {rerun}")
+        try:
+            first, rest = path.read_text().split("\n", 1)
+            rows = pd.read_csv(StringIO(rest), low_memory=False)
+        except (ValueError, UnicodeDecodeError) as error:
+            raise StudyError(f"{path} is damaged ({error}); {rerun}") from None
+        if not first.startswith(f"# {self._kind()}; "):
+            raise StudyError(f"{path} holds other rows than {self._kind()} ones: {first[:60]!r}; {rerun}")
+        return rows, first.removeprefix(f"# {self._kind()}; ")
+
+    def save_findings(self, findings: Mapping[str, Any]) -> None:
+        """Write NAME.json; what is not finite becomes null."""
+        told = {"timed": WHOLE_CALL, "processor": processor()} if self.call.study in TIMED else {}
+        text = json.dumps(plain({**findings, **told}), indent=1, allow_nan=False, ensure_ascii=False)
+        self.write(f"{self.call.study}.json", text + "\n")
+
+    def load_findings(self) -> dict[str, Any]:
+        """Read what `save_findings` wrote."""
+        path = self.file(f"{self.call.study}.json")
+        try:
+            return dict(json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise StudyError(f"{path} cannot be read: {error}") from None
+
+    def save_series(self, series: Mapping[str, NDArray[Any]]) -> None:
+        """Write named arrays, of which figures are drawn, to NAME_series.npz."""
+        stream = BytesIO()
+        arrays = {name: np.asarray(x, np.float32) for name, x in series.items()}
+        np.savez_compressed(stream, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        self.write(f"{self.call.study}_series.npz", stream.getvalue())
+
+    def load_series(self) -> dict[str, NDArray[Any]]:
+        """Read what `save_series` wrote."""
+        path = self.file(f"{self.call.study}_series.npz")
+        try:
+            with np.load(path) as stored:
+                return {name: stored[name] for name in stored.files}
+        except (OSError, ValueError) as error:
+            raise StudyError(f"{path} cannot be read: {error}") from None
+
+    def kept(self, settings: Mapping[str, Any] | None = None) -> "KeptRows":
+        """The rows of an unfinished run of this study; `settings`: what they depend on beside sources and keys."""
+        depends = {"study": self.call.study, "quick": self.call.quick, **(settings or {})}
+        return KeptRows(self.file(f"{self.call.study}.partial.jsonl"), depends)
+
+    def _kind(self) -> str:
+        return f"{'quick' if self.call.quick else 'full'} {self.call.study}"
+
+
+def alone() -> int:
+    """Hold the machine for a study that compares times, by the descriptor that is returned; its end releases it.
+
+    Raises
+    ------
+    StudyError
+        If another such study runs.
+    """
+    path = Path(tempfile.gettempdir(), LOCK)
+    try:
+        # to read is enough for a lock, and of a file that another user has made all that may be
+        descriptor = os.open(path, os.O_RDONLY | NO_LINK)
+    except FileNotFoundError:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | NO_LINK, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise StudyError(
+            "another study is being timed on this machine, and two would slow one another down; wait for it"
+        ) from None
+    return descriptor
+
+
+class KeptRows:
+    """The rows of an unfinished study, in a file that vanishes when the study is complete.
+
+    A context manager: ended without an exception it removes the file; otherwise the rows stay for the next start. The
+    file begins with what the rows depend on. A file with another beginning, or with a line that is not a row, is set
+    aside under another name, which is printed; nothing of it is used.
+
+    Parameters
+    ----------
+    path : Path
+    settings : mapping
+        What the rows depend on beside the sources and their own key; anything that JSON holds.
+
+    Attributes
+    ----------
+    n_resumed : int
+        Rows that an interrupted run left here.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any]):
+        self.path = path
+        about = {"sources": sources(), "processor": processor(), "settings": dict(settings)}
+        self._header = json.dumps(about, sort_keys=True)
+        self._rows: dict[str, Row] = {}
+        self.n_resumed = 0
+
+    def __enter__(self) -> Self:
+        lines: list[str] = []
+        if self.path.exists():
+            # a last line without its end is a row whose writing was cut off
+            lines = self.path.read_text(errors="replace").split("\n")[:-1]
+            try:
+                self._rows = self._read(lines)
+            except ValueError as error:
+                lines, aside = [], next(path for k in count(1) if not (path := self._aside(k)).exists())
+                self.path.rename(aside)
+                print(f"{self.path.name}: {error}; set aside as {aside.name}")
+            self.n_resumed = len(self._rows)
+            if self._rows:
+                print(f"Continuing from {self.n_resumed} finished runs in {self.path}")
+        new = self.path.with_name(f".{self.path.name}.new")
+        new.unlink(missing_ok=True)
+        new.write_text("".join(f"{line}\n" for line in lines or [self._header]))
+        os.replace(new, self.path)
+        return self
+
+    def _aside(self, k: int) -> Path:
+        return self.path.with_suffix(f".aside-{k}")
+
+    def _read(self, lines: list[str]) -> dict[str, Row]:
+        if lines[:1] != [self._header] and self.path.stat().st_size > 0:
+            raise ValueError("its rows were made by other sources, with other settings or on another processor")
+        rows = {}
+        for number, line in enumerate(lines[1:], 2):
+            try:
+                kept = json.loads(line)
+                key, row = kept["key"], dict(kept["row"])
+            except (ValueError, KeyError, TypeError):
+                key, row = None, {}
+            if not isinstance(key, str):
+                raise ValueError(f"line {number} is not a row")
+            rows[key] = row
+        return rows
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.path.unlink()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._rows
+
+    def __getitem__(self, key: str) -> Row:
+        return self._rows[key]
+
+    def add(self, key: str, row: Row) -> None:
+        """Keep a row, with the processor that made it: it is on disk when this returns."""
+        line = json.dumps({"key": key, "row": plain(row) | {"processor": processor()}})
+        descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | NO_LINK)
+        with os.fdopen(descriptor, "a") as file:
+            file.write(line + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self._rows[key] = json.loads(line)["row"]  # as a later start would read it
+
+
+def sources() -> str:
+    """One hash of all that rows depend on: the sources as they are on disk, and the numerical packages."""
+    digest = hashlib.sha256()
+    for folder in FOLDERS:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(f"{path.relative_to(ROOT)}\n".encode() + path.read_bytes())
+    digest.update(" ".join(f"{package} {version(package)}" for package in NUMERICS).encode())
+    return digest.hexdigest()
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON holds it: numpy's types as Python's, what is not finite as None.
+
+    Raises
+    ------
+    TypeError
+        If it is of a type that JSON does not hold.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    raise TypeError(f"findings and rows hold numbers, booleans, texts and lists of these; given {type(value).__name__}")

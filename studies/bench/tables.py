@@ -1,0 +1,321 @@
+"""From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
+
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from studies.bench.collector import NOTHING_RUN
+from studies.bench.render import number, power
+
+Array = NDArray[np.float64]
+
+SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
+DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
+NEAR = 2.0  # settings that differ by less are nearly the same
+LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
+RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, and the percentiles that count of these
+LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
+LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
+CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
+FEWEST = 3  # repetitions that an interval asks for
+SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
+
+
+def medians(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row a run: the repetition of median error, with median and quartiles of the time of all calls.
+
+    The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
+    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all.
+    """
+    firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
+    errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
+    chosen, quartiles, kept = [], [], []
+    for run in np.split(np.arange(len(rows)), firsts[1:]):
+        chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
+        known = times[run][~np.isnan(times[run])]
+        kept.append(tuple(known))
+        quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
+    found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
+    found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
+    return found.assign(repeats=np.diff(firsts, append=len(rows)), times=pd.Series(kept, dtype=object))
+
+
+@cache
+def _rounds(n: int) -> NDArray[np.int64]:
+    """Rounds of n repetitions, drawn again (RESAMPLES, n): the same for all runs, as rounds are interleaved."""
+    return np.random.default_rng(SEED).integers(0, n, (RESAMPLES, n))
+
+
+def resampled(rows: pd.DataFrame) -> Array:
+    """Medians of the times of each row over rounds drawn again (n_rows, RESAMPLES); NaN of fewer than three."""
+    drawn = np.full((len(rows), RESAMPLES), np.nan)
+    for k, times in enumerate(rows.get("times", ())):
+        if len(times) >= FEWEST:
+            drawn[k] = np.median(np.array(times)[_rounds(len(times))], axis=1)
+    return drawn
+
+
+def setting_of(rows: pd.DataFrame) -> Array:
+    """Value of the setting that varies, of each row; NaN where there is none."""
+    found = np.full(len(rows), np.nan)
+    for name in SETTINGS:
+        if name in rows:
+            found = np.where(np.isnan(found), rows[name].to_numpy(float), found)
+    return found
+
+
+def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, float | None] | None:
+    """How many of the runs of one solver, by error, are good enough, and where between them and the next the target is.
+
+    `rows` are all of the solver, `runs` those that have an error and the cost. None: no run is so good, or none was
+    asked for about this: within a decade below the target, at the loosest setting that the solver can run, or next to a
+    run that is not good enough at nearly the same setting (the solver leaps over the target). The place between two
+    runs, on the log-log line through them, is None where they are more than a decade apart or of different methods.
+    """
+    errors = _errors(runs)
+    n_good = int((errors <= target).sum())
+    if n_good == 0 or target < runs["floor"].max():
+        return None
+    below, settings, end = errors[n_good - 1], setting_of(runs), n_good == len(errors)
+    joined = not end and 0.0 < errors[n_good] <= DECADE * below
+    near = not end and 1.0 / NEAR <= settings[n_good] / settings[n_good - 1] <= NEAR
+    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
+        return None
+    if not joined or used(runs.iloc[n_good - 1]) != used(runs.iloc[n_good]):
+        return n_good, None
+    x = np.log(errors[n_good - 1 : n_good + 1])
+    return n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
+
+
+def _loosest(rows: pd.DataFrame) -> float:
+    """The setting than which none is looser that the solver can run: tried, or of no use."""
+    settings, good = setting_of(rows), rows["error_q"].notna().to_numpy()
+    best = float(settings[good].max(initial=0.0))
+    return best if (settings[~good] > best).any() else LOOSEST
+
+
+def used(run: pd.Series) -> str:
+    """The method that a solver took which chooses; a file has nothing where there is none."""
+    return run["used"] if isinstance(run.get("used"), str) else ""
+
+
+def _errors(runs: pd.DataFrame) -> Array:
+    return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
+
+
+def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
+    """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
+    n_good, share = place
+    best = costs[:n_good].min(axis=0)
+    if share is None:
+        return np.asarray(best)
+    with np.errstate(invalid="ignore"):
+        between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
+    return np.minimum(best, between)
+
+
+def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
+    """The runs that have an error and this cost, by error."""
+    return rows[rows["error_q"].notna() & rows[what].notna()].sort_values("error_q", kind="stable")
+
+
+def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
+    """Time of a call (or another cost) of one solver for an error of at most `target`.
+
+    Between two runs less than a decade apart, on the log-log line through them: solvers whose settings lie apart are
+    not made to look expensive by it. NaN where no run is so good, where the solver was not asked for about so much, and
+    where the target is below what the reference resolves.
+    """
+    runs = _told(rows, what)
+    place = None if runs.empty else _place(rows, runs, target)
+    return float("nan") if place is None else float(_cost(runs[what].to_numpy(float), place))
+
+
+Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
+
+
+def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
+    """Of the solvers of one case that get to an error and were asked for about so much, what they take.
+
+    `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
+    either side, so that nobody is ahead of a solver for want of a run.
+    """
+    found = {}
+    for solver, own in rows.groupby("solver", sort=False):
+        runs = _told(own, "call_s")
+        place = None if runs.empty else _place(own, runs, target)
+        if place is None and doubt and not runs.empty and target >= runs["floor"].max():
+            n_good = int((_errors(runs) <= target).sum())
+            place = None if n_good == 0 else (min(n_good + 1, len(runs)), None)
+        if place is not None:
+            found[str(solver)] = float(_cost(runs["call_s"].to_numpy(float), place)), _cost(resampled(runs), place)
+    return found
+
+
+def compared(own: Costs, others: Costs) -> dict[str, Any]:
+    """Time of the best of others over that of the best of `own` at one error on one case, and what it comes to.
+
+    Returns
+    -------
+    dict
+        ratio; interval, its range over the repetitions drawn again, which is the scatter of these few and no
+        confidence interval, or None; verdict: "ahead" where all of the range is above LEAST, "behind" where it is
+        below 1 / LEAST, else "undecided"; "alone" where no other gets there, "missed" where own does not and another
+        does, "none" where neither does.
+    """
+    if not own or not others:
+        verdict = "alone" if own else "missed" if others else "none"
+        return {"ratio": None, "interval": None, "verdict": verdict}
+    least, drawn = zip(
+        *(
+            (min(time for time, _ in side.values()), np.min([each for _, each in side.values()], axis=0))
+            for side in (own, others)
+        ),
+        strict=True,
+    )
+    low, high = (float(x) for x in np.percentile(drawn[1] / drawn[0], INTERVAL))
+    verdict = "ahead" if low > LEAST else "behind" if high < 1.0 / LEAST else "undecided"
+    return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
+
+
+def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
+    """The solvers of one case that reach an error, cheapest first.
+
+    Returns
+    -------
+    DataFrame
+        solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on the
+        log-log line between two runs), and violation_q, violation_v, energy of the cheapest run that is as good.
+    """
+    lines = []
+    for solver, runs in rows.groupby("solver", sort=False):
+        cpu = time_for(runs, target)
+        if np.isnan(cpu):
+            continue
+        good = runs[runs["error_q"] <= target]
+        run = good.loc[good["call_s"].astype(float).idxmin()]
+        line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
+        line |= {
+            "call_s": cpu,
+            **{what: time_for(runs, target, what) for what in ("call_q1", "call_q3", "n_evaluations")},
+        }
+        lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
+    return pd.DataFrame(lines).sort_values("call_s", ignore_index=True) if lines else pd.DataFrame()
+
+
+def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
+    """The first line of a ranking as a finding; None where there is none."""
+    if ranked.empty:
+        return None
+    keys = ("solver", "call_s", "n_evaluations", "called_from", "violation_q", "energy")
+    found = {key: ranked.iloc[0][key] for key in keys}
+    kept, family = ranked.iloc[0][["keeps_constraints", "family"]]
+    return found | {"keeps": bool(kept), "ours": bool(family == "two-loop")}
+
+
+def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
+    """The cheapest of ours and of others in a ranking."""
+    if ranked.empty:
+        return {"ours": None, "others": None}
+    own = ranked["family"] == "two-loop"
+    return {"ours": best(ranked[own]), "others": best(ranked[~own])}
+
+
+def put(rows: pd.DataFrame) -> pd.DataFrame:
+    """Those rows for which a solver was started: a refusal is our adapter's, and says nothing of the solver."""
+    return rows[~rows["status"].isin((*NOTHING_RUN, "RAISED"))]
+
+
+def missed(rows: pd.DataFrame, target: float) -> bool:
+    """Whether one solver, which was put to a case, was asked for all that it can and has not reached an error.
+
+    That is: at its tightest tolerance, or until it failed by itself where a looser one had ended. Where it was stopped
+    by a limit of ours, of time or of steps, at a setting finer than the last that ended, it was not asked.
+    """
+    errors, settings = rows["error_q"].astype(float), setting_of(rows)
+    if (errors <= target).any():
+        return False
+    last = settings[errors.notna().to_numpy()].min(initial=np.inf)
+    if (stopped_by_us(rows) & ~(settings > last)).any():
+        return False
+    finest = float(np.nanmin(settings, initial=np.inf))
+    return bool(finest < last < np.inf or finest <= TIGHTEST * (1.0 + 1e-9))
+
+
+def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:
+    """Which runs a limit of ours ended: the time of a run, or the most steps that an adapter allows."""
+    said = rows["message"].fillna("") if "message" in rows else pd.Series("", rows.index)
+    return (rows["status"].isin(LIMITED) | said.str.contains(CAPPED)).to_numpy(bool)
+
+
+def tightest(rows: pd.DataFrame) -> float:
+    """The finest setting of one solver on a case at which a run was made that no limit of ours ended; NaN: none was."""
+    made = put(rows[~stopped_by_us(rows)])
+    return float(setting_of(made).min()) if len(made) else float("nan")
+
+
+def why_not(rows: pd.DataFrame, target: float) -> str:
+    """What a table shows for a solver without a time at an error: why there is none."""
+    reached = rows[rows["error_q"].notna()]
+    if reached.empty:
+        first = rows["status"].iloc[0]
+        return first.lower().replace("_", " ")
+    finer = setting_of(rows) < setting_of(reached).min()
+    stopped = bool((stopped_by_us(rows) & finer).any()) and bool((reached["error_q"] > target).all())
+    if not stopped and not missed(rows, target):
+        return "not asked"
+    return f"least error {number(float(reached['error_q'].min()))}" + (", then our limit" if stopped else "")
+
+
+def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = ()) -> list[list[str]]:
+    """Lines of a table: solver, called from, CPU time with quartiles in seconds for each target.
+
+    Instead of a dash the cell of a target that is not reached says how far the solver came.
+    """
+    lines = []
+    for solver in solvers or list(dict.fromkeys(rows["solver"])):
+        runs = rows[rows["solver"] == solver]
+        if runs.empty:
+            continue
+        line = [solver, str(runs["called_from"].iloc[0])]
+        for target in targets:
+            middle, low, high = (time_for(runs, target, what) for what in ("call_s", "call_q1", "call_q3"))
+            line.append(why_not(runs, target) if np.isnan(middle) else with_quartiles(middle, low, high))
+        lines.append(line)
+    return lines
+
+
+def with_quartiles(middle: float, low: float, high: float) -> str:
+    """Seconds, the quartiles in brackets where they are more than `SPREAD` of the median apart."""
+    texts = [number(value) for value in (low, middle, high)]
+    near = high - low <= SPREAD * middle or len(set(texts)) == 1
+    return texts[1] if near else f"{texts[1]} ({texts[0]}–{texts[2]})"
+
+
+def setting(row: pd.Series) -> str:
+    """Name and value of the setting that varies."""
+    return next(f"{name} {number(row[name])}" for name in ("h", "err_out", "tol") if pd.notna(row.get(name)))
+
+
+def failures(rows: pd.DataFrame) -> list[list[str]]:
+    """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message."""
+    lines = []
+    for _, row in rows[rows["status"] != "REACHED_END"].iterrows():
+        what = [f"{key} {power(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
+        setting = "all" if row["status"] in NOTHING_RUN else ", ".join(what)
+        status, message = str(row["status"]).lower().replace("_", " "), str(row["message"]).split(". ")[0]
+        if [row["solver"], setting, status, message] not in lines:
+            lines.append([row["solver"], setting, status, message])
+    return lines
+
+
+def unfinished(rows: pd.DataFrame) -> list[str]:
+    """ "solver (setting, setting)" of the runs that did not reach the end, for a sentence; the CSV has the messages."""
+    settings: dict[str, list[str]] = {}
+    for solver, setting, *_ in failures(rows):
+        settings.setdefault(solver, []).append(setting)
+    return [f"{solver} ({', '.join(dict.fromkeys(each))})" for solver, each in settings.items()]

@@ -1,0 +1,83 @@
+"""The table "your mechanism, take": what is the cheapest for a class of problem or a kind of mechanism, by its call."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from studies.bench.render import listed
+from twoloop.methods.presets import PRESETS
+
+SUFFIX = " (two-loop)"  # of our solvers, in the findings of honesty
+COMPILED_DEFAULT = "auto, compiled"
+KINDS = {  # tags of mechanisms, and what a user calls them
+    "redundant": "redundant constraints",
+    "spatial": "spatial",
+    "driven": "driven by a given motion",
+    "non-holonomic": "rolling, or sliding on an edge: non-holonomic",
+}
+
+
+def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
+    """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
+    rows = []
+    for group in groups:
+        what = f"{group[0]['class']} ({'; '.join(entry['name'] for entry in group)})"
+        picks = [f"{call(pick['solver'])} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]]
+        open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
+        doubt = f" (undecided: {listed(open_at)})" if open_at else ""
+        rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
+    made = found.get("work_precision", {})
+    return rows + _of_kinds(made.get("rivals", {}).get("mechanisms", [])) + _often(made.get("first_calls", []))
+
+
+def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Of each kind who is the cheapest on most mechanisms; kinds with none such are told together."""
+    rows, undecided = [], []
+    for kind, words in KINDS.items():
+        these = [each["at"] for each in mechanisms if kind in each.get("tags", ())]
+        cheapest = Counter(_cheapest(at) for at in these)
+        solver, n = max(cheapest.items(), key=lambda item: (item[0] != "", item[1]), default=("", 0))
+        if solver and 2 * n > len(these):
+            said = f"{call(solver)}, the cheapest at most errors on {n} of {len(these)} such mechanisms"
+            rows.append({"what": words, "take": said})
+        elif these:
+            undecided.append(words)
+    if undecided:
+        said = "the default: no solver is the cheapest at most errors on most such mechanisms"
+        rows.append({"what": "; ".join(undecided), "take": said})
+    return rows
+
+
+def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
+    """Who is the cheapest at more than half of the errors that any solver reaches on one mechanism; else nobody.
+
+    Nobody is where ours and others are not told apart, nor where others were not asked.
+    """
+    won: Counter[str] = Counter()
+    for line in at:
+        runs = [(run["call_s"], run["solver"]) for run in (line["ours"], line["others"]) if run]
+        decided = line["verdict"] in ("ahead", "behind", "alone", "missed")
+        won.update([min(runs)[1] if decided else ""] if runs else [])
+    solver, n = won.most_common(1)[0] if won else ("", 0)
+    return solver if 2 * n > won.total() else ""
+
+
+def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """From which run on code for the mechanism pays, by the first calls, where it does."""
+    for line in first_calls:
+        if line["solver"] == COMPILED_DEFAULT and line["pays"]:
+            least, most = min(line["pays"]), max(line["pays"])
+            runs = f"{least:.0f}" if least == most else f"{least:.0f} to {most:.0f}"
+            never = f"; on {line['never']} of {line['n']} it never does" if line["never"] else ""
+            said = f"`compiled=True`, which pays from run {runs} on the mechanisms measured{never}"
+            return [{"what": "run many times", "take": said}]
+    return []
+
+
+def call(solver: str) -> str:
+    """How a user asks for a solver of the reports: the argument of `solve_dae` where there is one."""
+    name, _, compiled = solver.removesuffix(SUFFIX).partition(", ")
+    if name not in PRESETS or compiled not in ("", "compiled"):
+        return f"`{solver}`"
+    words = [] if name == "auto" else [f'method="{name}"']
+    return f"`{', '.join([*words, *(['compiled=True'] if compiled else [])]) or 'auto'}`"

@@ -1,0 +1,5 @@
+"""Energy over long times: which methods let it drift, what a run without drift costs, and why."""
+
+from studies.energy.study import main
+
+__all__ = ["main"]

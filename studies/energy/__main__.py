@@ -1,0 +1,5 @@
+"""`python -m studies.energy`."""
+
+from studies.energy.study import main
+
+main()

@@ -1,0 +1,196 @@
+"""The runs of the energy study: two geometries of the four-bar linkage, methods with and without step-size control."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.casadi.integrators import solve_idas
+from references.diffrax.dopri8 import solve_diffrax
+from references.paper.four_bar_minimal import MinimalFourBar
+from references.scipy.index1 import solve_index1
+from studies.bench.collector import Case, Run, Solver
+from studies.bench.reference_motion import ReferenceMotion
+from studies.bench.solvers import CATALOGUE, CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.energy.drift import drift, windows
+from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
+from twoloop.mechanisms import Problem, four_bar
+from twoloop.methods.plan import Method
+from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
+
+Array = NDArray[np.float64]
+Variant = tuple[str, str]  # variables and partition
+
+ONE, SWITCHING = "one partition", "switching"
+GEOMETRIES: dict[str, dict[str, Any]] = {
+    ONE: {"lengths": (1.0, 1.2, 0.5), "ground": 1.0, "theta3": math.pi, "branch": 1},
+    SWITCHING: {},
+}
+LONG, QUICK = 10_000.0, 75.0  # s
+FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
+TIME_LIMIT = 300.0  # CPU s
+MOST_STEPS = 10_000_000  # of solvers that count them and do not look at the clock
+NOT_QUICK = (DIFFRAX, IDAS)  # compile for seconds
+GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
+
+SUN, GAUSS, RADAU, MIDPOINT = "Sun Radau IIB(3)", "Gauss(3)", "Radau IIA(3)", "implicit midpoint"
+NEWMARK = "Newmark, β = 1/2"
+METHODS: dict[str, Method] = {
+    SUN: RungeKutta(sun_radau_iib(3)),
+    GAUSS: RungeKutta(gauss(3)),
+    RADAU: RungeKutta(radau_iia(3)),
+    MIDPOINT: RungeKutta(gauss(1)),
+    NEWMARK: Newmark(0.5),
+    IRK: paper_irk(),
+    OWN_BDF: BDF(),
+}
+BASIC, EVEN = ("velocities", "lasting"), ("velocities", "symmetric")
+MOMENTA, MOMENTA_EVEN = ("momenta", "lasting"), ("momenta", "symmetric")
+VARIANTS = (BASIC, EVEN, MOMENTA, MOMENTA_EVEN)
+H, H_SMALL = 0.02, 0.01  # s; H_SMALL for methods of order 2
+FIXED: dict[str, dict[str, tuple[Variant, ...]]] = {
+    ONE: {SUN: (BASIC, MOMENTA), GAUSS: (BASIC,), RADAU: (BASIC,), MIDPOINT: (BASIC,), NEWMARK: (BASIC,)},
+    SWITCHING: {SUN: VARIANTS, GAUSS: (BASIC, EVEN, MOMENTA_EVEN), MIDPOINT: (BASIC, EVEN), NEWMARK: (BASIC,)},
+}
+COARSER = {GAUSS: (0.04, 0.03), MIDPOINT: (0.02,)}  # s, further steps of what is free of drift on SWITCHING, EVEN
+CONTROLLED: dict[str, dict[str, Variant]] = {
+    ONE: {IRK: BASIC, SUN: MOMENTA, GAUSS: BASIC},
+    SWITCHING: {IRK: BASIC, SUN: BASIC, GAUSS: EVEN, OWN_BDF: BASIC},
+}
+TOL = 1e-5  # Rtol = Atol
+LSODA, PROJECTED = "LSODA, index 1", "DOP853, projected"
+ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
+OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tight; quick: the first
+    OWN_EXPLICIT: (1e-6, 1e-8, 1e-10, 1e-12),
+    "Gauss12": (1e-5, 1e-7),
+    **dict.fromkeys((IDA_C, HEYOKA, CVODE_C, DIFFRAX, IDAS), (1e-6, 1e-8, 1e-10, 1e-12)),
+    LSODA: (1e-8, 1e-10, 1e-12),
+    PROJECTED: (1e-7, 1e-9, 1e-11),
+    ALPHA: (0.01,),
+    TRAPEZOIDAL: (0.02, 0.01),
+}
+
+
+@cache
+def linkage(geometry: str) -> tuple[Problem, MinimalFourBar]:
+    """A linkage released from rest, and its true motion."""
+    problem = four_bar(**GEOMETRIES[geometry])
+    return problem, MinimalFourBar.from_parameters(problem.parameters)
+
+
+@cache
+def case_of(geometry: str, t_end: float) -> Case:
+    """A linkage released from rest for so long, sampled at times spread over the phases of its period."""
+    problem, motion = linkage(geometry)
+    known = ReferenceMotion(motion.states, FLOOR, "one-coordinate formulation of its own")
+    n = math.ceil(t_end / (0.25 * GOLDEN * motion.period))
+    return Case(geometry, problem, t_end, lambda: known, n, time_limit=TIME_LIMIT, timed=0.0, tags=("long",))
+
+
+def instants(case: Case, h: float) -> Array | None:
+    """Multiples of a fixed step h near the case's instants, and its end: landing on them changes no step.
+
+    None for short motions: at every step.
+    """
+    if case.t_end <= QUICK:
+        return None
+    interval = h * max(1, round(case.t_end / case.n_instants / h))
+    n = int(case.t_end / interval * (1.0 - 1e-12))
+    return np.append(interval * np.arange(n + 1, dtype=np.float64), case.t_end)
+
+
+def _solve(method: str | Method, case: Case, **options: Any) -> Result:
+    problem = case.problem
+    return solve_dae(problem.system, (0.0, case.t_end), problem.q0, problem.v0, method=method, **options)
+
+
+def _fixed(method: Method, case: Case, h: float, repeat: int) -> Result:
+    return _solve(method, case, step_size=h, t_eval=instants(case, h))
+
+
+def _controlled(method: str | Method, case: Case, tol: float, repeat: int) -> Result:
+    """Every step is stored, except where steps are much shorter than the intervals of the sampling instants."""
+    short = (method == "DOP853" and tol < 1e-9) or isinstance(method, BDF)
+    return _solve(method, case, rtol=tol, atol=tol, t_eval=case.instants if short else None)
+
+
+def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int) -> Result:
+    p, span = case.problem, (0.0, case.t_end)
+    options: dict[str, Any] = {"stabilisation": stabilisation, "t_eval": np.append(0.0, case.instants)}
+    return solve_index1(p.system, span, p.q0, p.v0, method, tol, tol, **options)
+
+
+def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> Result:
+    p, options = case.problem, {"time_limit": case.time_limit, "most_steps": MOST_STEPS}
+    return solve(p.system, (0.0, case.t_end), p.q0, p.v0, tol, tol, t_eval=np.append(0.0, case.instants), **options)
+
+
+def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
+    from references.exudyn.four_bar import solve_exudyn
+
+    n_steps = round(case.t_end / h)
+    most = max(1, int(case.t_end / case.n_instants / h))
+    every = next(k for k in range(most, 0, -1) if n_steps % k == 0)
+    return solve_exudyn(case.problem, case.t_end, n_steps, solver, store_every=every)
+
+
+ADAPTERS: dict[str, Callable[[Case, float, int], Result]] = {  # that store states at the case's instants
+    OWN_EXPLICIT: partial(_controlled, "DOP853"),
+    "Gauss12": partial(_controlled, "Gauss12"),
+    **{name: CATALOGUE[name].run for name in (IDA_C, HEYOKA, CVODE_C)},
+    DIFFRAX: partial(_long, solve_diffrax),
+    IDAS: partial(_long, solve_idas),
+    LSODA: partial(_index1, "LSODA", "none"),
+    PROJECTED: partial(_index1, "DOP853", "projection"),
+    ALPHA: partial(_exudyn, "GeneralizedAlpha"),
+    TRAPEZOIDAL: partial(_exudyn, "TrapezoidalIndex2"),
+}
+
+
+def _two_loop(name: str, setting: str, variant: Variant) -> Solver:
+    method = METHODS[name]
+    fixed = dict(zip(("variables", "partition"), variant, strict=True))
+    if isinstance(method, RungeKutta) and variant != BASIC:
+        method = replace(method, **fixed)  # type: ignore[arg-type]
+    run = partial(_fixed if setting == "h" else _controlled, method)
+    return Solver(name, "two-loop", "compiled", True, setting, run, fixed=fixed)
+
+
+def runs(quick: bool) -> Iterator[Run]:
+    """All runs, the longest first so that no core waits at the end."""
+    cases = {name: case_of(name, QUICK if quick else LONG) for name in GEOMETRIES}
+    for name, values in OTHERS.items():
+        if quick and name in NOT_QUICK:
+            continue
+        solver = replace(CATALOGUE[name], run=ADAPTERS[name])
+        for value in reversed(values[:1] if quick else values):
+            yield Run(cases[SWITCHING], solver, value, "other", 1)
+    for geometry, controlled in CONTROLLED.items():
+        for name, variant in controlled.items():
+            yield Run(cases[geometry], _two_loop(name, "tol", variant), TOL, "controlled", 1)
+    for geometry, methods in FIXED.items():
+        for name, variants in methods.items():
+            h = H_SMALL if name in (MIDPOINT, NEWMARK) else H
+            for variant in variants:
+                yield Run(cases[geometry], _two_loop(name, "h", variant), h, "fixed", 1)
+    for name, steps in COARSER.items():
+        for h in () if quick else steps:
+            yield Run(cases[SWITCHING], _two_loop(name, "h", EVEN), h, "coarser", 1)
+
+
+def measure(run: Run, result: Result) -> dict[str, Any]:
+    """What the energy of a run does: slope and swing, and the windows that a figure shows."""
+    case, problem = run.case, run.case.problem
+    row: dict[str, Any] = {"t_reached": float(result.t[-1]), "kinetic": case.scale.kinetic, "series": {}}
+    row |= dict.fromkeys(("slope", "slope_error", "swing"))
+    if not result.success:
+        return row
+    error = problem.energy(result.t, result.q, result.v) - problem.energy(0.0, problem.q0, problem.v0)
+    seen = windows(result.t, error, linkage(case.name)[1].period, case.t_end)
+    row["slope"], row["slope_error"] = drift(seen["t"], seen["mean"])
+    row["swing"] = float(np.median(seen["range"]))
+    return row | {"series": {"t": seen["t"], "mean": seen["mean"]}}

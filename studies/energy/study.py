@@ -1,0 +1,195 @@
+"""Energy over long times: which methods let it drift, what a run without drift costs, and why."""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from studies.bench import figures
+from studies.bench.cli import StudyError
+from studies.bench.render import number
+from studies.bench.solvers import CVODE_C, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
+from studies.bench.study import Series, Study, key
+from studies.bench.tables import setting, unfinished
+from studies.energy import runs as energy_runs
+from studies.energy.drift import CALM, DRIFTS, SLOWLY, bound, verdict
+from studies.energy.runs import (
+    BASIC,
+    EVEN,
+    GAUSS,
+    MOMENTA,
+    NEWMARK,
+    ONE,
+    RADAU,
+    SUN,
+    SWITCHING,
+    TRAPEZOIDAL,
+    VARIANTS,
+    Variant,
+)
+
+SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
+EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
+KEEPING = f"{GAUSS}, symmetric partition"
+DRAWN = (OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
+
+
+def judged(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with the verdict on each run, and with the method's name."""
+    return rows.assign(verdict=rows.apply(verdict, axis=1), name=rows.apply(name_of, axis=1))
+
+
+def name_of(row: pd.Series) -> str:
+    """Method with what is not the default."""
+    extra = ["momenta"] * (row["variables"] == "momenta") + ["symmetric partition"] * (row["partition"] == "symmetric")
+    return ", ".join([row["solver"], *extra])
+
+
+def of(rows: pd.DataFrame, solver: str, variant: Variant = BASIC) -> pd.DataFrame:
+    """The runs of a method on certain variables, with a certain choice of the partition."""
+    same = (rows["variables"] == variant[0]) & (rows["partition"] == variant[1])
+    return rows[(rows["solver"] == solver) & same]
+
+
+def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC, group: str = "fixed") -> pd.Series:
+    """The long run of a method with fixed steps (group "fixed") or step-size control ("controlled")."""
+    chosen = of(rows[(rows["case"] == motion) & (rows["group"] == group)], solver, variant)
+    if chosen.empty:
+        raise StudyError(f"the rows have no run of {solver} on {motion}; make them again by python -m studies.energy")
+    return chosen.iloc[0]
+
+
+def told(row: pd.Series) -> dict[str, Any]:
+    """A run as a finding."""
+    found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
+    found |= {name: row[name] for name in ("verdict", "status")}
+    found["label"] = f"{row['name']}, {setting(row)}"
+    found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
+    found |= {"calm": row["verdict"] in CALM, "drifts": row["verdict"] in (DRIFTS, SLOWLY)}
+    return found | {"keeps": bool(row["keeps_constraints"])}
+
+
+def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
+    """The cheapest of some runs."""
+    return None if rows.empty else told(rows.loc[rows["call_s"].idxmin()])
+
+
+def long_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
+    reached = rows[(rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
+    calm, own = reached["verdict"].isin(CALM), reached["family"] == "two-loop"
+    kinetic = float(reached["kinetic"].iloc[0])
+    at = []
+    for share in (np.inf, *SHARES):
+        good = reached["energy"].abs() <= share * kinetic
+        level: dict[str, Any] = {"share": share, "energy": share * kinetic}
+        for name, which in (("no_drift", good & calm), ("drift", good & ~calm)):
+            level[name] = {"ours": cheapest(reached[which & own]), "others": cheapest(reached[which & ~own])}
+        free, other = cheapest(reached[good & calm]), cheapest(reached[good & ~calm])
+        over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
+        level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
+        at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
+    listed = rows[rows["group"].isin(("other", "controlled"))]
+    places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
+    return {
+        "case": SWITCHING,
+        "problem": rows["problem"].iloc[0],
+        "t_end": float(rows["t_end"].iloc[0]),
+        "kinetic": kinetic,
+        "no_drift": at[0]["no_drift"],
+        "at": at[1:],
+        "n_pays": sum(level["pays"] for level in at[1:]),
+        "n_equal": sum(level["equal"] for level in at[1:]),
+        "equal": EQUAL,
+        "alternatives": [told(rows.loc[place]) for place in places],  # of each the run of least error
+    }
+
+
+def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
+    """Fixed steps: the runs of each method in each variant on both geometries, None where there is none."""
+    places = [(ONE, BASIC), (ONE, MOMENTA), *((SWITCHING, variant) for variant in VARIANTS)]
+    found = []
+    for solver in dict.fromkeys(fixed["solver"]):
+        runs = [of(fixed[fixed["case"] == geometry], solver, variant) for geometry, variant in places]
+        h = fixed[fixed["solver"] == solver]["h"].iloc[0]
+        found.append({"solver": solver, "h": h, "runs": [None if run.empty else told(run.iloc[0]) for run in runs]})
+    return found
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report and the first screen say."""
+    rows = judged(rows)
+    fixed = rows[(rows["group"] == "fixed") & (rows["case"] == SWITCHING)]
+    even = fixed["partition"] == "symmetric"
+    kinds = {"lasting": ~even, "even": even & (fixed["solver"] != SUN), "uneven": even & (fixed["solver"] == SUN)}
+    calm = {name: fixed[which]["verdict"].isin(CALM) for name, which in kinds.items()}
+    controlled = rows[(rows["group"] == "controlled")]["verdict"].isin((DRIFTS, SLOWLY))
+    sun, gauss, canonical = (told(pick(rows, ONE, *which)) for which in ((SUN,), (GAUSS,), (SUN, MOMENTA)))
+    both = {"one": ONE, "switching": SWITCHING}
+    return {
+        "long": long_of(rows[rows["case"] == SWITCHING]),
+        "sun": sun,
+        "gauss": gauss,
+        "radau": told(pick(rows, ONE, RADAU)),
+        "canonical": canonical,
+        "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
+        "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
+        "variants": variants_of(rows[rows["group"] == "fixed"]),
+        "n": {name: len(each) for name, each in calm.items()},
+        "n_calm": {name: int(each.sum()) for name, each in calm.items()},
+        "n_controlled": len(controlled),
+        "n_controlled_drift": int(controlled.sum()),
+        "newmark": {name: told(pick(rows, motion, NEWMARK)) for name, motion in both.items()},
+        "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
+        "failed": unfinished(rows),
+        "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
+    }
+
+
+def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+    """Both figures of the report."""
+    return {"energy_cost": cost_figure(judged(rows)), "energy_long": time_figure(judged(rows), series)}
+
+
+def cost_figure(rows: pd.DataFrame) -> Figure:
+    """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
+    long = rows[rows["case"] == SWITCHING]
+    ended = (long["status"] == "REACHED_END") & ~long["lost"].fillna(True).astype(bool)
+    long = long.assign(error_q=long["energy"].abs().where(ended), floor=0.0, solver=long["name"], astray=False)
+    long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
+    title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
+    figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")
+    calm = long[long["verdict"].isin(CALM)]
+    for axes, what in zip(figure.axes, ("call_s", "n_evaluations"), strict=True):
+        ring: dict[str, Any] = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 0.8}
+        axes.plot(calm["error_q"], calm[what], "o", color="black", **ring)
+    return figure
+
+
+def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
+    """Mean energy error over time with fixed steps, on both geometries."""
+    dashes = {BASIC: "-", MOMENTA: ":", EVEN: "--"}
+    chosen = [(SUN, BASIC), (SUN, MOMENTA), (GAUSS, BASIC), (GAUSS, EVEN), (RADAU, BASIC), (NEWMARK, BASIC)]
+    figure, panels = plt.subplots(1, 2, figsize=(10.5, 3.8), sharey=True, layout="constrained")
+    for axes, motion in zip(panels, (ONE, SWITCHING), strict=True):
+        fixed = rows[(rows["group"] == "fixed") & (rows["case"] == motion)]
+        for solver, variant in chosen:
+            for _, row in of(fixed, solver, variant).iterrows():
+                if key(row, "t") in series:
+                    look = figures.look(row) | {"linestyle": dashes[variant], "marker": ""}
+                    look["label"] = f"{row['name']}, h = {row['h']:g} s"
+                    axes.plot(series[key(row, "t")], np.abs(series[key(row, "mean")]), **look)
+        axes.set(xscale="log", yscale="log", xlabel="time (s)")
+        axes.set_title(f"{motion}: {rows[rows['case'] == motion]['problem'].iloc[0]}", fontsize=9)
+    panels[0].set_ylabel("|mean energy error of a window| (J)")
+    figures.legend(figure, panels)
+    return figure
+
+
+STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of)
+main = STUDY.main
+
+if __name__ == "__main__":
+    main()

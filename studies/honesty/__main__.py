@@ -1,0 +1,5 @@
+"""`python -m studies.honesty`."""
+
+from studies.honesty.study import main
+
+main()

@@ -1,0 +1,100 @@
+"""The solvers of `studies.honesty`, as their users call them: ours, and others as they come and with `max_step`."""
+
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+from references.scipy.index1 import solve_index1
+from references.sundials.cvode_c import solve_cvode_c
+from references.sundials.ida import solve_ida
+from references.sundials.ida_c import solve_ida_c
+from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, Trap
+from twoloop import Result, solve_dae
+from twoloop.run.run import LONGEST_UNSEEN
+
+OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
+COMPILED_ONLY = (IDA_C, CVODE_C, HEYOKA)
+SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
+OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
+    *("auto, compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14", "Gauss16", "SunRadau5"),
+    *("RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
+)
+OURS = " (two-loop)"
+DEFAULT, DEFAULT_COMPILED = f"auto{OURS}", f"auto, compiled{OURS}"
+QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
+LIMITED = ", max_step"  # of others that take no step longer than ours do by default
+
+Call = Callable[[Trap], Result]
+
+
+def own(method: str, trap: Trap) -> Result:
+    """One of ours, as a user calls it."""
+    name, _, code = method.partition(", ")
+    options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
+    options |= ({"compiled": True} if code else {}) | dict(trap.steps)
+    return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, method=name, **options)
+
+
+def scipy(method: str, limited: bool, trap: Trap) -> Result:
+    """One of SciPy's solvers on index 1."""
+    return solve_index1(*_start(trap), method, trap.tolerance, trap.tolerance, **_options(trap, limited))
+
+
+def ida(limited: bool, trap: Trap) -> Result:
+    """IDA through scikit-sundae."""
+    return solve_ida(*_start(trap), "stabilised", trap.tolerance, trap.tolerance, **_options(trap, limited))
+
+
+def ida_c(limited: bool, trap: Trap) -> Result:
+    """IDA's library with compiled functions."""
+    return solve_ida_c(*_start(trap), trap.tolerance, trap.tolerance, **_options(trap, limited))
+
+
+def cvode_c(limited: bool, trap: Trap) -> Result:
+    """CVODE's library with code made of the mechanism."""
+    return solve_cvode_c(*_start(trap), "Adams", trap.tolerance, trap.tolerance, **_options(trap, limited))
+
+
+def heyoka(limited: bool, trap: Trap) -> Result:
+    """heyoka's Taylor series, compiled for the mechanism."""
+    from references.heyoka.taylor import solve_heyoka
+
+    return solve_heyoka(*_start(trap), trap.tolerance, **_options(trap, limited))
+
+
+def _start(trap: Trap) -> tuple[Any, Any, Any, Any]:
+    return trap.system, (0.0, trap.t_end), trap.q0, trap.v0
+
+
+def _options(trap: Trap, limited: bool) -> dict[str, Any]:
+    longest = LONGEST_UNSEEN * trap.t_end if limited else None
+    return {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
+
+
+def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
+    """Name to call, of those that are asked a group of traps; ours first, then others as they come and limited."""
+    ours = (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
+    made: dict[str, Call] = {f"{name}{OURS}": partial(own, name) for name in (QUICK_OWN if quick else ours)}
+    others: dict[str, Callable[..., Result]] = {f"{name}, index 1": partial(scipy, name) for name in QUICK_SCIPY}
+    if not quick:
+        others = {IDA: ida, IDA_C: ida_c, CVODE_C: cvode_c, HEYOKA: heyoka}
+        others |= {f"{name}, index 1": partial(scipy, name) for name in SCIPY}
+    made |= {name: partial(call, False) for name, call in others.items()}
+    # steps do not matter to checks of the input
+    return made | ({} if group == INPUT else {name + LIMITED: partial(call, True) for name, call in others.items()})
+
+
+def why_not(name: str, trap: Trap) -> str:
+    """Why a solver is not run on a trap; "" where it is."""
+    solver, theirs = name.removesuffix(LIMITED), not name.endswith(OURS)
+    if theirs and set(trap.steps) - {"max_step"}:
+        return "its adapter takes neither first nor constant steps"
+    if name.endswith(LIMITED) and trap.steps:
+        return "the trap sets max_step itself"
+    if theirs and trap.impulse and not solver.startswith("IDA"):
+        return "our form of index 1 lacks the impulse: its solvers are given other equations"
+    if solver == HEYOKA and find_spec("heyoka") is None:
+        return "heyoka is not installed"
+    return "it takes compiled functions only" if solver in COMPILED_ONLY and trap.system.called_in_python else ""

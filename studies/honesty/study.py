@@ -1,0 +1,362 @@
+"""Which solver says so when it is wrong: every solver on every trap, right, said so, wrong and silent, or hung."""
+
+import multiprocessing
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain, pairwise
+from multiprocessing.connection import Connection
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from studies.bench import figures, study
+from studies.bench.cli import StudyError
+from studies.bench.render import render, table
+from studies.bench.sharp_forces import T_END
+from studies.bench.store import Output, Row
+from studies.honesty import picture as honesty_picture
+from studies.honesty.solvers import DEFAULT, DEFAULT_COMPILED, LIMITED, OURS, Call, solvers, why_not
+from studies.honesty.traps import AGREE as TRUE_TO
+from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
+from twoloop import ConstrainedSystem, solve_dae
+
+Array = NDArray[np.float64]
+
+LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
+LEAST = 1e-10  # ... of which no more is asked than this
+GRACE = 6.0  # s beyond the time limit of a run after which it hangs
+TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right answer: the first that succeed
+TRUTH_LIMIT = 10.0  # s that one of them may take
+AGREE = 1e-7  # how far the two may differ
+RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
+UNASKED = "wrong and silent, never asked"  # shown of those that are the same, bit for bit, as without the trap
+SHORT = {
+    HANG: "**hang**",
+    SILENT: "**silent**",
+    UNASKED: "**silent** (unasked)",
+    SAID: "said",
+    RIGHT: "right",
+    NOT_RUN: "–",
+}
+ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
+UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
+REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, to a solver: no run
+    *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
+    *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
+)
+BUILT = ("heyoka", "cvode_c")  # calls of solvers that are built for each system, which takes longer than they run
+
+PARTS = {  # of the bars of the figure
+    "right": (RIGHT,),
+    "said so": (SAID,),
+    "wrong and silent, or hanging": (SILENT, HANG),
+}
+
+
+def right_answer(trap: Trap) -> Array | None:
+    """Positions at the end by two unlike methods, from one break of the forces to the next; None where there is none.
+
+    Raises
+    ------
+    StudyError
+        If the two agree at no tolerance.
+    """
+    if trap.positions is not None:
+        return trap.positions(trap.t_end)
+    if trap.sane is None:
+        return None
+    differ = np.inf
+    for tolerance in TRUTHS:
+        first = _end(trap.sane, trap, "RadauIIA5", tolerance)
+        second = None if first is None else _end(trap.sane, trap, "Gauss12", tolerance)
+        if first is not None and second is not None:
+            differ = float(np.abs(first - second).max())
+            if differ <= AGREE:
+                return second
+    raise StudyError(f"no right answer for {trap.name} on {trap.mechanism}: two methods differ by {differ:.1e}")
+
+
+def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -> Array | None:
+    """Positions at the end, in pieces between the breaks; None where a piece fails."""
+    q, v = trap.q0, trap.v0
+    for begin, end in pairwise((0.0, *trap.breaks, trap.t_end)):
+        result = solve_dae(
+            system, (begin, end), q, v, method=method, rtol=tolerance, atol=tolerance, time_limit=TRUTH_LIMIT
+        )
+        if not result.success:
+            return None
+        q, v = result.q[:, -1], result.v[:, -1]
+    return q
+
+
+def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
+    """Make a run in a process of its own and send what came of it."""
+    made: Row = {"status": "", "message": "", "error": None, "warned": "", "asked": True}
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            result = call(trap)
+            made |= {"status": result.status.name, "message": result.message}
+            if result.success and truth is not None:
+                made["error"] = float(np.nanmax(np.abs(result.q[:, -1] - truth)))
+            if result.success and trap.unnoticed is not None:
+                without = call(replace(trap, system=trap.unnoticed))
+                made["asked"] = not np.array_equal(result.q, without.q)
+        except Exception as error:
+            made |= {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
+    made["warned"] = " / ".join(str(each.message) for each in said)
+    pipe.send(made)
+
+
+def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
+    """The rule: what a run that came back is."""
+    if row["status"] == "RAISED" and any(words in row["message"] for words in REFUSALS):
+        return NOT_RUN
+    if row["status"] != "REACHED_END":
+        return SAID
+    limit = LOOSENESS * max(trap.tolerance, LEAST)
+    if has_answer and row["error"] is not None and row["error"] <= limit:
+        return RIGHT
+    if row["warned"] or UNCONTROLLED in row["message"]:
+        return SAID
+    return SILENT
+
+
+def about(name: str, trap: Trap) -> dict[str, str]:
+    """Which cell it is."""
+    return {"group": trap.group, "trap": trap.name, "mechanism": trap.mechanism, "solver": name}
+
+
+def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
+    """One cell, in a process of its own that is ended when it does not come back."""
+    row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=cell, args=(call, trap, truth, there), daemon=True)
+    process.start()
+    there.close()
+    began = time.monotonic()
+    try:
+        came = here.poll(trap.time_limit + GRACE)
+        row |= here.recv() if came else {"status": "HANG", "message": "", "error": None, "warned": ""}
+    except EOFError:
+        row |= {"status": "CRASHED", "message": "the process ended without an answer", "error": None, "warned": ""}
+        came = True
+    process.kill()
+    process.join()
+    row["seconds"] = time.monotonic() - began
+    return row | {"outcome": outcome(row, trap, truth is not None) if came else HANG}
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all cells. The checks of a start in our adapters of foreign solvers are off: those are to answer alone."""
+    rows = []
+    with output.kept() as kept, unchecked():
+        compiled: set[tuple[Any, ...]] = set()
+        for trap in chain(traps(output.call.quick), held_out(output.call.quick)):
+            known = solvers(output.call.quick, trap.group)
+            keys = {name: " | ".join(about(name, trap).values()) for name in known}
+            truth = None if all(key in kept for key in keys.values()) else right_answer(trap)
+            for name, call in known.items():
+                if (key := keys[name]) not in kept:
+                    if why := why_not(name, trap):
+                        kept.add(key, about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why})
+                    else:
+                        warm_up(name, call, trap, compiled)
+                        kept.add(key, run(name, call, trap, truth))
+                rows.append(kept[key])
+    return pd.DataFrame(rows)
+
+
+def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
+    """Compile in this process what the children call, on a harmless motion."""
+    shared = call.func.__name__ if isinstance(call, partial) and not name.endswith(OURS) else name
+    sane, tolerance = trap.sane or trap.system, 1e-4
+    made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *sane.functions[:-2])
+    if shared in BUILT:
+        tolerance = trap.tolerance
+        made_for += (trap.group, trap.name, trap.mechanism)
+    if made_for in compiled:
+        return
+    compiled.add(made_for)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            call(replace(trap, system=sane, t_end=1e-6, tolerance=tolerance))
+        except Exception:  # comes again in the run, where it is counted
+            return
+
+
+class unchecked:
+    """Context: references/ without the check of a start, which is ours."""
+
+    def __enter__(self) -> None:
+        self.patches = [
+            patch(f"references.{name}.check_start") for name in ("cvode_c", "heyoka_taylor", "ida", "ida_c", "index1")
+        ]
+        for each in self.patches:
+            each.start()
+
+    def __exit__(self, *_: object) -> None:
+        for each in self.patches:
+            each.stop()
+
+
+def unasked(rows: pd.DataFrame) -> pd.Series:
+    """Which of the runs that are wrong and silent never evaluated the force in question."""
+    return (rows["outcome"] == SILENT) & rows["asked"].eq(False)
+
+
+def counts_of(rows: pd.DataFrame) -> dict[str, int]:
+    """Runs, and how many of them had each outcome."""
+    return {"n": len(rows)} | {what: int((rows["outcome"] == what).sum()) for what in ORDER if what != UNASKED}
+
+
+def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says: of mistakes and forces, how far ours can be trusted on both, and what was held out."""
+    rows, forces, inputs, held = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT, HELD_OUT))
+    both = pd.concat([rows, forces])
+    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(both), "totals": totals(both)}
+    found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
+    found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
+    found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
+    return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+
+
+def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Outcomes of each solver on the traps that it was run on: ours, others as they come, and limited."""
+    ran = rows[rows["outcome"] != NOT_RUN]
+    counts = [{"solver": str(name)} | counts_of(own) for name, own in ran.groupby("solver", sort=False)]
+    return sorted(counts, key=lambda line: (not line["solver"].endswith(OURS), line["solver"].endswith(LIMITED)))
+
+
+def parts_of(rows: pd.DataFrame) -> dict[str, pd.Series]:
+    """Which rows are of ours, of others as they come, and of these with a largest step."""
+    ours, limited = rows["solver"].str.endswith(OURS), rows["solver"].str.endswith(LIMITED)
+    return {"ours": ours, "others": ~ours & ~limited, "limited": limited}
+
+
+def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
+    """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
+    ran = rows[rows["outcome"] != NOT_RUN]
+    found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": []}
+    found["solvers"] = totals(rows)
+    for family, own in ran.groupby("trap", sort=False):
+        parts = parts_of(own)
+        line = {"family": str(family)} | {whose: counts_of(own[which]) for whose, which in parts.items()}
+        by = own[parts["ours"] & (own["outcome"] == SILENT)]["solver"]
+        found["families"].append(line | {"by": sorted(set(by))})
+    found["mechanisms"] = [str(name) for name in ran["mechanism"].unique()]
+    return found | {whose: counts_of(ran[which]) for whose, which in parts_of(ran).items()}
+
+
+def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
+    """Runs, of what, and those wrong without a word: of the default, compiled, of our others, of others, limited.
+
+    What an adapter refuses is no run.
+    """
+    parts = parts_of(rows)
+    parts = {"default": rows["solver"] == DEFAULT, "compiled": rows["solver"] == DEFAULT_COMPILED} | parts
+    parts["ours"] &= ~parts["default"] & ~parts["compiled"]
+    found = {}
+    for name, which in parts.items():
+        own = rows[which]
+        ran = own[own["outcome"] != NOT_RUN]
+        wrong = ran["outcome"].isin((SILENT, HANG))
+        line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
+        line |= {"n_mistakes": int((ran["group"] == MISTAKE).sum()), "n_forces": int((ran["group"] == FORCE).sum())}
+        found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
+    return found
+
+
+def bad_in(rows: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
+    """Runs that are wrong and silent, or hang, of ours, of others as they come, and limited."""
+    bad = rows[rows["outcome"].isin((SILENT, HANG))]
+    columns = ["trap", "mechanism", "solver", "outcome", "error"]
+    return {whose: bad[which][columns].to_dict("records") for whose, which in parts_of(bad).items()}
+
+
+def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
+    """Outcomes on traps that lie in a model, a motion or a setting."""
+    names, trap_names = list(dict.fromkeys(rows["solver"])), list(dict.fromkeys(rows["trap"]))
+    found: dict[str, Any] = {"n_traps": len(trap_names), "n_cells": int((rows["outcome"] != NOT_RUN).sum())}
+    found["cells"], shown = [], rows["outcome"].mask(unasked(rows), UNASKED)
+    for trap in trap_names:
+        line = {"trap": trap}
+        for name in names:
+            these = shown[(rows["trap"] == trap) & (rows["solver"] == name)].tolist()
+            line[name] = [what for what in ORDER if what in these]
+        found["cells"].append(line)
+    for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
+        alike = [[outcome], [NOT_RUN]]
+        found[key] = [each["trap"] for each in found["cells"] if all(each[name] in alike for name in names)]
+    found["one_says_so"] = []
+    for each in found["cells"]:
+        said = [name for name in names if each[name] == [SAID]]
+        if len(said) == 1 and all(each[name] in ([RIGHT], [NOT_RUN]) for name in names if name not in said):
+            found["one_says_so"].append({"trap": each["trap"], "solver": said[0]})
+    found |= {"solvers": names, "looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
+    ran = rows[rows["outcome"] != NOT_RUN]
+    found["missed_by_all"] = [
+        str(trap) for trap, own in ran.groupby("trap", sort=False) if own["outcome"].isin((SILENT, HANG)).all()
+    ]
+    found["counts"] = {name: counts_of(rows[rows["solver"] == name]) for name in names}
+    found["unasked"] = int(unasked(rows).sum())
+    return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
+
+
+def outcomes(found: dict[str, Any], names: Sequence[str], without: set[str]) -> str:
+    """A line for each trap, a column for each solver."""
+    short = [name.replace(OURS, "") for name in names]
+    lines = [
+        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in names)]
+        for each in found["cells"]
+        if each["trap"] not in without
+    ]
+    return table(["trap", *short], lines)
+
+
+def told(counts: dict[str, int] | None) -> str:
+    """Outcomes under forces in a cell."""
+    return "/".join(str(counts[what]) for what in (SILENT, SAID, RIGHT)) if counts and counts["n"] else "–"
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings, figure and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    figures.save(honesty_picture.picture(found["totals"], PARTS), output, "honesty")
+    alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
+    limited = [name for name in found["solvers"] if name.endswith(LIMITED)]
+    as_they_come = [name for name in found["solvers"] if name not in limited]
+    ready = {"cells": outcomes(found, as_they_come, alike), "limited": outcomes(found, limited, alike)}
+    ready["input"] = outcomes(found["input"], found["input"]["solvers"], set())
+    both = found["forces"], found["held_out"]
+    whose = {"ours": "ours", "others": "others", "limited": "others, max_step"}
+    held = {each["family"]: each for each in both[1]["families"]}
+    ready["forces"] = table(
+        ["force", *whose.values(), *(f"held out: {words}" for words in whose.values())],
+        [
+            [each["family"], *(told(part.get(who)) for part in (each, held.get(each["family"], {})) for who in whose)]
+            for each in both[0]["families"]
+        ],
+    )
+    by_solver = [{each["solver"]: each for each in part["solvers"]} for part in both]
+    lines = [[name.replace(OURS, ""), *(told(part.get(name)) for part in by_solver)] for name in by_solver[0]]
+    ready["solvers"] = table(["solver", "first set", "held out"], lines)
+    output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study and write its report."""
+    study.run_rows("honesty", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

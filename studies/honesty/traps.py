@@ -1,0 +1,349 @@
+"""Traps: systems and starts on which a solver goes wrong unless it notices, each on two mechanisms.
+
+One set of compiled callbacks serves those on chains of point masses: what makes the trap stands in the parameters.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from studies.bench.cli import StudyError
+from studies.bench.random_linkages import end_of
+from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families
+from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
+from studies.bench.sharp_mechanisms import chain as chain_of
+from studies.bench.sharp_motion import CHECK, RTOL, march, motion, off
+from studies.planted_errors.faults import python_copy
+from twoloop import ConstrainedSystem
+from twoloop.kernels.compile.callbacks import callback
+from twoloop.mechanisms import Problem, four_bar, n_four_bar
+
+Array = NDArray[np.float64]
+
+NEVER = 1e30  # s
+# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,
+# such a one with other numbers, on which no method was repaired
+INPUT, MISTAKE, FORCE, HELD_OUT = "input", "mistake", "force", "held out"
+AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
+SEED = 13  # of the numbers of the forces
+HELD_OUT_SEED = 20261121  # of those held out: a date, used once, when all methods were as they are
+GROWN = 100.0  # how much errors may grow in a motion that is held out: as much as in the first set
+FORCES = (  # families of `sharp_forces`
+    "drag",
+    *(f"tanh friction, width {width:g}" for width in FRICTIONS),
+    *(f"gust of {1e3 * width:g} ms" for width in GUSTS),
+    *("softplus stop", "chirp", "switching drive", "square wave", "noise by interpolation"),
+)
+UNKNOWN_IN_SPACE = FORCES[-4:]  # two methods do not agree to AGREE there: the truth is not known
+KINK = "drive with a kink"
+QUICK_FORCES = ("drag", "gust of 30 ms", KINK)
+# places in the parameters: gravity, mass of the last point, stiffness of a spring that holds it, begin and end of a
+# force along x and its size, when the force becomes NaN, when it raises, wrong entry of C_q, amplitude and frequency
+# of the pivot, where the spring is at rest
+G, LAST, SPRING, BEGIN, END, PUSH, NAN, RAISES, WRONG, AMPLITUDE, OMEGA, REST = range(12)
+SANE = (9.81, 1.0, 0.0, NEVER, NEVER, 0.0, NEVER, NEVER, 0.0, 0.0, 0.0, 0.0)
+
+
+@callback("mass")
+def mass(t, q, p, M):  # type: ignore[no-untyped-def]
+    for i in range(q.size):
+        M[i, i] = p[1] if i >= q.size - 2 else 1.0
+
+
+@callback("force")
+def force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    if t > p[7]:
+        raise ValueError("the trap's callback raises")
+    n = q.size
+    for i in range(1, n, 2):
+        Q[i] = -p[0] * (p[1] if i == n - 1 else 1.0)
+    Q[n - 2] -= p[2] * (q[n - 2] - p[11])
+    if p[3] < t <= p[4]:
+        Q[n - 2] += p[5]
+    if t > p[6]:
+        Q[n - 2] = math.nan
+
+
+@callback("constraint")
+def constraint(t, q, p, C):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    for i in range(C.size):
+        k = i % n  # a further row repeats one
+        x = q[0] - p[9] * math.sin(p[10] * t) if k == 0 else q[2 * k] - q[2 * k - 2]
+        y = q[1] if k == 0 else q[2 * k + 1] - q[2 * k - 1]
+        C[i] = 0.5 * (x * x + y * y - 1.0) * (1.0 + i // n)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    for i in range(Cq.shape[0]):
+        k, scale = i % n, 1.0 + i // n
+        if k == 0:
+            Cq[i, 0] = scale * (q[0] - p[9] * math.sin(p[10] * t))
+            Cq[i, 1] = scale * q[1]
+        else:
+            for axis in range(2):
+                apart = scale * (q[2 * k + axis] - q[2 * k - 2 + axis])
+                Cq[i, 2 * k + axis] = apart
+                Cq[i, 2 * k - 2 + axis] = -apart
+    Cq[0, 1] += p[8]
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    rate = p[9] * p[10] * math.cos(p[10] * t)
+    for i in range(0, Ct.size, n):
+        Ct[i] = -(1.0 + i // n) * (q[0] - p[9] * math.sin(p[10] * t)) * rate
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
+    n = q.size // 2
+    rate = p[9] * p[10] * math.cos(p[10] * t)
+    second = -p[10] * p[10] * p[9] * math.sin(p[10] * t)
+    for i in range(Qd.size):
+        k = i % n
+        x = v[0] - rate if k == 0 else v[2 * k] - v[2 * k - 2]
+        y = v[1] if k == 0 else v[2 * k + 1] - v[2 * k - 1]
+        Qd[i] = -(x * x + y * y)
+        if k == 0:
+            Qd[i] += (q[0] - p[9] * math.sin(p[10] * t)) * second
+        Qd[i] *= 1.0 + i // n
+
+
+def chain(n: int, parameters: Array, rows: int = 0) -> ConstrainedSystem:
+    """A chain of n points a metre apart that hangs from a pivot, the first `rows` of its constraints twice."""
+    return ConstrainedSystem(
+        n_q=2 * n,
+        n_c=n + rows,
+        mass=mass,
+        force=force,
+        constraint=constraint,
+        jacobian=jacobian,
+        constraint_rate=constraint_rate,
+        gamma=gamma,
+        parameters=parameters,
+        constant_mass=True,
+        name=f"chain of {n}",
+    )
+
+
+def fails(Q: Array, t: float, *state: Array) -> Array:
+    """An error of Python after 1 s, in place of the force Q."""
+    if t > 1.0:
+        raise KeyError("the trap's callback raises")
+    return Q
+
+
+def misshapes(Q: Array, t: float, *state: Array) -> Array:
+    """One force too few after 1 s."""
+    return Q if t <= 1.0 else Q[:-1]
+
+
+@dataclass(frozen=True)
+class Trap:
+    """What is wrong, on one mechanism.
+
+    Attributes
+    ----------
+    name : str
+    mechanism : str
+    system : ConstrainedSystem
+    q0, v0 : ndarray (n_q,)
+    t_end : float
+    sane : ConstrainedSystem or None
+        The same without the mistake: its motion is the right answer. None: there is none, and whoever reports success
+        is wrong.
+    breaks : tuple of float
+        Times at which the right motion is computed in pieces.
+    positions : callable or None
+        positions(t) -> q, where they are known.
+    group : str
+        INPUT, MISTAKE, FORCE or HELD_OUT.
+    tolerance, time_limit : float
+    steps : mapping
+        `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
+    unnoticed : ConstrainedSystem or None
+        The system as it is for a solver that never evaluates it where the trap lies.
+    impulse : bool
+        Whether velocities jump.
+    n_drawn : int
+        How many forces were drawn until the motion under one was known.
+    """
+
+    name: str
+    mechanism: str
+    system: ConstrainedSystem
+    q0: Array
+    v0: Array
+    t_end: float
+    sane: ConstrainedSystem | None = None
+    breaks: tuple[float, ...] = ()
+    positions: Callable[[float], Array] | None = field(default=None, repr=False)
+    tolerance: float = 1e-8
+    time_limit: float = 10.0
+    steps: Mapping[str, float] = field(default_factory=dict)
+    unnoticed: ConstrainedSystem | None = None
+    group: str = MISTAKE
+    impulse: bool = False
+    n_drawn: int = 1
+
+
+def start(n: int) -> tuple[Array, Array]:
+    """The chain out of the vertical, at rest."""
+    angles = np.linspace(0.6, 0.2, n)
+    q = np.empty(2 * n)
+    q[::2], q[1::2] = np.cumsum(np.sin(angles)), -np.cumsum(np.cos(angles))
+    return q, np.zeros(2 * n)
+
+
+def traps(quick: bool) -> list[Trap]:
+    """All traps: mistakes on chains of two and of three points, positions on two linkages each, and sharp forces."""
+    made = [trap for n in ((2,) if quick else (2, 3)) for trap in of_chain(n)]
+    return made + ([] if quick else list(of_linkages())) + list(under_forces(quick))
+
+
+def of_linkages() -> Iterator[Trap]:
+    """Singular positions, dead points, and positions where the two assemblies of a linkage nearly meet."""
+    for n in (1, 2):
+        problem = n_four_bar(n)
+        yield of_motion("singular position crossed", problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
+    for ground in (2.0, 1.9):  # bars 1 and 2 come into line: the angle of bar 3 does not determine theirs
+        problem = four_bar((0.8, 1.2, 1.0), ground)
+        yield of_motion("dead point", problem, partial(end_of, problem))
+    for excess in (1e-4, -1e-7):  # longest and shortest less the other two: 0 at a change point
+        problem = four_bar((0.5, 1.5, 1.0), 2.0 + excess, theta3=1.0)
+        yield of_motion("assemblies nearly meet", problem, partial(end_of, problem))
+
+
+def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:
+    """A trap that lies in the motion, which is known."""
+    return Trap(name, problem.name, problem.system, problem.q0, problem.v0, 5.0, problem.system, positions=positions)
+
+
+def of_chain(n: int) -> list[Trap]:
+    """The traps on one chain."""
+    q0, v0 = start(n)
+
+    def system(rows: int = 0, **changed: float) -> ConstrainedSystem:
+        p = np.array(SANE)
+        for name, value in changed.items():
+            p[globals()[name]] = value
+        return chain(n, p, rows)
+
+    def trap(name: str, made: ConstrainedSystem, sane: ConstrainedSystem | None, t_end: float = 2.0, **more: object):  # type: ignore[no-untyped-def]
+        return Trap(name, f"chain of {n}", made, **({"q0": q0, "v0": v0} | more), t_end=t_end, sane=sane)  # type: ignore[arg-type]
+
+    across = np.zeros(2 * n)
+    across[:2] = 1e-2 * q0[:2]
+    fast = system(AMPLITUDE=0.01, OMEGA=1e3)
+    moving = np.zeros(2 * n)
+    moving[::2] = 0.01 * 1e3  # all points with the pivot
+    push, pulse = system(BEGIN=0.7, END=NEVER, PUSH=20.0), system(BEGIN=1.0, END=1.001, PUSH=1e3)
+    spring, heavy = system(SPRING=1e7, REST=q0[-2]), system(LAST=1e10)
+    return [
+        trap("inconsistent positions", system(), None, q0=q0 + across / 10.0, group=INPUT),
+        trap("inconsistent velocities", system(), None, v0=across, group=INPUT),
+        trap("NaN in the force after 1 s", system(NAN=1.0), None),
+        trap("exception in a callback after 1 s", system(RAISES=1.0), None),
+        trap("exception in a Python callback after 1 s", python_copy(system(), force=fails), None),
+        trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=misshapes), None),
+        trap("one wrong entry of C_q", system(WRONG=1e-3), system(), group=INPUT),
+        trap("force that jumps", push, push, breaks=(0.7,)),
+        trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001), unnoticed=system()),
+        trap("pulse of 1 ms, max_step half of it", pulse, pulse, breaks=(1.0, 1.001), steps={"max_step": 5e-4}),
+        trap("redundant row", system(rows=1), system()),
+        trap("pivot driven at 1000 rad/s", fast, fast, 1.0, v0=moving),
+        trap("spring of 1e7 N/m", spring, spring, 1.0),
+        trap("masses 1 to 1e10", heavy, heavy, 1.0),
+        trap("tolerance of 1e-17", system(), system(), tolerance=1e-17),
+        trap("time limit of 0.5 s", system(), None, 1e5, time_limit=0.5),
+        trap("first step of 1 s", system(), system(), steps={"first_step": 1.0}),
+        trap("fixed steps of 0.5 s", system(), system(), steps={"step_size": 0.5}),
+    ]
+
+
+def pendulum(sharp: Sharp) -> Mechanism:
+    """A point of 1 kg on a link of 1 m, released 1 rad from the vertical."""
+    one = np.ones(1)
+    return chain_of(sharp, one, one, one, 0.0 * one)
+
+
+def masses(sharp: Sharp) -> Mechanism:
+    """Two masses on springs, the sum of whose places is given."""
+    return row(sharp, np.array([3.0, 8.0]), np.array([1.0, 1.5]), 0.2, 0.0)
+
+
+def end_under_force(mechanism: Mechanism) -> Array:
+    """Positions at the end by two methods of SciPy in independent coordinates; NaN where they are not compared.
+
+    Raises
+    ------
+    StudyError
+        If the two do not agree.
+    """
+    ends = [
+        mechanism.positions(T_END, march(mechanism, method, tolerance, mechanism.y0)[T_END])
+        for method, tolerance in (("DOP853", RTOL), ("LSODA", CHECK))
+    ]
+    if not off(ends[1], ends[0]) <= AGREE:
+        raise StudyError(f"no right answer for {mechanism.sharp.family} on {mechanism.name}: two methods differ")
+    return ends[0]
+
+
+def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
+    """Sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
+    if quick:
+        return [(family, pendulum) for family in QUICK_FORCES]
+    every = [(family, bodies) for family in FORCES for bodies in (pendulum, bars, slider_in_space)]
+    for family in UNKNOWN_IN_SPACE:
+        every.remove((family, slider_in_space))
+    return [*every, (KINK, pendulum), (KINK, masses)]
+
+
+def under_forces(quick: bool) -> Iterator[Trap]:
+    """The traps that are made of these."""
+    for family, bodies in forces(quick):
+        drawn = families()[family](np.random.default_rng([SEED, [*FORCES, KINK].index(family)]))
+        mechanism = bodies(drawn)
+        yield of_force(mechanism, FORCE, partial(end_under_force, mechanism))
+
+
+def held_out(quick: bool) -> Iterator[Trap]:
+    """The same forces and mechanisms with other numbers, each drawn until two methods agree and errors do not grow."""
+    for place, (family, bodies) in enumerate(forces(quick)):
+        g, n_drawn = np.random.default_rng([HELD_OUT_SEED, place]), 0
+        while True:
+            n_drawn += 1
+            mechanism = bodies(families()[family](g))
+            try:
+                known = motion(mechanism)
+            except (RuntimeError, ValueError):  # SciPy's method fails
+                continue
+            if known.apart <= AGREE and known.growth <= GROWN:
+                break
+        yield of_force(mechanism, HELD_OUT, partial(known.q.__getitem__, -1), n_drawn)
+
+
+def of_force(mechanism: Mechanism, group: str, end: Callable[[], Array], n_drawn: int = 1) -> Trap:
+    """The trap of a mechanism under a force, whose end is known."""
+    sharp = mechanism.sharp
+    return Trap(
+        sharp.family,
+        mechanism.name,
+        mechanism.system,
+        mechanism.q0,
+        mechanism.v0,
+        T_END,
+        mechanism.system,
+        positions=lambda t: end(),
+        group=group,
+        impulse=sharp.driven and bool(sharp.breaks),
+        n_drawn=n_drawn,
+    )

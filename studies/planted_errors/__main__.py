@@ -1,0 +1,5 @@
+"""`python -m studies.planted_errors`."""
+
+from studies.planted_errors.study import main
+
+main()

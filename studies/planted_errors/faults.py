@@ -1,0 +1,336 @@
+"""Single faults to plant at run time: in mechanisms, traces, references, tableaux, options, adapters and reports."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import scipy.integrate
+from numpy.typing import NDArray
+
+from studies.bench import metrics, render, solvers, tables
+from twoloop import ConstrainedSystem, Result, callback, mechanisms
+from twoloop.mechanisms import Problem
+from twoloop.methods import presets as methods
+from twoloop.methods import tableaux
+from twoloop.methods.bdf import BDF
+from twoloop.methods.dop853 import DOP853
+from twoloop.methods.plan import Plan
+
+Array = NDArray[np.float64]
+
+TABLEAUX = "tests/test_tableaux.py"
+EXPLICIT = "tests/kernels/test_explicit.py::test_scipy_still_gives_the_numbers_that_we_take_from_it"
+TABLES, METRICS, RENDER = (f"tests/studies/test_{name}.py" for name in ("tables", "metrics", "render"))
+
+
+SCIPY = "DOP853, index 1"  # for all adapters of foreign solvers
+TRACING = "Taylor"  # a solver that integrates what callbacks were traced to
+GRAVITY, OTHER = 9.81, 9.80  # m/s^2, of a pendulum and what it is in a wrong trace
+weight = GRAVITY  # a global on purpose: numba takes it as it is when it compiles `frozen`
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One mistake, and where to look for it.
+
+    Attributes
+    ----------
+    name, place : str
+        What is wrong, and in what.
+    plant : callable
+        plant() -> a context in which it is.
+    checks : tuple of str
+        Files or tests of pytest, run in this order until one fails. Empty: the run below is the check.
+    problem : Problem or None
+        To be run by `solver` and judged as in `validation`.
+    solver : str
+    """
+
+    name: str
+    place: str
+    plant: Callable[[], AbstractContextManager[Any]] = nullcontext
+    checks: tuple[str, ...] = ()
+    problem: Problem | None = None
+    solver: str = "Gauss12"
+
+
+def python_copy(system: ConstrainedSystem, **edits: Callable[..., Any]) -> ConstrainedSystem:
+    """The system in plain Python, some of its callbacks passed through edit(value, t, *state)."""
+
+    def edited(kind: str) -> Callable[..., Any]:
+        original, edit = getattr(system, kind), edits.get(kind, lambda value, *state: value)
+        if kind in ("mass", "constraint", "jacobian", "constraint_rate"):
+            return lambda t, q: edit(np.array(original(t, q)), t, q)
+        return lambda t, q, v: edit(np.array(original(t, q, v)), t, q, v)
+
+    kinds = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
+    made: dict[str, Any] = {kind: edited(kind) for kind in kinds}
+    return ConstrainedSystem.from_python(n_q=system.n_q, n_c=system.n_c, name=system.name, **made)
+
+
+def put(place: Any, number: float, factor: float = 0.0) -> Callable[..., Any]:
+    """An edit that multiplies the value at a place by `factor` and adds a number."""
+
+    def edit(value: Array, *state: Any) -> Array:
+        value[place] = factor * value[place] + number
+        return value
+
+    return edit
+
+
+def in_mechanism() -> Iterator[Fault]:
+    """Callbacks and starts of Andrews' mechanism, and C_t of a driven crank."""
+    sound, driven = mechanisms.andrews(), mechanisms.driven_crank()
+    edits: list[tuple[str, str, Callable[..., Any]]] = [
+        ("Q_d with the other sign", "gamma", lambda value, *state: -value),
+        ("one entry of Q_d 1 % too large", "gamma", put(2, 0.0, 1.01)),
+        ("one row of Q_d left out", "gamma", put(4, 0.0)),
+        ("one entry of C_q with the other sign", "jacobian", put((0, 0), 0.0, -1.0)),
+        ("one entry of C_q off by 1e-5", "jacobian", put((3, 4), 1e-5, 1.0)),
+        ("one row of C_q left out", "jacobian", put(5, 0.0)),
+        ("two columns of C_q swapped", "jacobian", lambda value, *state: value[:, [1, 0, *range(2, 7)]]),
+        ("a length of the loop 0.01 mm too large", "constraint", put(0, 1e-5, 1.0)),
+        ("a constraint of the wrong coordinate", "constraint", lambda value, t, q: value + (q[0] - q[3]) * 1e-3),
+        ("one mass 0.1 % too large", "mass", put((0, 0), 0.0, 1.001)),
+        ("an off-diagonal entry of M left out on one side", "mass", put((0, 1), 0.0)),
+        ("an off-diagonal pair of M with the other sign", "mass", put(([0, 1], [1, 0]), 0.0, -1.0)),
+        ("a negative inertia", "mass", put((2, 2), 0.0, -1.0)),
+        ("the driving torque 0.01 % too large", "force", put(0, 3.3e-6, 1.0)),
+        ("one generalised force with the other sign", "force", put(2, 0.0, -1.0)),
+        ("a velocity term of the forces left out", "force", put(1, 0.0)),
+        ("a force of velocity where none is", "force", lambda value, t, q, v: value - 1e-7 * v),
+    ]
+    for name, kind, edit in edits:
+        yield Fault(name, "mechanism", problem=replace(sound, system=python_copy(sound.system, **{kind: edit})))
+    rates: list[tuple[str, dict[str, Callable[..., Any]]]] = [
+        ("C_t left out", {"constraint_rate": lambda value, *state: 0.0 * value}),
+        ("C_t with the other sign", {"constraint_rate": lambda value, *state: -value}),
+        ("C_tt left out of Q_d", {"gamma": lambda value, t, q, v: driven.system.gamma(0.0, q, v)}),
+    ]
+    for name, edit_of in rates:
+        system = python_copy(driven.system, **edit_of)
+        yield Fault(name, "mechanism", problem=replace(driven, system=system))
+    moved = sound.q0 + 1e-6 * np.eye(7)[0]
+    yield Fault("start off the constraints by 1e-6", "mechanism", problem=replace(sound, q0=moved))
+    yield Fault("initial velocity off the constraints", "mechanism", problem=replace(sound, v0=np.full(7, 1e-3)))
+    closed = mechanisms.projection_pendulum()
+    yield Fault(
+        "consistent start at another speed", "mechanism", problem=replace(closed, v0=closed.v0 + np.array([0.0, 1e-4]))
+    )
+
+
+@callback("mass")
+def unit(t, q, p, M):  # type: ignore[no-untyped-def]
+    M[0, 0] = M[1, 1] = 1.0
+
+
+@callback("force")
+def frozen(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    Q[1] = -weight
+
+
+@callback("constraint")
+def circle(t, q, p, C):  # type: ignore[no-untyped-def]
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+
+
+@callback("jacobian")
+def radius(t, q, p, Cq):  # type: ignore[no-untyped-def]
+    Cq[0, 0], Cq[0, 1] = q[0], q[1]
+
+
+def pendulum_in_python(**changed: Any) -> ConstrainedSystem:
+    """The pendulum of A01 in functions that can be traced, with others in the place of some."""
+    functions = {
+        "mass": lambda t, q: np.eye(2),
+        "force": lambda t, q, v: np.array([0.0, -GRAVITY]),
+        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+        "jacobian": lambda t, q: q.reshape(1, 2),
+        "gamma": lambda t, q, v: np.array([-(v @ v)]),
+    }
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, name="pendulum", **{**functions, **changed})
+
+
+def in_trace() -> Iterator[Fault]:
+    """Callbacks of a pendulum that are not what they are traced to."""
+
+    def swallowed(t: Any, q: Any, v: Any) -> Array:
+        try:
+            return np.array([0.0, -GRAVITY if t < 1e3 else -OTHER])
+        except Exception:
+            return np.array([0.0, -OTHER])
+
+    def by_type(t: Any, q: Any, v: Any) -> Array:
+        return np.array([0.0, -GRAVITY if isinstance(t, float) else -OTHER])
+
+    def counting(most: int) -> Callable[..., Array]:
+        calls = [0]
+
+        def force(t: Any, q: Any, v: Any) -> Array:
+            calls[0] += 1
+            return np.array([0.0, -GRAVITY if calls[0] < most else -OTHER])
+
+        return force
+
+    in_numba = ConstrainedSystem(
+        n_q=2, n_c=1, mass=unit, force=frozen, constraint=circle, jacobian=radius, name="pendulum"
+    )
+    lopsided = pendulum_in_python(mass=lambda t, q: np.array([[1.0, 0.1 * q[1]], [0.0, 1.0]]))
+    changed = lambda: patch("studies.planted_errors.faults.weight", OTHER)  # noqa: E731
+    sound = mechanisms.pendulum()
+    for name, system, plant in (
+        ("a branch that tracing loses behind try/except", pendulum_in_python(force=swallowed), nullcontext),
+        ("a branch on the type of t", pendulum_in_python(force=by_type), nullcontext),
+        ("a global that changed after numba compiled", in_numba, changed),
+        ("M symmetric at the start only", lopsided, nullcontext),
+        ("a callback that changes after 5 calls", pendulum_in_python(force=counting(5)), nullcontext),
+        ("a callback that changes after 100 calls", pendulum_in_python(force=counting(100)), nullcontext),
+    ):
+        yield Fault(name, "trace", plant, problem=replace(sound, system=system), solver=TRACING)
+
+
+def in_reference() -> Iterator[Fault]:
+    """The state that runs are compared with."""
+    sound = mechanisms.andrews()
+    known = sound.reference
+    assert known is not None and known.lam is not None
+    swapped = known.q[[1, 0, *range(2, 7)]]
+    for name, change in (
+        ("q off in the 7th digit", {"q": known.q * (1.0 + 3e-7 * np.eye(7)[0])}),
+        ("v off in the 7th digit", {"v": known.v * (1.0 + 3e-7 * np.eye(7)[1])}),
+        ("lam off in the 6th digit", {"lam": known.lam * (1.0 + 3e-6 * np.eye(6)[0])}),
+        ("lam with the other sign", {"lam": -known.lam}),
+        ("one velocity with the other sign", {"v": known.v * (1.0 - 2.0 * np.eye(7)[3])}),
+        ("two coordinates swapped", {"q": swapped}),
+        ("time of the state off by 1e-9 s", {"t": known.t + 1e-9}),
+    ):
+        yield Fault(name, "reference", problem=replace(sound, reference=replace(known, **change)))
+
+
+def _changed(owner: Any, name: str, change: Callable[[Any], Any]) -> Callable[[], AbstractContextManager[Any]]:
+    """What plants a function that returns change(what it returned)."""
+    original = getattr(owner, name)
+
+    def faulty(*arguments: Any, **named: Any) -> Any:
+        return change(original(*arguments, **named))
+
+    return lambda: patch.object(owner, name, faulty)
+
+
+def in_tableau() -> Iterator[Fault]:
+    """Numbers of the Runge-Kutta methods."""
+
+    def off(pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        A = pair[0].copy()
+        A[0, -1] += 1e-6
+        return A, pair[1]
+
+    def mirrored(c: Array) -> Array:
+        return np.sort(1.0 - c)
+
+    def row(name: str, owner: Any, attribute: str, change: Callable[[Any], Any]) -> Fault:
+        return Fault(name, "tableau", _changed(owner, attribute, change), (TABLEAUX,))
+
+    yield row("an a_ij off by 1e-6", tableaux, "_collocation", off)
+    yield row("weights in the other order", tableaux, "_collocation", lambda pair: (pair[0], pair[1][::-1]))
+    yield row("A transposed", tableaux, "_collocation", lambda pair: (pair[0].T.copy(), pair[1]))
+    yield row("nodes mirrored", tableaux, "_nodes", mirrored)
+    yield row("one node off by 1e-9", tableaux, "_nodes", lambda c: c + 1e-9 * (np.arange(c.size) == 0))
+    yield row("A of Sun's family off by 1e-9", tableaux, "_symplectic_average", lambda A: A + 1e-9 * np.eye(len(A)))
+    average = lambda A, b: A  # noqa: E731
+    plain = lambda: patch.object(tableaux, "_symplectic_average", average)  # noqa: E731
+    yield Fault("the symplectic average left out", "tableau", plain, (TABLEAUX,))
+    for name in ("A", "B", "C", "E3", "E5"):
+        array = getattr(scipy.integrate.DOP853, name).copy()
+        array[np.unravel_index(np.flatnonzero(array)[1], array.shape)] += 1e-6
+        plant = lambda name=name, array=array: patch.object(scipy.integrate.DOP853, name, array)  # noqa: E731
+        yield Fault(f"a number of DOP853's {name} off by 1e-6", "tableau", plant, (EXPLICIT,))
+
+
+def in_options() -> Iterator[Fault]:
+    """The plan of a method: what its compiled step and the step-size control read."""
+    from twoloop.kernels.steps import newmark_step as newmark
+
+    sound, double, pendulum = mechanisms.andrews(), mechanisms.double_pendulum(), mechanisms.projection_pendulum()
+
+    def planned(owner: Any, **changed: Any) -> Callable[[], AbstractContextManager[Any]]:
+        return _changed(owner, "plan", lambda plan: replace(plan, **changed))
+
+    def swapped(plan: Plan) -> Plan:
+        plan.options[[newmark.BETA, newmark.GAMMA]] = plan.options[[newmark.GAMMA, newmark.BETA]]
+        return plan
+
+    orders = "tests/kernels/test_orders.py::test_observed_order_is_the_theoretical_one[newmark(1/4)]"
+    plant = _changed(methods.Newmark, "plan", swapped)
+    yield Fault("beta and gamma of Newmark swapped", "options", plant, (orders,))
+    for name, owner, solver, change in (
+        ("exponent of the error 1 in place of 1/8", DOP853, "DOP853 (two-loop)", {"exponent": 1.0}),
+        ("exponent of the error with the other sign", DOP853, "DOP853 (two-loop)", {"exponent": -0.125}),
+        ("exponent of the error 1/5 in place of 1", BDF, "BDF", {"exponent": 0.2}),
+        ("steps that never grow", methods.RungeKutta, "Gauss12", {"factor_max": 1.0}),
+        ("a safety factor of 9", DOP853, "DOP853 (two-loop)", {"safety": 9.0}),
+        ("a safety factor of 0.09", DOP853, "DOP853 (two-loop)", {"safety": 0.09}),
+    ):
+        yield Fault(name, "options", planned(owner, **change), problem=double if owner is BDF else sound, solver=solver)
+    original = solvers.solve_dae
+
+    def looser(*arguments: Any, **named: Any) -> Result:
+        system, t_span, q0, v0, method, rtol, atol = arguments
+        return original(system, t_span, q0, v0, method, 1e4 * rtol, 1e4 * atol, **named)
+
+    loose = lambda: patch.object(solvers, "solve_dae", looser)  # noqa: E731
+    yield Fault("tolerances handed on 1e4 times too large", "options", loose, problem=pendulum)
+
+
+def in_adapter() -> Iterator[Fault]:
+    """What comes back from our methods and from SciPy's."""
+    sound = mechanisms.double_pendulum()
+    for solver, owner, name in (("Gauss12", solvers, "solve_dae"), (SCIPY, solvers, "solve_index1")):
+        whose = "ours" if name == "solve_dae" else "SciPy's"
+        for what, change in (
+            ("multipliers with the other sign", lambda result: replace(result, lam=-result.lam)),
+            ("velocities of the step before", lambda result: replace(result, v=np.roll(result.v, 1, axis=1))),
+            ("two coordinates swapped", lambda result: replace(result, q=result.q[[1, 0, 2, 3]])),
+            ("single precision", lambda result: replace(result, q=result.q.astype(np.float32).astype(float))),
+            ("the end 1e-6 s too early", lambda result: replace(result, q=result.q - 1e-6 * result.v)),
+            ("accelerations of the other sign", lambda result: replace(result, a=-result.a)),
+        ):
+            yield Fault(f"{what} ({whose})", "adapter", _changed(owner, name, change), problem=sound, solver=solver)
+
+
+def in_report() -> Iterator[Fault]:
+    """Measures, medians, rankings and numbers of a report."""
+
+    def fault(name: str, owner: Any, attribute: str, change: Callable[[Any], Any], check: str) -> Fault:
+        return Fault(name, "report", _changed(owner, attribute, change), (check,))
+
+    def columns_swapped(lines: list[list[str]]) -> list[list[str]]:
+        return [[*line[:2], *line[:1:-1]] for line in lines]
+
+    def halved(levels: tuple[Any, dict[str, Array]]) -> tuple[Any, dict[str, Array]]:
+        return levels[0], {level: 0.0 * size for level, size in levels[1].items()}
+
+    def late(pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        return pair[0] * 1.5, pair[1]
+
+    yield fault("columns of the table of costs swapped", tables, "work_precision", columns_swapped, TABLES)
+    yield fault("costs at equal error 10 % too small", tables, "time_for", lambda time: 0.9 * time, TABLES)
+    yield fault("a ranking that begins with the dearest", tables, "ranking", lambda rows: rows.iloc[::-1], TABLES)
+    yield fault("no reason given for an empty cell", tables, "why_not", lambda text: "–", TABLES)
+    yield fault("failed runs left out", tables, "medians", lambda rows: rows[rows["status"] == "REACHED_END"], TABLES)
+    yield fault("violations counted as 0", metrics, "violations", halved, METRICS)
+    yield fault("deviations 1.5 times too large", metrics, "deviation", late, METRICS)
+    yield fault("digits by the natural logarithm", metrics, "correct_digits", lambda x: x * math.log(10.0), METRICS)
+    yield fault("errors of multipliers left out", metrics, "_error_lam", lambda size: None, METRICS)
+    yield fault("minus signs lost", render, "number", lambda text: text.replace("−", ""), RENDER)
+    yield fault("percentages a hundred times too small", render, "percent", lambda text: "0." + text, RENDER)
+
+
+def all_faults() -> list[Fault]:
+    """All of them, each on its own."""
+    made = (in_mechanism, in_trace, in_reference, in_tableau, in_options, in_adapter, in_report)
+    return [fault for make in made for fault in make()]

@@ -1,0 +1,250 @@
+"""Mutants of the kernels: which single change of an operator or a number do the tests of that kernel not see?"""
+
+import ast
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from studies.bench import study
+from studies.bench.cli import ROOT, StudyError
+from studies.bench.store import Output, Row
+
+TESTS = {  # of a kernel whose change compiles nothing but itself, and what is run until a test fails
+    "adams": ("tests/kernels/test_adams.py",),
+    "bdf": ("tests/kernels/test_orders.py", "tests/kernels/test_bdf.py"),
+    "explicit": ("tests/kernels/test_orders.py", "tests/kernels/test_explicit.py"),
+    "newmark": ("tests/kernels/test_newmark.py", "tests/kernels/test_orders.py", "tests/test_fixed_step.py"),
+}
+FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs", "reports")
+SEED, N_EACH, QUICK_EACH = 2016, 10, 1
+TIME_LIMIT = 900.0  # s of the tests of a mutant, longer than they take on a busy machine; none has to end
+NONE = "none"
+# mutants that no test can see, and why: kernel, line, what was there, what is there
+ARGUED: dict[tuple[str, ...], str] = {
+    ("explicit", "if not error <= 1.0:", "<=", "<"): "differs where an error is 1 to the last bit",
+    (
+        "bdf",
+        "if k < options[HIGHEST] and depth > k:",
+        ">",
+        ">=",
+    ): "the estimate is used after k steps of order k only, when the depth is above k",
+    (
+        "bdf",
+        "copy(differences[0], trial[0])",
+        "0",
+        "1",
+    ): "trial[0] and trial[1] are written anew before they are read: the line could go",
+    (
+        "adams",
+        "memory[DEPTH] = 0.0",
+        "0.0",
+        "1.0",
+    ): "another history after three refusals in a row: past a jump it takes fewer steps, to the same answers",
+    (
+        "adams",
+        "width = (n + 3) // 4 * 4",
+        "3",
+        "4",
+    ): "takes four numbers too many; where n_q is a multiple of 4 they lie behind the memory, which no test watches",
+    (
+        "bdf",
+        "for j in range(int(memory[NEXT_DEPTH]) + 1):",
+        "1",
+        "2",
+    ): "copies one row beyond the depth, which is written before it is read",
+    (
+        "adams",
+        "return min(max(error ** (1.0 / (k + 1.0)), 1.0 + 1e-9), SAFETY / SHRINKAGE)",
+        "+",
+        "-",
+    ): "refused steps, one in a hundred, are shortened by up to the same limit: another strategy, no other answer",
+}
+SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
+COMPARED = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
+SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"} | {
+    **{ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+}
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one place of a file: characters `begin` to `end` of a line become `new`.
+
+    Attributes
+    ----------
+    kernel : str
+        Name of the file in twoloop/kernels.
+    line, begin, end : int
+    old, new : str
+    text : str
+        The line as it is.
+    """
+
+    kernel: str
+    line: int
+    begin: int
+    end: int
+    old: str
+    new: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        """For tables and keys."""
+        return f"{self.kernel}.py:{self.line}:{self.begin} {self.old} -> {self.new}"
+
+    def applied(self, source: str) -> str:
+        """The file with the change."""
+        lines = source.splitlines(keepends=True)
+        line = lines[self.line - 1]
+        lines[self.line - 1] = line[: self.begin] + self.new + line[self.end :]
+        return "".join(lines)
+
+
+def mutants_of(kernel: str, source: str) -> Iterator[Mutant]:
+    """All of a file: operators and comparisons swapped, numbers one larger or doubled, "and" for "or"."""
+    lines = source.splitlines()
+
+    def between(left: ast.expr, right: ast.expr, old: str, new: str) -> Iterator[Mutant]:
+        if left.end_lineno == right.lineno and left.end_col_offset is not None:
+            text = lines[right.lineno - 1]
+            begin = text.find(old, left.end_col_offset, right.col_offset)
+            if begin >= 0:
+                yield Mutant(kernel, right.lineno, begin, begin + len(old), old, new, text.strip())
+
+    for function in (node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)):
+        if not function.decorator_list:  # not compiled
+            continue
+        for node in ast.walk(ast.Module(function.body, [])):
+            if isinstance(node, ast.BinOp) and type(node.op) in SWAPPED:
+                yield from between(node.left, node.right, SIGNS[type(node.op)], SWAPPED[type(node.op)])
+            elif isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARED:
+                kind = type(node.ops[0])
+                yield from between(node.left, node.comparators[0], SIGNS[kind], COMPARED[kind])
+            elif isinstance(node, ast.BoolOp):
+                old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+                yield from between(node.values[0], node.values[1], old, new)
+            elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                text, old = lines[node.lineno - 1], ast.get_source_segment(source, node) or ""
+                value: Any = node.value
+                new = repr(value + 1) if isinstance(value, int) else repr(value * 2.0 or 1.0)
+                begin = node.col_offset
+                yield Mutant(kernel, node.lineno, begin, begin + len(old), old, new, text.strip())
+
+
+def sample(quick: bool) -> list[Mutant]:
+    """The same mutants every time, as many of each file."""
+    chosen = []
+    for kernel in TESTS:
+        found = list(mutants_of(kernel, (ROOT / "twoloop" / "kernels" / f"{kernel}.py").read_text()))
+        chosen += random.Random(SEED).sample(found, QUICK_EACH if quick else N_EACH)
+    return chosen
+
+
+def copy_of_the_repository(folder: Path) -> None:
+    """What the tests need, with the compiled kernels, which a change of one file leaves valid."""
+    for name in FOLDERS:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("*.partial.jsonl", "*.png", "*.svg"))
+        elif source.is_file():
+            shutil.copy2(source, folder / name)
+
+
+def first_failure(folder: Path, tests: Sequence[str]) -> str:
+    """The first test that fails in a process of its own, "" if none does; a crash and a time limit count as one."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    try:
+        text, _ = process.communicate(timeout=TIME_LIMIT)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return "time limit of the tests"
+    if process.returncode == 0:
+        return ""
+    failed = [line.split(" ")[1] for line in text.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    if failed:
+        return failed[0]
+    return f"the process ended with {process.returncode}"
+
+
+def row_of(mutant: Mutant, folder: Path) -> Row:
+    """A mutant, and the test that sees it."""
+    path, began = folder / "twoloop" / "kernels" / f"{mutant.kernel}.py", time.monotonic()
+    sound = path.read_text()
+    try:
+        path.write_text(mutant.applied(sound))
+        seen = first_failure(folder, TESTS[mutant.kernel])
+    finally:
+        path.write_text(sound)
+    row: Row = {"kernel": mutant.kernel, "line": mutant.line, "place": mutant.begin, "text": mutant.text}
+    row |= {"old": mutant.old, "new": mutant.new, "seen_by": seen or NONE}
+    return row | {"seconds": time.monotonic() - began}
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, those of each kernel in a copy of the repository, side by side."""
+    chosen, lock = sample(output.call.quick), threading.Lock()
+    with output.kept() as kept, tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(len(TESTS)) as pool:
+
+        def work(kernel: str) -> str:
+            todo = [mutant for mutant in chosen if mutant.kernel == kernel and mutant.name not in kept]
+            folder = Path(name) / kernel
+            if not todo:
+                return ""
+            copy_of_the_repository(folder)
+            for mutant in todo:
+                row = row_of(mutant, folder)
+                with lock:
+                    kept.add(mutant.name, row)
+            return first_failure(folder, TESTS[kernel])  # without one
+
+        for kernel, found in zip(TESTS, pool.map(work, TESTS), strict=True):
+            if found:
+                raise StudyError(f"the tests of {kernel}.py fail without a mutant: {found}")
+        return pd.DataFrame([kept[mutant.name] for mutant in chosen])
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What planted_errors.md says: how many are seen, and which are not."""
+    survivors = rows[rows["seen_by"] == NONE]
+    kernels = {
+        str(kernel): {"n": len(own), "seen": int((own["seen_by"] != NONE).sum())}
+        for kernel, own in rows.groupby("kernel", sort=False)
+    }
+    keys = ("kernel", "text", "old", "new")
+    places = [
+        {key: str(row[key]) for key in ("line", *keys)} | {"why": ARGUED.get(tuple(str(row[key]) for key in keys), "")}
+        for _, row in survivors.iterrows()
+    ]
+    return {"n": len(rows), "seen": len(rows) - len(survivors), "kernels": kernels, "survivors": places}
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write the findings; planted_errors.md shows them."""
+    output.save_findings(findings_of(rows))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study."""
+    study.run_rows("mutants", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

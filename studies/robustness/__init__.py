@@ -1,0 +1,5 @@
+"""Random linkages, sizes, masses and long runs: no answer of ours may be wrong and silent."""
+
+from studies.robustness.study import main
+
+__all__ = ["main"]

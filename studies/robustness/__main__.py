@@ -1,0 +1,5 @@
+"""`python -m studies.robustness`."""
+
+from studies.robustness.study import main
+
+main()

@@ -1,0 +1,99 @@
+"""Runs of random mechanisms under sharp forces, judged by their motion in independent coordinates, and their counts."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pandas as pd
+
+from studies.bench.sharp_forces import FRICTION, families
+from studies.bench.sharp_motion import RIGHT, SAID, SILENT, Mechanism, Motion, case, judged
+from studies.bench.store import Row
+
+METHODS = (  # all presets but the paper's, and code made for the mechanism
+    *("auto", "auto, compiled", "Taylor", "Taylor, compiled", "Adams", "DOP853", "Gauss4", "Gauss6", "Gauss8"),
+    *("Gauss10", "Gauss12", "Gauss14", "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13", "TRBDF2"),
+    *("ESDIRK4", "BDF", "Newmark"),
+)
+OF_FEATURES = (  # the methods that the grid of features is made of
+    *("auto", "auto, compiled", "Taylor", "Adams", "DOP853", "RadauIIA5", "RadauIIA9", "RadauIIA13", "TRBDF2"),
+    "ESDIRK4",
+)
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+SEED, N_MECHANISMS = 24, 144  # every other one with friction: about 3,000 runs
+TIME_LIMIT = 10.0  # s
+SHARP = "sharp"  # group of these rows
+
+Part = tuple[str, Callable[[], list[Row]]]
+
+
+def run(mechanism: Mechanism, known: Motion, method: str, tolerance: float) -> Row:
+    """One run, with code of its own where the name says so."""
+    name, _, code = method.partition(", ")
+    row: Row = {
+        "group": SHARP,
+        "what": mechanism.sharp.family,
+        "name": mechanism.name,
+        "method": method,
+        "tol": tolerance,
+    }
+    return row | judged(mechanism, known, name, tolerance, TIME_LIMIT, **({"compiled": True} if code else {}))
+
+
+def random_mechanisms(quick: bool) -> Iterator[Part]:
+    """Key and rows of each: every method, at a tolerance that goes round."""
+    every = list(families())
+    rubbing = [family for family in every if family.split(",")[0] in FRICTION]
+    others = [family for family in every if family not in rubbing]
+
+    def rows(k: int, family: str) -> list[Row]:
+        mechanism, known, _ = case(family, [SEED, k])
+        methods = METHODS[::6] if quick else METHODS
+        return [
+            run(mechanism, known, method, TOLERANCES[(k + place) % len(TOLERANCES)]) | {"value": float(k)}
+            for place, method in enumerate(methods)
+        ]
+
+    for k in range(4 if quick else N_MECHANISMS):
+        kinds = others if k % 2 else rubbing
+        family = kinds[k // 2 % len(kinds)]
+        yield f"sharp {k} {family}", lambda k=k, family=family: rows(k, family)  # type: ignore[misc]
+
+
+def features(quick: bool) -> Iterator[Part]:
+    """Key and rows of each family: one mechanism, some methods, all tolerances."""
+
+    def rows(place: int, family: str) -> list[Row]:
+        mechanism, known, _ = case(family, [SEED, 1000 + place])
+        methods, tolerances = OF_FEATURES[:: 4 if quick else 1], TOLERANCES[:: 4 if quick else 1]
+        return [run(mechanism, known, method, each) for method in methods for each in tolerances]
+
+    for place, family in enumerate(list(families())[:: 8 if quick else 1]):
+        yield f"feature {family}", lambda place=place, family=family: rows(place, family)  # type: ignore[misc]
+
+
+def counts(rows: pd.DataFrame) -> dict[str, Any]:
+    """Outcomes, and those of each method; every run that is wrong and silent by its name."""
+    silent = rows[rows["outcome"] == SILENT]
+
+    def of(own: pd.DataFrame) -> dict[str, int]:
+        return {"n": len(own)} | {what: int((own["outcome"] == what).sum()) for what in (RIGHT, SAID, SILENT)}
+
+    found: dict[str, Any] = of(rows) | {"n_mechanisms": len(rows.groupby(["what", "name", "value"], dropna=False))}
+    found["methods"] = [{"method": str(name)} | of(own) for name, own in rows.groupby("method", sort=False)]
+    found["families"] = {str(family): len(own) for family, own in silent.groupby("what")}
+    return found
+
+
+def main(quick: bool) -> None:
+    """Run the grid of features and print what came out, without a report."""
+    rows: list[Row] = []
+    for key, part in features(quick):
+        rows += part()
+        print(
+            f"{key}: {sum(row['outcome'] == SILENT for row in rows)} wrong and silent of {len(rows)} so far", flush=True
+        )
+    frame = pd.DataFrame(rows).assign(value=0.0)
+    print(pd.crosstab(frame["method"], frame["outcome"]).to_string())
+    wrong = frame[frame["outcome"] == SILENT]
+    if len(wrong):
+        print(wrong[["what", "name", "method", "tol", "error", "allowed"]].to_string(index=False))

@@ -1,0 +1,287 @@
+"""Random linkages, sizes, masses and long runs: no answer of ours may be wrong and silent."""
+
+import multiprocessing
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from studies.bench import study
+from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
+from studies.bench.render import number, power, render, table
+from studies.bench.store import Output, Row
+from studies.robustness import sharp_runs
+from twoloop import solve_dae
+from twoloop.mechanisms import Problem, four_bar
+
+Array = NDArray[np.float64]
+
+METHODS = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+QUICK_METHODS = ("DOP853", "Gauss12", "BDF")
+TOLERANCE = 1e-8  # rtol and atol of all runs
+LOOSENESS = 1e3  # an answer is right within so many tolerances, times the sensitivity of the end to the start
+TIME_LIMIT = 10.0  # s
+RIGHT, SAID, SILENT = "right", "said so", "wrong and silent"
+T_END = 5.0  # s; of a size s it is times sqrt(s)
+SEED = 2016
+N_LINKAGES, N_QUICK = 100, 2  # of each kind
+SIZES = tuple(10.0**k for k in (-15, -12, -9, -6, -3, 0, 3, 6, 9, 12, 15))
+DENSITIES = tuple(10.0**k for k in (-15, -10, -5, 0, 5, 10, 15))  # kg/m, of all bars
+RATIOS = tuple(10.0**k for k in (-10, -8, -5, 5, 8, 10))  # of bar 2 to the others
+WANTED_SIZES, WANTED_DECADES = (1e-6, 1e3), 10  # what we aim at
+LONG_STEP, LONG_STEPS, LONG_QUICK = 1e-3, (100_000, 1_000_000), (2_000, 10_000)  # s, largest step; their numbers
+STATES = 1000  # states of a long run that are stored
+GROWS = 10.0  # times, from the first tenth of a run to the last: then the violation grows
+LONG_LIMIT = 600.0  # s
+
+
+def measured(problem: Problem, method: str, t_end: float, truth: Array, unit: Array, allowed: float) -> Row:
+    """A run and its outcome: the error is the largest of those of the coordinates, each over its unit."""
+    row: Row = {"method": method, "status": "", "message": "", "error": None, "allowed": allowed}
+    options: dict[str, Any] = {"rtol": TOLERANCE, "atol": TOLERANCE, "time_limit": TIME_LIMIT}
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            result = solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, method, **options)
+        except ValueError as error:
+            return row | {"status": "RAISED", "message": str(error), "outcome": SAID}
+    row |= {"status": result.status.name, "message": result.message, "n_evaluations": result.stats.n_evaluations}
+    if not result.success:
+        return row | {"outcome": SAID}
+    off = float(np.abs((result.q[:, -1] - truth) / unit).max())
+    return row | {"error": off, "outcome": RIGHT if off <= allowed else SAID if said else SILENT}
+
+
+def linkages(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
+    """Key and rows of every linkage; those without a known motion are drawn again and counted."""
+
+    def rows(kind: str, seed: list[int]) -> list[Row]:
+        generator, drawn, empty = np.random.default_rng(seed), None, 0
+        while drawn is None:
+            drawn, empty = draw(kind, generator, T_END), empty + 1
+        allowed = LOOSENESS * TOLERANCE * max(1.0, drawn.sensitivity)
+        about = {"group": "linkage", "what": kind, "value": float(seed[-1]), "name": drawn.problem.name}
+        about |= {"theta3": drawn.problem.parameters["theta3"], "branch": drawn.problem.parameters["branch"]}
+        about |= {"sensitivity": drawn.sensitivity, "n_redrawn": empty - 1}
+        methods = QUICK_METHODS if quick else METHODS
+        return [about | measured(drawn.problem, name, T_END, drawn.q, np.ones(9), allowed) for name in methods]
+
+    for k in range(N_QUICK if quick else N_LINKAGES):
+        for place, kind in enumerate(KINDS):
+            yield f"linkage {kind} {k}", lambda kind=kind, seed=[SEED, place, k]: rows(kind, seed)  # type: ignore[misc]
+
+
+def scales(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
+    """Key and rows of every size and mass."""
+
+    def rows(group: str, value: float) -> list[Row]:
+        size = value if group == "size" else 1.0
+        bar = value if group == "density" else 1.0
+        densities = (bar, value if group == "ratio" else bar, bar)
+        problem, t_end = scaled(size, densities), T_END * np.sqrt(size)
+        unit = np.ones(9)
+        unit[PLACES] = size
+        truth = end_of_scaled(size, (1.0, densities[1] / bar, 1.0), t_end)
+        about = {"group": group, "what": group, "value": value, "name": problem.name}
+        allowed = LOOSENESS * TOLERANCE
+        methods = QUICK_METHODS if quick else METHODS
+        return [about | measured(problem, name, t_end, truth, unit, allowed) for name in methods]
+
+    for group, values in (("size", SIZES), ("density", DENSITIES), ("ratio", RATIOS)):
+        for value in values[:: 5 if quick else 1]:
+            yield f"{group} {value:g}", lambda group=group, value=value: rows(group, value)  # type: ignore[misc]
+
+
+def resident() -> int:
+    """Memory of this process, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def long_run(method: str, n_steps: int) -> Row:
+    """A run of so many steps at least; what its constraints, its energy and its memory do.
+
+    Call it in a process of its own: memory that an earlier run has given back would hide what this one takes.
+    """
+    problem = four_bar()
+    system, t_end = problem.system, n_steps * LONG_STEP
+    options: dict[str, Any] = {"rtol": TOLERANCE, "atol": TOLERANCE, "max_step": LONG_STEP, "time_limit": LONG_LIMIT}
+    times = np.linspace(0.0, t_end, STATES + 1)
+    start = (problem.q0, problem.v0, method)
+    solve_dae(system, (0.0, 1.0), *start, **options, t_eval=times[times < 1.0])  # what is loaded once
+    before = resident()
+    result = solve_dae(system, (0.0, t_end), *start, **options, t_eval=times)
+    row: Row = {"group": "long", "what": "long", "method": method, "value": float(n_steps), "name": problem.name}
+    row |= {"status": result.status.name, "message": result.message, "outcome": RIGHT if result.success else SAID}
+    row |= {"n_steps": result.h.size, "bytes_a_step": (resident() - before) / max(1, result.h.size)}
+    states = list(zip(result.t, result.q.T.copy(), result.v.T.copy(), strict=True))
+    sizes = {
+        "q": [float(np.abs(system.constraint(t, q)).max()) for t, q, _ in states],
+        "v": [float(np.abs(system.velocity_constraint(t, q, v)).max()) for t, q, v in states],
+    }
+    energy = np.abs(problem.energy(result.t, result.q, result.v) - problem.energy(0.0, problem.q0, problem.v0))
+    tenth = max(1, len(states) // 10)
+    for level, size in sizes.items():
+        row |= {f"first_{level}": max(size[:tenth]), f"last_{level}": max(size[-tenth:])}
+    return row | {"energy": float(energy.max())}
+
+
+def alone(method: str, n_steps: int) -> Row:
+    """`long_run` in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool:
+        return pool.submit(long_run, method, n_steps).result()
+
+
+def long_runs(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
+    """Key and row of every long run."""
+    for method in QUICK_METHODS if quick else METHODS:
+        for n in LONG_QUICK if quick else LONG_STEPS:
+            yield f"long {method} {n}", lambda method=method, n=n: [alone(method, n)]  # type: ignore[misc]
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, those kept from an unfinished run aside."""
+    rows: list[Row] = []
+    with output.kept() as kept:
+        for part in (linkages, sharp_runs.random_mechanisms, scales, long_runs):
+            for key, run in part(output.call.quick):
+                if key not in kept:
+                    kept.add(key, {"rows": run()})
+                rows += kept[key]["rows"]
+    return pd.DataFrame(rows)
+
+
+def counts_of(own: pd.DataFrame) -> dict[str, Any]:
+    """Outcomes, and the largest share of the allowed error of runs that reach the end."""
+    done = own[own["error"].notna()]
+    found: dict[str, Any] = {what: int((own["outcome"] == what).sum()) for what in (RIGHT, SAID, SILENT)}
+    share = (done["error"] / done["allowed"]).astype(float)
+    found["median"], found["worst"] = (float(done["error"].median()), float(share.max())) if len(done) else (None, None)
+    return found
+
+
+def limits_of(own: pd.DataFrame) -> dict[str, Any]:
+    """Smallest and largest value from which and to which all of a method's runs are right, about 1."""
+    good = (own["outcome"] == RIGHT).groupby(own["value"]).all()
+    low = high = None
+    for value in sorted((x for x in good.index if x <= 1.0), reverse=True):
+        if not good[value]:
+            break
+        low = float(value)
+    for value in sorted(x for x in good.index if x >= 1.0):
+        if not good[value]:
+            break
+        high = float(value)
+    return {"low": low, "high": high, "said": sorted({str(x) for x in own[own["outcome"] == SAID]["status"]})}
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says."""
+    drawn, long = rows[rows["group"] == "linkage"], rows[rows["group"] == "long"]
+    silent = rows[(rows["outcome"] == SILENT) & (rows["group"] != sharp_runs.SHARP)]
+    found: dict[str, Any] = {"tolerance": TOLERANCE, "looseness": LOOSENESS, "t_end": T_END, "grows": GROWS}
+    found["n_linkages"] = len(drawn.groupby(["what", "value"]))
+    found["n_redrawn"] = int(drawn.drop_duplicates(["what", "value"])["n_redrawn"].sum())
+    found["sensitivity"] = float(drawn["sensitivity"].max())
+    found["sharp"] = sharp_runs.counts(rows[rows["group"] == sharp_runs.SHARP])
+    stopped = drawn[drawn["outcome"] == SAID]
+    found["n_stopped"], found["n_stopped_rank"] = len(stopped), int(stopped["message"].str.contains("rank").sum())
+    found["linkages"] = [
+        {"method": name, "kind": kind, **counts_of(own)}
+        for (name, kind), own in drawn.groupby(["method", "what"], sort=False)
+    ]
+    found["silent"] = [
+        {key: row[key] for key in ("group", "what", "value", "method", "error", "allowed")}
+        for _, row in silent.iterrows()
+    ]
+    found["scales"] = [
+        {"method": name, "group": group, **limits_of(own)}
+        for group in ("size", "density", "ratio")
+        for name, own in rows[rows["group"] == group].groupby("method", sort=False)
+    ]
+    found["long"] = []
+    for _, row in long[long["value"] == long["value"].max()].iterrows():
+        shorter = long[(long["method"] == row["method"]) & (long["value"] < row["value"])].iloc[0]
+        line = {key: row[key] for key in ("method", "n_steps", "first_q", "last_q", "first_v", "last_v", "energy")}
+        line |= {"bytes": row["bytes_a_step"], "bytes_shorter": shorter["bytes_a_step"], "reached": row["outcome"]}
+        line["grows"] = any(row[f"last_{level}"] > GROWS * row[f"first_{level}"] for level in "qv")
+        found["long"].append(line)
+    found["long_grow"] = [line["method"] for line in found["long"] if line["grows"]]
+    found["most_bytes"] = max(line["bytes"] for line in found["long"])
+    sizes = [line for line in found["scales"] if line["group"] == "size"]
+    reach = [line["low"] is not None and line["low"] <= WANTED_SIZES[0] for line in sizes]
+    reach += [line["high"] is not None and line["high"] >= WANTED_SIZES[1] for line in sizes]
+    found |= {"sizes_reached": all(reach), "wanted_sizes": list(WANTED_SIZES), "wanted_decades": WANTED_DECADES}
+    return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
+
+
+def _span(line: dict[str, Any]) -> str:
+    """From where to where a method is right, and what it reports beyond."""
+    if line["low"] is None or line["high"] is None:
+        return "–"
+    beyond = f" ({', '.join(word.lower() for word in line['said'])})" if line["said"] else ""
+    return f"{power(line['low'])} … {power(line['high'])}{beyond}"
+
+
+def tables_of(found: dict[str, Any]) -> dict[str, str]:
+    """The tables of the report."""
+    methods, kinds = (list(dict.fromkeys(line[key] for line in found["linkages"])) for key in ("method", "kind"))
+    of = {(line["method"], line["kind"]): line for line in found["linkages"]}
+    drawn = [
+        [
+            name,
+            *("/".join(str(of[name, kind][what]) for what in (RIGHT, SAID, SILENT)) for kind in kinds),
+            max(of[name, kind]["median"] for kind in kinds),
+            max(of[name, kind]["worst"] for kind in kinds),
+        ]
+        for name in methods
+    ]
+    reach = {(line["method"], line["group"]): line for line in found["scales"]}
+    reached = [[name, *(_span(reach[name, group]) for group in ("size", "density", "ratio"))] for name in methods]
+    lasting = [
+        [
+            line["method"],
+            number(float(line["n_steps"])),
+            *(f"{number(line[f'first_{level}'])} / {number(line[f'last_{level}'])}" for level in "qv"),
+            line["energy"],
+            line["bytes"],
+        ]
+        for line in found["long"]
+    ]
+    always = [line for line in found["sharp"]["methods"] if not line[SAID] and not line[SILENT]]
+    others = [line for line in found["sharp"]["methods"] if line not in always]
+    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT))] for line in others]
+    if always:
+        sharp.append([", ".join(line["method"] for line in always), f"all {always[0][RIGHT]}", 0, 0])
+    return {
+        "sharp": table(("method", RIGHT, SAID, SILENT), sharp),
+        "linkages": table(("method", *kinds, "median error", "worst / allowed"), drawn),
+        "scales": table(("method", "size, m", "density, kg/m", "density of bar 2 over the others"), reached),
+        "long": table(("method", "steps", "max abs C", "max abs C_q v", "energy (J)", "bytes a step"), lasting),
+    }
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    text = render("robustness", found, tables_of(found), stamp=line, quick=output.call.quick)
+    output.write("robustness.md", text)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study and write its report; with --features a grid of sharp forces in its place, printed only."""
+    given = sys.argv[1:] if words is None else words
+    if "--features" in given:
+        sharp_runs.main("--quick" in given)
+        return
+    study.run_rows("robustness", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

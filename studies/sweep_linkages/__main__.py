@@ -1,0 +1,5 @@
+"""`python -m studies.sweep_linkages`."""
+
+from studies.sweep_linkages.study import main
+
+main()

@@ -1,0 +1,193 @@
+"""Ten thousand random linkages: energy error and period of each, and how a sweep scales on two cores."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from studies.bench import figures, study
+from studies.bench.cli import StudyError
+from studies.bench.render import render, table
+from studies.bench.store import Output, sources
+from studies.sweep_linkages import many_runs
+from twoloop import Result, sweep
+from twoloop.mechanisms import Problem, four_bar
+
+Array = NDArray[np.float64]
+
+SEED = 2016
+N_RUNS, N_QUICK = 10_000, 20
+N_SCALING, N_SCALING_QUICK = 1_000, 10
+N_MANY, N_MANY_QUICK = 100, 4
+SPAN = (0.0, 6.0)
+RANGES = {"L1": (0.8, 1.5), "L2": (1.0, 2.0), "L3": (0.8, 1.6), "ground": (2.0, 3.0), "theta3": (-1.0, 1.0)}
+AT_REST = 1e-4  # of the largest velocity of a run: below it the linkage has turned back
+SAME = 1e-6  # s: zeros of several bars closer than this are one rest
+BARS = (2, 5, 8)  # angles of the three bars
+WAYS = (("processes", 1), ("processes", 2), ("threads", 1), ("threads", 2))
+SCALES = 1.8  # on two cores, as the project asks for
+
+
+def linkage(L1: float, L2: float, L3: float, ground: float, theta3: float, branch: int) -> Problem:
+    """A linkage of these lengths, released from rest."""
+    return four_bar((L1, L2, L3), ground, theta3, branch)
+
+
+def drawn(n: int) -> list[dict[str, Any]]:
+    """Parameters of n linkages, always the same ones."""
+    rng = np.random.default_rng(SEED)
+    made = []
+    for _ in range(n):
+        values = {name: round(float(rng.uniform(*limits)), 4) for name, limits in RANGES.items()}
+        made.append({**values, "branch": int(rng.choice((-1, 1)))})
+    return made
+
+
+def turning(angle: int, t: float, q: Array, v: Array) -> float:
+    """Zero where one bar turns back, as all do wherever the linkage is at rest."""
+    return float(v[angle])
+
+
+# of all three bars: one whose acceleration at rest is nearly zero turns back three times within milliseconds, of which
+# signs taken four times a step see one
+TURNING = tuple(partial(turning, angle) for angle in BARS)
+
+
+def rests(result: Result) -> Array:
+    """Times after the start at which the linkage is at rest."""
+    assert result.t_events is not None and result.v_events is not None
+    least = AT_REST * np.abs(result.v).max()
+    found = [
+        t[np.abs(v).max(axis=1, initial=0.0) < least] for t, v in zip(result.t_events, result.v_events, strict=True)
+    ]
+    times = np.sort(np.concatenate(found))
+    times = times[times > SAME]
+    return times[np.diff(times, prepend=0.0) > SAME]
+
+
+def measured(problem: Problem, result: Result) -> dict[str, Any]:
+    """Energy error over the largest kinetic energy, and the period: the second return to rest is that to the start."""
+    energy = result.energy
+    kinetic = energy - problem.energy(result.t, result.q, 0.0 * result.v)
+    stops = rests(result)
+    known = len(stops) > 1
+    return {
+        "energy_error": _short(np.abs(energy - energy[0]).max() / kinetic.max(), 4),
+        "half": _short(stops[0], 12) if known else np.nan,
+        "period": _short(stops[1], 12) if known else np.nan,
+        "n_evaluations": result.stats.n_evaluations,
+    }
+
+
+def _short(value: float, digits: int) -> float:
+    """With so many digits: a file of ten thousand rows should hold no others."""
+    return float(f"{value:.{digits}g}")
+
+
+def make(output: Output) -> pd.DataFrame:
+    """The rows of all linkages, then one of each way to sweep, with its wall-clock time."""
+    quick = output.call.quick
+    ways = WAYS[2:] if quick else WAYS  # new processes take seconds to start: not for a quick run
+    options: dict[str, Any] = {"measure": measured, "t_span": SPAN, "events": TURNING}
+    # what an interrupted run leaves is of no use to other sources
+    kept = output.file(f"sweep_linkages.{sources()[:16]}.partial.parquet")
+    given = drawn(N_QUICK if quick else N_RUNS)
+    rows = sweep(linkage, given, **options, workers=2, parallel=ways[0][0], out=kept)
+    rows["message"] = rows["message"].where(rows["status"] != "REACHED_END", "")
+    parts = [rows.drop(columns="seconds").assign(group="linkages")]
+    for parallel, workers in ways:
+        chosen = drawn(N_SCALING_QUICK if quick else N_SCALING)
+        began = time.perf_counter()
+        timed = sweep(linkage, chosen, **options, workers=workers, parallel=parallel)
+        row = {"group": "scaling", "parallel": parallel, "workers": workers, "n_runs": len(timed)}
+        parts.append(pd.DataFrame([row | {"wall": time.perf_counter() - began}]))
+    kept.unlink()
+    several = many_runs.assembled(linkage, drawn(N_RUNS if not quick else N_QUICK), N_MANY_QUICK if quick else N_MANY)
+    # diffrax takes ten seconds to compile: not for a quick run
+    names = (many_runs.SWEEP, many_runs.SINGLE, many_runs.HEYOKA, *(() if quick else (many_runs.DIFFRAX,)))
+    parts.append(pd.DataFrame(many_runs.rows_of(linkage, several, SPAN[1], names, quick)))
+    return pd.concat(parts, ignore_index=True)
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says."""
+    linkages = rows[rows["group"] == "linkages"]
+    done = linkages[linkages["status"] == "REACHED_END"]
+    if not len(done):
+        raise StudyError("no linkage reached the end; the rows say why")
+    failed = linkages[linkages["status"] != "REACHED_END"]
+    causes = failed["message"].astype(str).str.startswith("ValueError: the linkage cannot be assembled")
+    periodic = done[done["period"].notna()]
+    worst = done.loc[done["energy_error"].idxmax()]
+    scaling = rows[rows["group"] == "scaling"]
+    wall = {(row["parallel"], int(row["workers"])): float(row["wall"]) for _, row in scaling.iterrows()}
+    ratios = {way: wall[way, 1] / wall[way, 2] for way in ("processes", "threads") if (way, 1) in wall}
+    returned = np.abs(periodic["period"] - 2.0 * periodic["half"]) / periodic["period"]
+    return {
+        "n": len(linkages),
+        "n_done": len(done),
+        "n_unassembled": int(causes.sum()),
+        "others": failed[~causes]["status"].value_counts().to_dict(),
+        "runs_per_second": int(scaling["n_runs"].iloc[0]) / min(wall.values()),
+        "t_end": SPAN[1],
+        "energy": _quantiles(done["energy_error"]),
+        "worst": {name: float(worst[name]) for name in (*RANGES, "branch", "energy_error")},
+        "n_periodic": len(periodic),
+        "period": _quantiles(periodic["period"]) if len(periodic) else None,
+        "return": _quantiles(returned) if len(periodic) else None,
+        "n_scaling": int(scaling["n_runs"].iloc[0]),
+        "ratios": ratios,
+        "many": many_runs.findings_of(rows),
+        "asked": SCALES,
+        "scales": ratios["processes"] >= SCALES if "processes" in ratios else None,
+    }
+
+
+def _quantiles(values: pd.Series) -> dict[str, float]:
+    return {"low": values.min(), "median": values.median(), "high": values.quantile(0.95), "worst": values.max()}
+
+
+def figure_of(rows: pd.DataFrame) -> Figure:
+    """Energy errors and periods of all linkages."""
+    done = rows[(rows["group"] == "linkages") & (rows["status"] == "REACHED_END")]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.4), layout="constrained")
+    errors = done["energy_error"].clip(lower=1e-16)
+    left.hist(errors, bins=np.geomspace(errors.min(), 1.01 * errors.max(), 40), color=figures.BLUE)
+    left.set(xscale="log", xlabel="largest energy error over largest kinetic energy", ylabel="linkages")
+    right.hist(done["period"].dropna(), bins=40, color=figures.BLUE)
+    right.set(xlabel="period (s)", ylabel="linkages")
+    return figure
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings, figure and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    figures.save(figure_of(rows), output, "sweep_linkages")
+    scaling = rows[rows["group"] == "scaling"]
+    cells = [(row["parallel"], int(row["workers"]), row["wall"]) for _, row in scaling.iterrows()]
+    ready = {"scaling": table(["workers are", "number", "wall-clock time (s)"], cells)}
+    many = found["many"]["lines"] if found["many"] else []
+    lines = [(e["way"], e["tol"], 1e3 * e["call_s"], e["first_s"], e["error_median"], e["error_worst"]) for e in many]
+    names = ["way", "tolerance", "CPU time a run (ms)", "first call (s)", "median error", "largest error"]
+    ready["many"] = table(names, lines)
+    text = render("sweep_linkages", found, ready, stamp=line, quick=output.call.quick)
+    output.write("sweep_linkages.md", text)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study."""
+    study.run_rows("sweep_linkages", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    # the functions are to be those of the module, not of the script: other processes look for them there
+    from studies.sweep_linkages.study import main as main_of_module
+
+    main_of_module()

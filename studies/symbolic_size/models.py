@@ -1,0 +1,253 @@
+"""Ready mechanisms, written again as energies and constraints for SymPy, with their numbers.
+
+`python -m studies.symbolic_size.models COORDINATES N TANGENTS FOLDER` measures one chain in a process of its own.
+"""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from scipy.optimize import brentq
+from sympy.physics.mechanics import dynamicsymbols
+
+from twoloop import solve_dae
+from twoloop.mechanisms import (
+    closed_chain,
+    driven_crank,
+    four_bar,
+    heavy_top,
+    knife_edge,
+    rolling_disc,
+    sundials_slider_crank,
+)
+from twoloop.problem import generated
+from twoloop.problem.problem import Problem
+from twoloop.symbolic import SymbolicMechanism, from_lagrangian
+
+t = dynamicsymbols._t
+SLACK = 0.8  # m between the pins of a chain, whose links are together 1 m long
+REPEATS = 5
+
+
+def rates(coordinates: Sequence[Any]) -> list[Any]:
+    """Their derivatives by time."""
+    return [each.diff(t) for each in coordinates]
+
+
+def symbolic_four_bar(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+    problem = four_bar()
+    q = dynamicsymbols("x1 y1 th1 x2 y2 th2 x3 y3 th3")
+    lengths, ground, g = sp.symbols("L1:4"), sp.Symbol("L"), sp.Symbol("g")
+    T = V = x = y = sp.S.Zero
+    constraints = []
+    for i, length in enumerate(lengths):
+        px, py, angle = q[3 * i : 3 * i + 3]
+        T += length * (px.diff(t) ** 2 + py.diff(t) ** 2 + length**2 / 12 * angle.diff(t) ** 2) / 2
+        V += length * g * py
+        dx, dy = length / 2 * sp.cos(angle), length / 2 * sp.sin(angle)
+        constraints += [px - x - dx, py - y - dy]
+        x, y = x + 2 * dx, y + 2 * dy
+    values = dict(zip([*lengths, ground, g], [1.0, 2.0, 1.5, 3.0, 9.81], strict=True))
+    return problem, from_lagrangian(
+        T, V, [*constraints, y, x - ground], q, parameters=values, tangents=tangents, name="four-bar"
+    )
+
+
+def symbolic_slider_crank(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+    """With a spring, a damper and a constant force: forces, dissipation and potential each have their part."""
+    problem = sundials_slider_crank()
+    q = crank, slider, rod = dynamicsymbols("crank slider rod")
+    p = a, J1, m2, J2, k, c, l0, F = sp.symbols("a J1 m2 J2 k c l0 F")
+    w1, u, w2 = rates(q)
+    T = (J1 * w1**2 + m2 * u**2 + J2 * w2**2) / 2
+    x, y = slider - (sp.cos(rod) + a * sp.cos(crank)) / 2, (sp.sin(rod) + a * sp.sin(crank)) / 2
+    length = sp.sqrt(x**2 + y**2)
+    mechanism = from_lagrangian(
+        T,
+        k * (length - l0) ** 2 / 2 - F * (slider + sp.cos(rod)),
+        [slider - sp.cos(rod) - a * sp.cos(crank), -sp.sin(rod) - a * sp.sin(crank)],
+        q,
+        dissipation=c * length.diff(t) ** 2 / 2,
+        parameters={symbol: problem.parameters[symbol.name] for symbol in p},
+        tangents=tangents,
+        name="slider-crank",
+    )
+    return problem, mechanism
+
+
+def symbolic_driven_crank(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+    problem = driven_crank()
+    q = x1, y1, th1, x2, y2, th2 = dynamicsymbols("x1 y1 th1 x2 y2 th2")
+    u1, v1, w1, u2, v2, w2 = rates(q)
+    p = L1, L2, m1, m2, g, start, rate, amplitude, frequency = sp.symbols(
+        "L1 L2 m1 m2 g start rate amplitude frequency"
+    )
+    T = (m1 * (u1**2 + v1**2 + L1**2 / 12 * w1**2) + m2 * (u2**2 + v2**2 + L2**2 / 12 * w2**2)) / 2
+    constraints = [
+        x1 - L1 / 2 * sp.cos(th1),
+        y1 - L1 / 2 * sp.sin(th1),
+        x2 - L2 / 2 * sp.cos(th2) - x1 - L1 / 2 * sp.cos(th1),
+        y2 - L2 / 2 * sp.sin(th2) - y1 - L1 / 2 * sp.sin(th1),
+        th1 - start - rate * t - amplitude * sp.sin(frequency * t),
+    ]
+    known = problem.parameters
+    numbers = [known["crank"], known["rod"], *known["masses"], known["gravity"], *known["drive"].values()]
+    values = dict(zip(p, numbers, strict=True))
+    return problem, from_lagrangian(
+        T, g * (m1 * y1 + m2 * y2), constraints, q, parameters=values, tangents=tangents, name="driven crank"
+    )
+
+
+def symbolic_knife_edge(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+    problem = knife_edge()
+    q = x, _, angle = dynamicsymbols("x y angle")
+    u, v, w = rates(q)
+    m, J, pull = sp.symbols("m J pull")
+    mechanism = from_lagrangian(
+        (m * (u**2 + v**2) + J * w**2) / 2,
+        -pull * x,
+        [],
+        q,
+        nonholonomic=[u * sp.sin(angle) - v * sp.cos(angle)],
+        parameters=dict(zip((m, J, pull), problem.system.parameters.tolist(), strict=True)),
+        tangents=tangents,
+        name="knife edge",
+    )
+    return problem, mechanism
+
+
+def symbolic_rolling_disc(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+    problem = rolling_disc()
+    q = dynamicsymbols("x y z yaw lean spin")
+    z, yaw, lean = q[2:5]
+    u, v, w, yaw_rate, ahead, spin_rate = rates(q)
+    m, R, g = sp.symbols("m R g")
+    upright, turn = yaw_rate * sp.cos(lean), spin_rate - yaw_rate * sp.sin(lean)
+    T = m * (u**2 + v**2 + w**2) / 2 + m * R**2 * (ahead**2 + upright**2) / 8 + m * R**2 * turn**2 / 4
+    centre = sp.Matrix([u, v])
+    forward, side = sp.Matrix([sp.cos(yaw), sp.sin(yaw)]), sp.Matrix([-sp.sin(yaw), sp.cos(yaw)])
+    slip = centre + R * (spin_rate - yaw_rate * sp.sin(lean)) * forward + R * ahead * sp.cos(lean) * side
+    known = problem.parameters
+    values = dict(zip((m, R, g), (known["mass"], known["radius"], known["gravity"]), strict=True))
+    holonomic = [z - R * sp.cos(lean)]
+    return problem, from_lagrangian(
+        T, m * g * z, holonomic, q, nonholonomic=slip, parameters=values, tangents=tangents, name="rolling disc"
+    )
+
+
+def body_spin(e: Sequence[Any]) -> sp.Matrix:
+    """Angular velocity in the axes of a body, 2 G(e) e'."""
+    e0, e1, e2, e3 = e
+    G = sp.Matrix([[-e1, e0, e3, -e2], [-e2, -e3, e0, e1], [-e3, e2, -e1, e0]])
+    return 2 * G * sp.Matrix(rates(e))
+
+
+def rotation(e: Sequence[Any]) -> sp.Matrix:
+    """The rotation matrix of Euler parameters, homogeneous of degree two as in `twoloop.mechanisms.rotation`."""
+    e0, f = e[0], sp.Matrix(e[1:])
+    cross = sp.Matrix([[0, -e[3], e[2]], [e[3], 0, -e[1]], [-e[2], e[1], 0]])
+    return (e0**2 - f.dot(f)) * sp.eye(3) + 2 * f * f.T + 2 * e0 * cross
+
+
+def symbolic_heavy_top(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+    problem = heavy_top()
+    x, e = dynamicsymbols("x y z"), dynamicsymbols("e0:4")
+    m, length, g, *J = sp.symbols("m length g J1:4")
+    spin = body_spin(e)
+    T = m * sum(each**2 for each in rates(x)) / 2 + sum(J[i] * spin[i] ** 2 for i in range(3)) / 2
+    pivot = sp.Matrix(x) + rotation(e) * sp.Matrix([0, -length, 0])
+    known = problem.parameters
+    values = dict(zip((m, length, g, *J), (known["mass"], known["length"], 9.81, *known["inertia"]), strict=True))
+    constraints = [(sum(each**2 for each in e) - 1) / 2, *pivot]
+    return problem, from_lagrangian(
+        T, m * g * x[2], constraints, [*x, *e], parameters=values, tangents=tangents, name="heavy top"
+    )
+
+
+MODELS: dict[str, Callable[..., tuple[Problem, SymbolicMechanism]]] = {
+    "four-bar": symbolic_four_bar,
+    "slider-crank with spring and damper": symbolic_slider_crank,
+    "driven crank": symbolic_driven_crank,
+    "knife edge": symbolic_knife_edge,
+    "rolling disc": symbolic_rolling_disc,
+    "heavy top": symbolic_heavy_top,
+}
+
+
+def chain_of_positions(n: int, tangents: bool = False) -> SymbolicMechanism:
+    """`closed_chain(n)`: point masses on massless links, in Cartesian coordinates."""
+    names = " ".join(f"x{i} y{i}" for i in range(n))
+    q = dynamicsymbols(names)
+    m, length, g, span = sp.symbols("m length g span")
+    points = [(0, 0), *((q[2 * i], q[2 * i + 1]) for i in range(n)), (span, 0)]
+    T = m * sum(each**2 for each in rates(q)) / 2
+    V = m * g * sum(q[1::2])
+    links = [((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 - length**2) / 2 for a, b in pairwise(points)]
+    values = {m: 1.0 / n, length: 1.0 / (n + 1), g: 9.81, span: SLACK}
+    return from_lagrangian(T, V, links, q, parameters=values, tangents=tangents, name=f"closed chain of {n}")
+
+
+def chain_of_angles(n: int, tangents: bool = False) -> SymbolicMechanism:
+    """n + 1 uniform links whose ends are pinned, in the angles of the links: a full mass matrix, two constraints."""
+    q = dynamicsymbols(f"a0:{n + 1}")
+    m, length, g, span = sp.symbols("m length g span")
+    T = V = x = y = sp.S.Zero
+    for angle in q:
+        middle = x + length / 2 * sp.cos(angle), y + length / 2 * sp.sin(angle)
+        T += m * (sum(each.diff(t) ** 2 for each in middle) + length**2 / 12 * angle.diff(t) ** 2) / 2
+        V += m * g * middle[1]
+        x, y = x + length * sp.cos(angle), y + length * sp.sin(angle)
+    values = {m: 1.0 / (n + 1), length: 1.0 / (n + 1), g: 9.81, span: SLACK}
+    return from_lagrangian(
+        T, V, [x - span, y], q, parameters=values, tangents=tangents, name=f"closed chain of {n}, angles"
+    )
+
+
+CHAINS = {"angles": chain_of_angles, "positions": chain_of_positions}
+
+
+def started(coordinates: str, n: int, mechanism: SymbolicMechanism) -> Problem:
+    """A chain at rest, not symmetric."""
+    if coordinates == "positions":
+        return mechanism.problem(closed_chain(n).q0, np.zeros(2 * n), (0.0, 0.5))
+    links = n + 1
+    half = brentq(lambda a: math.sin(links * a) / (links * math.sin(a)) - SLACK, 1e-6, math.pi / links)
+    angles = (2.0 * np.arange(links) - n) * half
+    angles[:2] = angles[1::-1]
+    return mechanism.problem(angles, np.zeros(links), (0.0, 0.5))
+
+
+def measured(coordinates: str, n: int, tangents: bool) -> dict[str, Any]:
+    """CPU times of making and running a chain, s: to be called in a process that has done nothing before."""
+    began = time.process_time()
+    mechanism = CHAINS[coordinates](n, tangents)
+    derived = time.process_time()
+    _ = mechanism.system
+    compiled = time.process_time()
+    problem = started(coordinates, n, mechanism)
+    runs = [solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853")]
+    since_start = time.process_time()
+    for _ in range(REPEATS):
+        runs.append(solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853"))
+    costs = [1e6 * (run.stats.cpu_time or 0.0) / (run.stats.n_evaluations or 1) for run in runs]
+    return {
+        "status": runs[-1].status.name,
+        "lines": mechanism.code.source.count("\n"),
+        "derive_s": derived - began,
+        "compile_s": compiled - derived,
+        "start_s": since_start,  # with the imports, and all that runs before
+        "evaluation_us": min(costs),
+    }
+
+
+if __name__ == "__main__":
+    coordinates, n, tangents, folder = sys.argv[1:]
+    generated.sources_folder = lambda: Path(folder)  # type: ignore[assignment]
+    print(json.dumps(measured(coordinates, int(n), tangents == "True")))

@@ -1,0 +1,159 @@
+"""Mechanisms from SymPy: what a chain of n links costs to derive, to compile, to start again and to evaluate.
+
+Times of making are CPU times of a process of its own; those of evaluations are the least of several runs.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from studies.bench import study
+from studies.bench.cli import ROOT
+from studies.bench.render import number, render, table
+from studies.bench.store import Output, Row
+from studies.symbolic_size.models import MODELS, REPEATS
+from twoloop import solve_dae
+from twoloop.mechanisms import Problem
+
+SIZES = (2, 5, 10, 20)
+QUICK_SIZES = (2,)
+QUICK_MODELS = 2
+TIME_LIMIT = 150.0  # s of wall-clock time for one chain, twice
+LONGEST = 2.0  # s of motion of the comparisons
+DEARER = 1.2  # times the cost of an evaluation by hand, which is to be kept
+SECOND = 2.0  # s of CPU time in which a second process is to start
+
+
+def made(coordinates: str, n: int, tangents: bool) -> Row:
+    """One chain, made in a process of its own, and again in a second one."""
+    row: Row = {"group": "size", "case": coordinates, "n": n, "tangents": tangents}
+    with tempfile.TemporaryDirectory() as folder:
+        words = [sys.executable, "-m", "studies.symbolic_size.models", coordinates, str(n), str(tangents), folder]
+        for turn in ("first", "second"):
+            try:
+                done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=TIME_LIMIT)
+            except subprocess.TimeoutExpired:
+                return row | {"status": "TIME_LIMIT", "message": f"the {turn} process took more than {TIME_LIMIT:g} s"}
+            if done.returncode != 0:
+                return row | {"status": "RAISED", "message": (done.stderr.strip().splitlines() or ["?"])[-1]}
+            got = json.loads(done.stdout)
+            row |= {"second_s": got["start_s"]} if turn == "second" else got
+    return row
+
+
+def cost(problem: Problem, times: int) -> tuple[float, int | None]:
+    """Least CPU time of an evaluation, us, and how many there were."""
+    end = min(LONGEST, problem.t_span[1])
+    least, count = float("inf"), None
+    for _ in range(times):
+        result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, "DOP853", rtol=1e-8, atol=1e-8)
+        count = result.stats.n_evaluations
+        least = min(least, 1e6 * (result.stats.cpu_time or 0.0) / (count or 1))
+    return least, count
+
+
+def compared(name: str) -> Row:
+    """A ready mechanism and its twin from SymPy: evaluations of a run and what one costs."""
+    hand, mechanism = MODELS[name]()
+    twin = mechanism.problem(hand.q0, hand.v0, hand.t_span)
+    row: Row = {
+        "group": "twin",
+        "case": name,
+        "status": "REACHED_END",
+        "hand_us": float("inf"),
+        "twin_us": float("inf"),
+    }
+    for _ in range(REPEATS):  # in turn, so that both see the same machine
+        for whose, problem in (("hand", hand), ("twin", twin)):
+            least, count = cost(problem, REPEATS)
+            row |= {f"{whose}_us": min(row[f"{whose}_us"], least), f"{whose}_evaluations": count}
+    return row
+
+
+def make(output: Output) -> pd.DataFrame:
+    """All rows."""
+    quick = output.call.quick
+    sizes = [
+        (coordinates, n, tangents)
+        for n in (QUICK_SIZES if quick else SIZES)
+        for coordinates in ("positions", "angles")
+        for tangents in ((False,) if quick else (False, True))
+    ]
+    names = list(MODELS)[: QUICK_MODELS if quick else None]
+    with output.kept() as kept:
+        for which in sizes:
+            if str(which) not in kept:
+                kept.add(str(which), made(*which))
+        for name in names:
+            if name not in kept:
+                kept.add(name, compared(name))
+        return pd.DataFrame([kept[key] for key in (*map(str, sizes), *names)])
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says."""
+    sizes, twins = rows[rows["group"] == "size"], rows[rows["group"] == "twin"]
+    done = sizes[sizes["status"] == "REACHED_END"]
+    ratios = twins["twin_us"] / twins["hand_us"]
+    largest = done[done["n"] == done["n"].max()]
+    with_tangents = largest[largest["tangents"] & (largest["case"] == "angles")]
+    without = largest[~largest["tangents"] & (largest["case"] == "angles")]
+    return {
+        "n": None if done.empty else int(done["n"].max()),
+        "failed": [
+            f"{row.case}, n = {row.n:g}: {row.status}" for row in sizes.itertuples() if row.status != "REACHED_END"
+        ],
+        "second_s": None if done.empty else float(done["second_s"].max()),
+        "second_limit": SECOND,
+        "late": [f"{row.case}, n = {row.n:g}" for row in done.itertuples() if row.second_s > SECOND],
+        "compile_s": [None if part.empty else float(part["compile_s"].max()) for part in (without, with_tangents)],
+        "ratio": [float(ratios.min()), float(ratios.max())],
+        "limit": DEARER,
+        "dearer": twins["case"][ratios > DEARER].tolist(),
+        "other_counts": twins["case"][twins["twin_evaluations"] != twins["hand_evaluations"]].tolist(),
+    }
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    sizes, twins = rows[rows["group"] == "size"], rows[rows["group"] == "twin"]
+    columns = ("lines", "derive_s", "compile_s", "second_s", "evaluation_us")
+    size_cells = [
+        [row["case"], f"{row['n']:g}", "yes" if row["tangents"] else "no", *(number(row.get(name)) for name in columns)]
+        for _, row in sizes.iterrows()
+    ]
+    twin_cells = [
+        [row["case"], number(row["hand_us"]), number(row["twin_us"]), number(row["twin_us"] / row["hand_us"])]
+        for _, row in twins.iterrows()
+    ]
+    header = [
+        "coordinates",
+        "n",
+        "tangents",
+        "lines",
+        "derive (s)",
+        "compile (s)",
+        "second start (s)",
+        "evaluation (us)",
+    ]
+    ready = {
+        "sizes": table(header, size_cells),
+        "twins": table(["mechanism", "by hand (us)", "from SymPy (us)", "ratio"], twin_cells),
+    }
+    output.write("symbolic_size.md", render("symbolic_size", found, ready, stamp=line, quick=output.call.quick))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study and write its report."""
+    study.run_rows("symbolic_size", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Why the paper's time over ours is not one factor in Table 3: causes and readings of the text, tested on the rows."""
+
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import least_squares
+
+from studies.bench.collector import Case, Run, Solver
+from studies.bench.solvers import ERR_IN, ERR_OUT, IRK, NEWMARK, PAPER_TOL
+from twoloop import Result, RungeKutta, solve_dae
+from twoloop.methods.tableaux import sun_radau_iib
+
+TOLERANCES = ERR_OUT
+FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
+FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
+Reading = Literal["all", "independent"]
+READINGS: dict[Reading, str] = {"all": "all of z", "independent": "y_i only"}  # what criterion (32) is taken over
+
+# Table 3 as printed: [err_in][err_out] in seconds; None is the star, "no reasonable result in long time simulation"
+PAPER_IRK = ((1.95, 1.98, 2.00, 2.08), (2.12, 2.23, 2.31, 2.31), (2.64, 2.85, 2.85, 2.99), (3.37, 3.46, 3.55, 3.60))
+PAPER_NEWMARK = (
+    (None, 2.71, 12.62, 49.73),
+    (None, 2.74, 12.36, 49.68),
+    (None, 3.10, 12.68, 49.66),
+    (None, 3.09, 13.40, 50.93),
+)
+PRINTED = {"out": PAPER_IRK[-1], "in": tuple(row[-1] for row in PAPER_IRK)}  # along one, the other at its finest
+
+
+def printed(group: str) -> tuple[tuple[float | None, ...], ...]:
+    """The paper's times of one procedure."""
+    return PAPER_IRK if group == "Table 3: IRK" else PAPER_NEWMARK
+
+
+def machine(rows: pd.DataFrame, group: str, err_in: float, err_out: float) -> pd.Series | None:
+    """Our run of a cell."""
+    found = rows[(rows["group"] == group) & (rows["err_in"] == err_in) & (rows["err_out"] == err_out)]
+    return None if found.empty else found.iloc[0]
+
+
+def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:
+    """All cells that both have: printed time, our time and counts; exchanged: err_in and err_out of the IRK swapped."""
+    lines = []
+    for group in FAMILIES:
+        for i, e_in in enumerate(TOLERANCES):
+            for j, e_out in enumerate(TOLERANCES):
+                swapped = exchanged and group == "Table 3: IRK"
+                paper = printed(group)[j][i] if swapped else printed(group)[i][j]
+                ours = machine(rows, group, e_in, e_out)
+                if paper is None or ours is None:
+                    continue
+                attempts = float(ours["n_steps"]) + float(ours["n_rejected"])
+                counts = (float(ours[key]) for key in ("call_s", "n_evaluations", "n_inner"))
+                lines.append((group, paper, *counts, attempts))
+    return pd.DataFrame(lines, columns=["group", "paper", "call_s", "evaluations", "inner", "attempts"])
+
+
+def span(ratio: pd.Series) -> float:
+    """Largest over smallest: 1 if one factor explains all."""
+    return float(ratio.max() / ratio.min())
+
+
+def fit(table: pd.DataFrame) -> dict[str, float]:
+    """The cost model, printed time = e (evaluations + i inner iterations + p attempted steps), least squares in logs.
+
+    i is at most 1: an evaluation contains inner iterations, so that one of them cannot cost more.
+    """
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        scale, inner, attempt = np.exp(x)
+        model = scale * (table["evaluations"] + inner * table["inner"] + attempt * table["attempts"])
+        return np.asarray(np.log(model / table["paper"]), dtype=float)
+
+    found = least_squares(cost, np.log([2e-5, 0.2, 4.0]), bounds=(np.log(1e-9), np.log([1.0, 1.0, 1e3])))
+    residual = cost(found.x)
+    irk = (table["group"] == "Table 3: IRK").to_numpy()
+    return {
+        "inner": float(np.exp(found.x[1])),
+        "attempt": float(np.exp(found.x[2])),
+        "rms_irk": float(np.sqrt(np.mean(residual[irk] ** 2))),
+        "rms": float(np.sqrt(np.mean(residual**2))),
+        "span": float(np.exp(residual.max() - residual.min())),
+    }
+
+
+def partition_cost(rows: pd.DataFrame) -> tuple[float, float]:
+    """Seconds of one partition by full pivoting, and of one evaluation, from runs with and without it in every step.
+
+    The partition is that of `partition="symmetric"`, in fixed steps of the midpoint rule, which has few evaluations.
+    """
+    kept, every = (
+        rows[(rows["group"] == "partition") & (rows["solver"] == f"fixed step, {name}")].iloc[0]
+        for name in ("lasting", "symmetric")
+    )
+    evaluation = kept["call_s"] / kept["n_evaluations"]
+    # the two runs do not iterate equally often
+    extra = every["call_s"] - evaluation * every["n_evaluations"]
+    return float(extra / every["n_steps"]), float(evaluation)
+
+
+def _paper_irk(err_in: float, test: Reading, case: Case, err_out: float, repeat: int) -> Result:
+    method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", err_in, err_out, outer_test=test)
+    span, start = (0.0, case.t_end), (case.problem.q0, case.problem.v0)
+    return solve_dae(case.problem.system, span, *start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
+
+
+def reading_runs(case: Case) -> list[Run]:
+    """Both readings of (32), along err_in and along err_out with the other at its finest."""
+    made = []
+    for test, what in READINGS.items():
+        for err_in in TOLERANCES:
+            fixed = {"err_in": err_in, "outer_test": test}
+            run = partial(_paper_irk, err_in, test)
+            solver = Solver(f"{IRK}, (32) on {what}", "two-loop", "compiled", True, "err_out", run, fixed=fixed)
+            values = TOLERANCES if err_in == ERR_IN else (ERR_IN,)
+            made += [Run(case, solver, err_out, "reading", 1) for err_out in values]
+    return made
+
+
+def readings(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Of each reading of (32): evaluations along err_out, relative, and how far they are from the printed columns."""
+    found = []
+    for test, what in READINGS.items():
+        runs = rows[(rows["group"] == "reading") & (rows["solver"] == f"{IRK}, (32) on {what}")]
+        along_out = runs[runs["err_in"] == ERR_IN].set_index("err_out").reindex(TOLERANCES)
+        along_in = runs[runs["err_out"] == ERR_IN].set_index("err_in").reindex(TOLERANCES)
+        if not (along_out["status"].eq("REACHED_END").all() and along_in["status"].eq("REACHED_END").all()):
+            continue
+        counts, by_in = (part["n_evaluations"].to_numpy(float) for part in (along_out, along_in))
+        line: dict[str, Any] = {"test": test, "over": what, "relative": (counts / counts[0]).tolist()}
+        line |= {"steps": along_out["n_steps"].tolist(), "errors": along_out["error_q"].tolist()}
+        line |= {"astray": bool(along_out["astray"].iloc[0]), "along_in": float(by_in[-1] / by_in[0])}
+        for name, paper in PRINTED.items():
+            line[f"rms_{name}"] = float(np.std(np.log(counts / paper)))  # the factor between both is free
+        found.append(line)
+    return found
+
+
+def causes(rows: pd.DataFrame) -> dict[str, Any]:
+    """Findings: paper over ours by procedure, and what each cause and reading leaves of the pattern."""
+    table, read = cells(rows), readings(rows)
+    partition, evaluation = partition_cost(rows)
+    by_time = table["paper"] / table["call_s"]
+    by_count = table["paper"] / table["evaluations"]
+    by_partition = table["paper"] / (table["call_s"] + partition * table["attempts"])
+    found: dict[str, Any] = {"flat": FLAT, "one_constant": span(by_time) <= FLAT, "span_time": span(by_time)}
+    for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
+        over = by_time[table["group"] == group]
+        found[f"{name}_over"] = [float(over.min()), float(over.max())]
+    found |= {"span_evaluations": span(by_count), "evaluations_explain": span(by_count) <= FLAT}
+    found |= {"partition_us": 1e6 * partition, "partition_evaluations": partition / evaluation}
+    found |= {"span_partition": span(by_partition), "partition_explains": span(by_partition) <= FLAT}
+    found["fits"] = {"as labelled": fit(table), "exchanged": fit(cells(rows, exchanged=True))}
+    literal, exchanged = found["fits"].values()
+    found["exchanged_fits_better"] = exchanged["rms"] < literal["rms"]
+    found["printed"] = {name: [time / paper[0] for time in paper] for name, paper in PRINTED.items()}
+    found["readings"] = read
+    for name in PRINTED:  # which reading follows the printed column better
+        closer = min(read, key=lambda line: float(line[f"rms_{name}"]), default=None)
+        found[f"closer_{name}"] = closer["test"] if closer is not None and len(read) == len(READINGS) else None
+    return found

@@ -1,0 +1,274 @@
+"""Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside other solvers."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from studies.bench import figures, study, tables
+from studies.bench.cases import four_bar
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Case, Run, Solver, collect
+from studies.bench.metrics import ASTRAY, LOST
+from studies.bench.render import number, power, render, table
+from studies.bench.solvers import (
+    ADAMS,
+    CATALOGUE,
+    ERR_IN,
+    IDA_C,
+    IDA_FORMS,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    OWN_EXPLICIT,
+    QUARTER,
+    TAYLOR,
+    paper_irk_at,
+    paper_newmark_at,
+)
+from studies.bench.store import Output
+from studies.table3.causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, causes, machine, printed, reading_runs
+from twoloop import Result, RungeKutta, solve_dae
+from twoloop.methods.tableaux import gauss
+
+TARGETS = (1e-2, 1e-4, 1e-6)
+PAPER = (NEWMARK, QUARTER, IRK_LINE)
+EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
+OTHERS = (
+    *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C, "IDA, stabilised"),
+    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+    *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
+)
+COMPILED = ("IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")  # for seconds: no quick runs
+DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C)
+LISTED = (*(name for name in DRAWN if name != ADAMS), "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
+PAPER_END = 100.0  # s, of the paper's runs
+STEP = 0.01  # s, of the runs that tell what a partition costs
+
+
+def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
+    problem, method = case.problem, RungeKutta(gauss(1), partition=partition)  # type: ignore[arg-type]
+    return solve_dae(problem.system, (0.0, case.t_end), problem.q0, problem.v0, method=method, step_size=step)
+
+
+def runs(first: Case, second: Case, quick: bool) -> list[Run]:
+    """The cells of the table, what a partition costs, both readings of (32), and the other solvers.
+
+    On the second geometry only the paper's procedures: `studies.work_precision` has the others there.
+    """
+    made = reading_runs(first)
+    for case, once in ((first, quick), (second, True)):
+        for group, at in zip(FAMILIES, (paper_irk_at, paper_newmark_at), strict=True):
+            cells = [(e_in, e_out) for e_in in TOLERANCES for e_out in TOLERANCES if case is first or e_in == e_out]
+            made += [Run(case, at(e_in), e_out, group, 1 if once else REPEATS) for e_in, e_out in cells]
+    for partition in ("lasting", "symmetric"):
+        solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
+        made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
+    more = [] if quick else [f"IDA, {form}" for form in IDA_FORMS if form != "stabilised"]
+    names = [name for name in (*PAPER, *OTHERS, *more) if not (quick and name in COMPILED)]
+    for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
+        for name in names_:
+            solver = CATALOGUE[name]
+            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+            made += [
+                Run(case, solver, x, "comparison", 1 if quick else REPEATS) for x in (values[1:3] if quick else values)
+            ]
+    return made
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, with the height of bar 3's centre, by which the paper judges energy."""
+
+    def highest(run: Run, result: Result) -> dict[str, float]:
+        return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
+
+    first, second = four_bar.cases(output.call.quick)
+    with output.kept() as kept:
+        return collect(runs(first, second, output.call.quick), kept, highest)
+
+
+def grid(rows: pd.DataFrame, group: str) -> str:
+    """A table of times, err_in by err_out, beside the printed ones."""
+    lines = []
+    for e_in, paper in zip(TOLERANCES, printed(group), strict=True):
+        cells = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
+        shown = ["not run" if cell is None else _time(cell, time) for cell, time in zip(cells, paper, strict=True)]
+        lines.append([power(e_in), *shown])
+    return table(["err_in \\ err_out", *(power(e) for e in TOLERANCES)], lines)
+
+
+def _time(cell: pd.Series, paper: float | None) -> str:
+    mark = "★" if cell["lost"] else "†" if cell["astray"] else ""
+    spread = tables.with_quartiles(cell["call_s"], cell["call_q1"], cell["call_q3"]) + mark
+    if cell["t_end"] != PAPER_END:  # a quick run: nothing printed is for so short a motion
+        return spread
+    if paper is None:
+        return f"{spread} / ★"
+    return f"{spread} / {paper:.2f} ×{number(paper / cell['call_s'])}"
+
+
+def ratios(rows: pd.DataFrame, group: str) -> list[list[float]]:
+    """The paper's time over ours, err_in by err_out; NaN where the paper or we have no result that is of use."""
+    found = []
+    for e_in, paper in zip(TOLERANCES, printed(group), strict=True):
+        cells = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
+        found.append(
+            [
+                np.nan if cell is None or time is None or cell["lost"] else time / cell["call_s"]
+                for cell, time in zip(cells, paper, strict=True)
+            ]
+        )
+    return found
+
+
+def picture(rows: pd.DataFrame) -> Figure:
+    """The paper's time over ours, of both procedures: one colour, were the machine all the difference."""
+    known = {group: np.array(ratios(rows, group)) for group in FAMILIES}
+    every = np.concatenate([np.ravel(each) for each in known.values()])
+    norm = LogNorm(np.nanmin(every), max(np.nanmax(every), 1.01 * np.nanmin(every)))
+    figure, panels = plt.subplots(1, 2, figsize=(6.4, 3.2), sharey=True, layout="constrained")
+    colours = plt.get_cmap("viridis").with_extremes(bad="#e6e6e6")
+    for axes, (group, name) in zip(panels, FAMILIES.items(), strict=True):
+        axes.imshow(known[group], norm=norm, cmap=colours)
+        for (i, j), value in np.ndenumerate(known[group]):
+            text = "★" if np.isnan(value) else number(value)
+            axes.text(j, i, text, ha="center", va="center", color="white" if norm(value) < 0.6 else "black")
+        axes.set_xticks(range(len(TOLERANCES)), [power(e) for e in TOLERANCES])
+        axes.set_yticks(range(len(TOLERANCES)), [power(e) for e in TOLERANCES])
+        axes.set_xlabel("err_out")
+        axes.set_title(name, fontsize=9)
+        axes.grid(False)
+    panels[0].set_ylabel("err_in")
+    figure.suptitle("The paper's time over ours (★: no result)", fontsize=10)
+    return figure
+
+
+def counts(rows: pd.DataFrame) -> str:
+    """A table of evaluations and error of both procedures with err_in = 1e-9, on which they hardly depend."""
+    lines = []
+    for group, name in (("Table 3: IRK", "Runge–Kutta"), ("Table 3: Newmark", "Newmark")):
+        line = [name]
+        for err_out in TOLERANCES:
+            cell = machine(rows, group, ERR_IN, err_out)
+            keys = ("n_evaluations", "error_q")
+            line.append("not run" if cell is None else "; ".join(number(float(cell[key])) for key in keys))
+        lines.append(line)
+    return table(["err_out", *(power(e) for e in TOLERANCES)], lines)
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says, from the medians."""
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
+    if irk is None or newmark is None:
+        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
+    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "floor": float(first["floor"].iloc[0])}
+    found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
+    found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
+    for name, cell in (("irk", irk), ("newmark", newmark)):
+        found |= {f"{name}_s": cell["call_s"], f"{name}_error": cell["error_q"]}
+        cells = first[first["group"] == cell["group"]]
+        for what in ("lost", "astray"):
+            bad = cells[cells[what].astype(bool)]["err_out"].unique()
+            found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
+    found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
+    found["newmark_growth"] = _last_decades(first)
+    found["ratio_s"] = newmark["call_s"] / irk["call_s"]
+    found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
+    ratios = _newmark_over_irk(first)
+    found["newmark_over_irk"] = [min(ratios), max(ratios)] if ratios else []
+    found["newmark_dearer_everywhere"] = bool(ratios and min(ratios) > 1.0)
+    found["cheapest"] = [line for error in TARGETS[::2] if (line := _cheapest(_compared(first), error)) is not None]
+    found["explicit"] = _explicit(first)
+    failed = rows[rows["status"] != "REACHED_END"]
+    found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
+    return found | causes(first)
+
+
+def _last_decades(first: pd.DataFrame) -> dict[str, float]:
+    """Growth of Newmark's evaluations, and of the printed times, from the tolerance before the last to the last."""
+    ours = [machine(first, "Table 3: Newmark", ERR_IN, err_out) for err_out in TOLERANCES[-2:]]
+    counts = [np.nan if cell is None else float(cell["n_evaluations"]) for cell in ours]
+    paper = [float(PAPER_NEWMARK[-1][k] or np.nan) for k in (-2, -1)]
+    return {"ours": counts[1] / counts[0], "paper": paper[1] / paper[0]}
+
+
+def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
+    """The cheapest solver at an error, and how many times as long the paper's procedure and IDA from C take."""
+    ranked = tables.ranking(first, error)
+    if ranked.empty:
+        return None
+    times = dict(zip(ranked["solver"], ranked["call_s"] / ranked["call_s"].iloc[0], strict=True))
+    found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
+    return found | (tables.best(ranked) or {})
+
+
+def _newmark_over_irk(first: pd.DataFrame) -> list[float]:
+    """CPU time of Newmark, both beta, over that of Runge-Kutta, at errors over the run that both reach or pass."""
+    fine = _at_least_fine(first)
+    ratios = []
+    for target in (0.3, 0.1, 0.03, 0.01, 0.003):
+        half, quarter, irk = (
+            tables.time_for(runs_, target) if target <= runs_["error_q"].max() else np.nan
+            for runs_ in (fine[fine["solver"] == solver] for solver in PAPER)
+        )
+        ratios += [newmark / irk for newmark in (half, quarter)]
+    return [float(ratio) for ratio in ratios if not np.isnan(ratio)]
+
+
+def _explicit(first: pd.DataFrame) -> dict[str, Any]:
+    """Time of the paper's Runge-Kutta procedure over that of the cheapest explicit method on all coordinates."""
+    fine = _at_least_fine(first)
+    over = {}
+    for error in TARGETS:
+        paper, *explicit = (tables.time_for(fine[fine["solver"] == name], error) for name in (IRK_LINE, *EXPLICIT))
+        least = np.fmin.reduce(explicit)  # of those that get there
+        if not np.isnan(paper) and not np.isnan(least):
+            over[power(error)] = float(paper / least)
+    return {"solvers": list(EXPLICIT), "paper": IRK, "errors": list(over), "over": list(over.values())}
+
+
+def _compared(first: pd.DataFrame) -> pd.DataFrame:
+    return first[first["group"].isin(("comparison", *FAMILIES))]
+
+
+def _at_least_fine(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["err_in"].isna() | (rows["err_in"] == ERR_IN)]
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
+    """Write findings, figure and report; the findings."""
+    rows = tables.medians(rows)
+    findings = findings_of(rows)
+    output.save_findings(findings)
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    compared = _compared(first)
+    seconds = f"{number(findings['t_end'])} s"
+    plot = figures.work_precision(_at_least_fine(compared), DRAWN, f"{first['problem'].iloc[0]}, {seconds}")
+    figures.save(plot, output, "table3")
+    if findings["t_end"] == PAPER_END:
+        figures.save(picture(first), output, "table3_ratios")
+    header = ["solver", *(power(target) for target in TARGETS)]
+    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(compared, TARGETS, LISTED)]
+    ready = {"work": table(header, costs)}
+    for name, group in (("irk", "Table 3: IRK"), ("newmark", "Table 3: Newmark")):
+        ready[name] = grid(first, group)
+        print(f"\n{group}, CPU time in s over {seconds} / the paper's, × its ratio to ours\n{ready[name]}")
+    ready["counts"] = counts(first)
+    problem = first["problem"].iloc[0]
+    output.write("table3.md", render("table3", findings, ready, stamp=line, quick=output.call.quick, problem=problem))
+    return findings
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study and write its report."""
+    study.run_rows("table3", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,5 @@
+"""Mechanisms that others published: which solver is right, to how many digits, on which of them."""
+
+from studies.validation.study import main
+
+__all__ = ["main"]

@@ -1,0 +1,5 @@
+"""`python -m studies.validation`."""
+
+from studies.validation.study import main
+
+main()

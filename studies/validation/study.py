@@ -1,0 +1,371 @@
+"""Mechanisms that others published: which solver is right, to how many digits, on which of them."""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from studies.bench import figures, study
+from studies.bench.collector import Run, warm_up
+from studies.bench.end_states import DECADES, EXACT, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
+from studies.bench.render import number, percent, power, render, table
+from studies.bench.solvers import (
+    ADAMS,
+    CATALOGUE,
+    CVODE_C,
+    CVODE_C_PROJECTED,
+    DEFAULT,
+    EXUDYN,
+    HEYOKA,
+    IDA_C,
+    OWN_BDF,
+    OWN_EXPLICIT,
+    TAYLOR,
+)
+from studies.bench.store import Output
+from studies.validation import deceived
+from twoloop import mechanisms
+from twoloop.mechanisms import Problem
+
+MAKE: tuple[Callable[[], Problem], ...] = (
+    mechanisms.pendulum,
+    mechanisms.projection_pendulum,
+    mechanisms.double_pendulum,
+    mechanisms.driven_crank,
+    mechanisms.andrews,
+    mechanisms.sundials_slider_crank,
+    mechanisms.driven_slider_crank,
+    mechanisms.redundant_slider_crank,
+    partial(mechanisms.closed_chain, 4),
+    partial(mechanisms.closed_chain, 20),
+    partial(mechanisms.n_four_bar, 1),
+    partial(mechanisms.n_four_bar, 2),
+    partial(mechanisms.n_four_bar, 2, "bodies"),
+    partial(mechanisms.n_four_bar, 40),
+    mechanisms.knife_edge,
+    mechanisms.rolling_disc,
+    mechanisms.heavy_top,
+    mechanisms.spatial_slider_crank,
+    mechanisms.spatial_four_bar,
+    mechanisms.bricard,
+    mechanisms.governor,
+)
+QUICK = (0, 2, 4, 10, 14)  # places in MAKE
+OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
+OTHERS = (
+    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, "IDAS, CasADi"),
+    *("LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1"),
+)
+QUICK_OTHERS = ("DOP853, index 1",)
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
+QUICK_TOLERANCES = (1e-6, 1e-10)
+JUDGED_AT = (1e-6, 1e-10)  # tolerances of these
+DECEIVED_AT = (1e-4, 1e-6, 1e-8)  # tolerances of runs whose steps are looked at one by one
+MODELLED = "Exudyn's own model"  # group of runs with fixed steps, ...
+MODELS = (
+    *("redundant slider-crank", "A02, N = 1", "A02, N = 2", "A02, N = 2 (bodies)"),
+    *("heavy top", "spatial slider-crank", "A04 Bricard", "A05 governor"),
+)
+STEPS, QUICK_STEPS = (2000, 8000), (500, 2000)  # ... so many of them
+MODELLED_LIMIT = 30.0  # s of CPU of such a run
+TIGHT = 1e-10  # at which digits are compared
+COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a problem
+REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
+AIMED = (DEFAULT, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
+FEWEST = 3  # errors above the reference's own from which a slope is taken
+APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
+OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
+SHORT = {
+    "RANK_LOST": "rank",
+    "TIME_LIMIT": "time",
+    "NOT_APPLICABLE": "n/a",
+    "NOT_AVAILABLE": "absent",
+    "RAISED": "refused",
+    "STEP_TOO_SMALL": "step",
+    "SOLVER_FAILED": "failed",
+    "NOT_CONVERGED": "failed",
+}
+
+
+def runs(quick: bool) -> list[Run]:
+    """Every problem, solver and tolerance."""
+    made = [make for k, make in enumerate(MAKE) if not quick or k in QUICK]
+    solvers = (*OWN, *(QUICK_OTHERS if quick else OTHERS))
+    tolerances = QUICK_TOLERANCES if quick else TOLERANCES
+    found = []
+    for problem in (make() for make in made):
+        case = case_of(problem)
+        found += [Run(case, CATALOGUE[name], value, repeats=1) for name in solvers for value in tolerances]
+        if problem.condition is not None and not quick:
+            case = case_of(problem, judged=True)
+            found += [Run(case, CATALOGUE[name], tol, JUDGED, repeats=1) for name in solvers for tol in JUDGED_AT]
+        if problem.system.n_a == 0 and not {"singular", "redundant"} & set(problem.tags):
+            steps = [name for name in solvers if name != IDA_C]  # whose adapter keeps none
+            at = DECEIVED_AT[-1:] if quick else DECEIVED_AT
+            group = deceived.DECEIVED
+            found += [Run(case_of(problem), CATALOGUE[name], tol, group, repeats=1) for name in steps for tol in at]
+    return found + list(modelled(made, quick))
+
+
+def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run]:
+    """Exudyn on the mechanisms of which it has a model of its own."""
+    for case in (replace(case_of(make()), time_limit=MODELLED_LIMIT) for make in made):
+        if case.name in MODELS:
+            for name in (f"Exudyn, {solver}" for solver in EXUDYN[: 1 if quick else None]):
+                for n in QUICK_STEPS if quick else STEPS:
+                    yield Run(case, CATALOGUE[name], case.t_end / n, MODELLED, repeats=1)
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, those kept from an unfinished run aside."""
+    todo = runs(output.call.quick)
+    with output.kept() as kept:
+        warm: set[tuple[Any, ...]] = set()
+        for run in todo:
+            if run.key(0) not in kept:
+                # what is built for a mechanism, or for each of its tolerances, is no part of the run and its time limit
+                what = (run.case.name, run.solver.name, run.value if run.solver.builds_each else None)
+                if what not in warm:
+                    warm.add(what)
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")
+                        warm_up(run, 0, set(), COMPILING)
+                kept.add(run.key(0), deceived.row_of(run) if run.group == deceived.DECEIVED else row_of(run))
+        return pd.DataFrame([kept[run.key(0)] for run in todo])
+
+
+def slope(own: pd.DataFrame) -> float | None:
+    """Exponent p of error ~ tol^p of one solver on one problem; None with too few errors above the reference's own."""
+    seen = own[own["error_q"].notna() & (own["error_q"] > 10.0 * own["floor"])]
+    if len(seen) < FEWEST:
+        return None
+    return float(np.polyfit(np.log10(seen["tol"]), np.log10(seen["error_q"].astype(float)), 1)[0])
+
+
+def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
+    """What the table says of a solver over all problems."""
+    tight = own[own["tol"] == TIGHT]
+    found: dict[str, Any] = {"solver": name, "family": str(own["family"].iloc[0])}
+    found |= {what: int((own["outcome"] == what).sum()) for what in OUTCOMES}
+    slopes = [p for _, each in own.groupby("case", sort=False) if (p := slope(each)) is not None]
+    found["slope"] = [float(x) for x in np.percentile(slopes, [25, 50, 75])] if slopes else None
+    ratios = (own["error_q"] / own["tol"])[own["error_q"].notna()].astype(float)
+    found["ratio"] = float(ratios.median()) if len(ratios) else None
+    for level in LEVELS:
+        got = tight[f"digits_{level}"].dropna().astype(float)
+        found[f"digits_{level}"] = float(got.median()) if len(got) else None
+    for level in ("energy", "violation_q", "violation_v", "violation_a"):
+        sizes = tight[tight["error_q"].notna()][level].dropna().astype(float)
+        found[level] = float(sizes.max()) if len(sizes) else None
+    found["evaluations"] = float(tight["n_evaluations"].dropna().median()) if len(tight) else None
+    return found
+
+
+def of_steps(name: str, own: pd.DataFrame) -> dict[str, Any]:
+    """What the table says of the steps of a solver, over all problems whose steps could be judged."""
+    seen = own[own["n_sampled"] > 0]
+    found: dict[str, Any] = {"solver": name, "n": int(seen["n_sampled"].sum()), "problems": int(seen["case"].nunique())}
+    found |= {"deceived": None, "worst": None, "first": None, "first_worst": None}
+    if len(seen):
+        found |= {"deceived": float(seen["n_deceived"].sum() / found["n"]), "worst": float(seen["worst_step"].max())}
+        first = seen["first_step"].astype(float)
+        found |= {"first": float((first > 1.0).mean()), "first_worst": float(first.max())}
+    return found
+
+
+def of_model(case: str, own: pd.DataFrame) -> dict[str, Any]:
+    """What Exudyn's solvers make of a mechanism: errors at the shorter step, and the orders seen."""
+    found: dict[str, Any] = {"case": case, "solvers": {}}
+    for name, each in own.groupby("solver", sort=False):
+        coarse, fine = (each.sort_values("h", ascending=False).iloc[k] for k in (0, -1))
+        line: dict[str, Any] = {"error": None, "order": None, "status": str(fine["status"])}
+        if pd.notna(fine["error_q"]):
+            line["error"] = float(fine["error_q"])
+        if pd.notna(fine["error_q"]) and pd.notna(coarse["error_q"]):
+            ratio = float(coarse["error_q"]) / float(fine["error_q"])
+            line["order"] = float(np.log(ratio) / np.log(coarse["h"] / fine["h"]))
+        found["solvers"][str(name)] = line
+    return found
+
+
+def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """The best of ours and of others on one problem with TIGHT, in digits of q, and who is right."""
+    tight = rows[rows["tol"] == TIGHT]
+    found: dict[str, Any] = {"case": name}
+    for which, own in (("ours", tight["family"] == "two-loop"), ("others", tight["family"] != "two-loop")):
+        some = tight[own & tight["digits_q"].notna()]
+        best = some.loc[some["digits_q"].astype(float).idxmax()] if len(some) else None
+        found[which] = None if best is None else {"solver": best["solver"], "digits": float(best["digits_q"])}
+        put = tight[own & (tight["outcome"] != "not run")]
+        found[f"{which}_put"], found[f"{which}_stopped"] = len(put), bool((put["status"] == "TIME_LIMIT").any())
+        found[f"{which}_right"] = tight[own & (tight["outcome"] == "right")]["solver"].tolist()
+    return found
+
+
+def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """By problem, the methods aimed at that stop with TIGHT, and those that have fewer digits than wanted."""
+    found = []
+    for _, row in rows[(rows["tol"] == TIGHT) & rows["solver"].isin(AIMED)].iterrows():
+        line: dict[str, Any] = {"case": row["case"], "solver": row["solver"]}
+        for level, wanted in REACH.items():
+            got = row[f"digits_{level}"]
+            if level == "q" and pd.isna(got):
+                found.append(line | {"level": level, "digits": None})
+            elif pd.notna(got) and got < wanted and _holds(row["case"], level) > wanted:
+                found.append(line | {"level": level, "digits": float(got)})
+    grouped: dict[str, dict[str, Any]] = {}
+    for line in found:
+        of = grouped.setdefault(line["case"], {"case": line["case"], "stopped": [], "short": []})
+        if line["digits"] is None:
+            of["stopped"].append(line["solver"])
+        else:
+            of["short"].append(line)
+    return list(grouped.values())
+
+
+def _holds(name: str, level: str) -> float:
+    """Digits that the reference of a problem holds."""
+    known = {problem.name: problem for problem in (make() for make in MAKE)}[name].reference
+    assert known is not None
+    return float(known.digits.get(level, 0.0))
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says."""
+    judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
+    models = rows[rows["group"] == MODELLED]
+    rows = rows[~rows["group"].isin(APART)]
+    solvers = [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]
+    problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
+    wrong = rows[rows["outcome"] == "wrong"]
+    stepped = [of_steps(name, own) for name, own in steps.groupby("solver", sort=False)]
+    found: dict[str, Any] = {
+        "n": len(problems),
+        "tight": TIGHT,
+        "solvers": solvers,
+        "problems": problems,
+        "decades": DECADES,
+        "models": [of_model(case, own) for case, own in models.groupby("case", sort=False)],
+        "model_steps": sorted({round(row["t_end"] / row["h"]) for _, row in models.iterrows()}),
+        "steps": stepped,
+        "steps_at": list(DECEIVED_AT),
+        "first_deceived": [line["solver"] for line in stepped if line["first"]],
+    }
+    found |= {"n_runs": len(rows), "ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
+    found["wrong"] = [
+        {key: row[key] for key in ("case", "solver", "family", "tol", "error_q")} for _, row in wrong.iterrows()
+    ]
+    found["only_others"] = [line["case"] for line in problems if line["others_right"] and not line["ours_right"]]
+    alone = [line for line in problems if line["ours_right"] and not line["others_right"]]
+    # alone is ours where others were put to it and none of these was ended by our limit of time
+    asked = [line["case"] for line in alone if line["others_put"] and not line["others_stopped"]]
+    found["only_ours"] = [{"case": line["case"], "put": line["others_put"]} for line in alone if line["case"] in asked]
+    found["not_put"] = [line["case"] for line in alone if line["case"] not in asked]
+    found["n_others"] = int(rows[rows["family"] != "two-loop"]["solver"].nunique())
+    singular = [problem.name for problem in (make() for make in MAKE) if "singular" in problem.tags]
+    found["none_right_singular"] = all(
+        line["case"] in singular for line in problems if not line["ours_right"] and not line["others_right"]
+    )
+    found["none_right"] = [line["case"] for line in problems if not line["ours_right"] and not line["others_right"]]
+    found["at_looser"] = {}
+    for name in found["none_right"]:
+        good = rows[(rows["case"] == name) & (rows["outcome"] == "right")]
+        if len(good):
+            least = good["tol"].min()
+            solvers_there = good[good["tol"] == least]["solver"].tolist()
+            found["at_looser"][name] = {"tol": float(least), "solvers": solvers_there}
+    always = [set(line["ours_right"]) for line in problems]
+    found["ours_always"] = [name for name in OWN if all(name in each for each in always)]
+    found |= {"judged": [], "judged_at": sorted({float(tol) for tol in judged["tol"]}, reverse=True)}
+    for name, own in judged.groupby("case", sort=False):
+        best = own.sort_values("condition").iloc[0]
+        line = {"case": name, "t_end": float(best["t_end"]), "best": None, "error": None, "tol": None}
+        if pd.notna(best["condition"]):
+            line |= {"error": float(best["condition"]), "best": best["solver"], "tol": float(best["tol"])}
+        passed = own[own["outcome"] == "right"]["solver"]
+        found["judged"].append(line | {"passed": list(dict.fromkeys(passed))})
+    ours = [line for line in found["wrong"] if line["family"] == "two-loop"]
+    found["ours_wrong_tight"] = [line for line in ours if line["tol"] == TIGHT]
+    inexact = rows[rows["outcome"] == "inexact"]["family"] == "two-loop"
+    found["n_inexact"] = {"ours": int(inexact.sum()), "others": int((~inexact).sum())}
+    found["exact"] = EXACT
+    found["n_wrong"] = {"ours": len(ours), "others": len(found["wrong"]) - len(ours)}
+    ended = rows[rows["outcome"].isin(("right", "inexact", "wrong"))]["family"] == "two-loop"
+    found["n_ended"] = {"ours": int(ended.sum()), "others": int((~ended).sum())}  # runs that report success
+    return found | {"time_limit": TIME_LIMIT}
+
+
+def picture(rows: pd.DataFrame) -> Figure:
+    """Problem x solver: digits of q with TIGHT."""
+    tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin(APART)]
+    cases, solvers = list(dict.fromkeys(tight["case"])), list(dict.fromkeys(tight["solver"]))
+    shown, texts = np.full((len(cases), len(solvers)), np.nan), {}
+    for _, row in tight.iterrows():
+        place = cases.index(row["case"]), solvers.index(row["solver"])
+        if pd.notna(row["digits_q"]):
+            shown[place], texts[place] = row["digits_q"], f"{max(0.0, float(row['digits_q'])):.1f}"
+        else:
+            texts[place] = SHORT.get(row["status"], "failed")
+    figure, axes = plt.subplots(figsize=(8.4, 0.3 * len(cases) + 1.6), layout="constrained")
+    colours = plt.get_cmap("viridis").with_extremes(bad="#e6e6e6")
+    image = axes.imshow(shown, vmin=0.0, vmax=14.0, cmap=colours, aspect="auto")
+    for (i, j), text in texts.items():
+        dark = shown[i, j] < 8.0
+        axes.text(j, i, text, ha="center", va="center", fontsize=7, color="white" if dark else "black")
+    axes.set_xticks(range(len(solvers)), solvers, rotation=35, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(cases)), cases)
+    axes.grid(False)
+    n_own = sum(CATALOGUE[name].family == "two-loop" for name in solvers)
+    axes.axvline(n_own - 0.5, color="white", linewidth=3.0)
+    axes.set_title(f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: two-loop, right: others")
+    figure.colorbar(image, ax=axes, label="decimals")
+    return figure
+
+
+def lines(found: Sequence[dict[str, Any]], steps: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
+    """Of the table of solvers, by their runs and by their steps."""
+    stepped = {line["solver"]: percent(line["deceived"]) for line in steps if line["n"]}
+    keys = ("right", "inexact", "wrong", "said so", "ratio", "digits_q", "digits_v", "digits_lam")
+    for line in found:
+        yield [line["solver"], *(line[key] for key in keys), stepped.get(line["solver"], "–")]
+
+
+HEADER = ("solver", "right", "inexact", "wrong", "said so", "error/tol", "q", "v", "λ", "deceived")
+
+
+def _of_exudyn(line: dict[str, Any] | None) -> str:
+    if line is None:
+        return "–"
+    order = "" if line["order"] is None else f" ({number(line['order'])})"
+    return f"{number(line['error'])}{order}" if line["error"] is not None else SHORT.get(line["status"], "failed")
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings, figure and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    figures.save(picture(rows), output, "validation")
+    ready = {"solvers": table(HEADER, lines(found["solvers"], found["steps"]))}
+    ready["models"] = table(
+        ("mechanism", *EXUDYN),
+        [
+            [line["case"], *(_of_exudyn(line["solvers"].get(f"Exudyn, {name}")) for name in EXUDYN)]
+            for line in found["models"]
+        ],
+    )
+    output.write("validation.md", render("validation", found, ready, stamp=line, quick=output.call.quick))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study and write its report."""
+    study.run_rows("validation", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

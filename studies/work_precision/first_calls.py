@@ -1,0 +1,142 @@
+"""The first call on a mechanism: nothing built, caches cold, a process of its own; from which run building pays.
+
+A part of `studies.work_precision`. The process has an empty folder of caches, but for the kernels of twoloop, which are
+compiled once an installation. It loads the packages by a run on another mechanism. CPU time, with that of
+compilers, is from the start until the end of the call that a user writes.
+"""
+
+import json
+import math
+import os
+import shutil
+import site
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from references.driver import cpu_time, user_call
+from studies.bench.cli import ROOT
+from studies.bench.collector import Run, attempt, timed
+from studies.bench.end_states import case_of
+from studies.bench.solvers import CATALOGUE, COMPILED, CVODE_C, DEFAULT, DIFFRAX, HEYOKA, IDA_C
+from studies.bench.store import KeptRows, Row
+from studies.work_precision import rivals
+from twoloop import mechanisms
+
+GROUP = "first call"
+BUILT_BY = {  # whose code a first call waits for; nothing is built for the others
+    **dict.fromkeys(COMPILED, "ours, LLVM"),
+    HEYOKA: "heyoka, LLVM",
+    **dict.fromkeys((CVODE_C, IDA_C), "ours for it, numba"),
+    DIFFRAX: "JAX, XLA",
+    "IDAS, CasADi": "CasADi",
+}
+BUILDING = tuple(BUILT_BY)
+MECHANISMS = ("four-bar", "SUNDIALS slider-crank", "Andrews' squeezing mechanism", "spatial four-bar", "heavy top")
+QUICK = (DEFAULT, "auto, compiled")
+TOLERANCE = 1e-8
+LIMIT = 120.0  # s of CPU of a call
+EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a folder of caches
+
+
+def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
+    """One row a mechanism and solver."""
+    keys = []
+    for name, solver in product(MECHANISMS[: 1 if quick else None], QUICK if quick else (DEFAULT, *BUILDING)):
+        key = f"{GROUP} | {name} | {solver}"
+        keys.append(key)
+        if key not in kept:
+            row: Row = {"group": GROUP, "case": name, "solver": solver, "tol": TOLERANCE, "repeat": 0}
+            row |= {"family": CATALOGUE[solver].family, "first_call_s": None, "call_s": None}
+            kept.add(key, row | in_process(name, solver))
+    return pd.DataFrame([kept[key] for key in keys])
+
+
+def in_process(name: str, solver: str) -> Row:
+    """Times, status and message of a solver on a mechanism in a new process with cold caches."""
+    with tempfile.TemporaryDirectory(prefix="twoloop-first-") as folder:
+        environment = {**os.environ, "HOME": folder, "XDG_CACHE_HOME": folder, "PYTHONUSERBASE": site.getuserbase()}
+        if shared := os.environ.get("NUMBA_CACHE_DIR"):  # with the kernels, and the code of mechanisms
+            own = shutil.copytree(shared, Path(folder, "numba"), ignore=shutil.ignore_patterns(EQUATIONS))
+            environment["NUMBA_CACHE_DIR"] = str(own)
+        command = [sys.executable, "-m", "studies.work_precision.first_calls", name, solver]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        return {"status": "RAISED", "message": (done.stderr.strip().splitlines() or ["no word of why"])[-1]}
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def times_of(name: str, solver: str) -> Row:
+    """The same in this process."""
+    problem, other = rivals.problems(name in rivals.QUICK)[name], mechanisms.double_pendulum()
+    run, before = (
+        Run(replace(case_of(each), time_limit=LIMIT, timed=rivals.TIMED), CATALOGUE[solver], TOLERANCE)
+        for each in (problem, other)
+    )
+    attempt(before, 0)
+    user_call.ended = None
+    began = cpu_time()
+    result, status, message, _ = attempt(run, 0)
+    # to the end of the user's call: a second run for the output, and what is built for it, is ours
+    spent = (cpu_time() if user_call.ended is None else user_call.ended) - began
+    found: Row = {"status": status, "message": message}
+    if result is None or not result.success:
+        return found
+    return found | {"first_call_s": spent, "call_s": timed(run, 0)[3]["call_s"]}
+
+
+def pays_from(line: Any, default: Any) -> float | None:
+    """The run on one mechanism from which building took less in all than the default without it; None: never."""
+    saved, built = default["call_s"] - line["call_s"], line["first_call_s"] - default["first_call_s"]
+    if built < 0.0:
+        return 1.0
+    return 2.0 + math.floor(built / saved) if saved > 0.0 else None
+
+
+def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """By solver: the first call and a later one over the mechanisms (least, median, most), and when building pays."""
+    if "first_call_s" not in rows:
+        return []
+    told = rows[rows["first_call_s"].notna()]
+    default = told[told["solver"] == DEFAULT].set_index("case")
+    found = []
+    for solver, own in told.groupby("solver", sort=False):
+        line: dict[str, Any] = {"solver": solver, "n": len(own), "pays": [], "never": 0}
+        for what in ("first_call_s", "call_s"):
+            line[what] = [float(own[what].min()), float(own[what].median()), float(own[what].max())]
+        for _, row in own[own["case"].isin(default.index)].iterrows():
+            pays = None if solver == DEFAULT else pays_from(row, default.loc[row["case"]])
+            line["pays"] += [] if pays is None else [pays]
+            line["never"] += pays is None and solver != DEFAULT
+        found.append(line)
+    return found
+
+
+def lines(found: list[dict[str, Any]]) -> Iterator[list[Any]]:
+    """Of the table."""
+    for line in found:
+        pays = sorted(line["pays"])
+        from_run = "–" if not pays else "–".join(dict.fromkeys(f"{n:.0f}" for n in (pays[0], pays[-1])))
+        never = f"never on {line['never']}" if line["never"] else ""
+        said = ", ".join(text for text in ("" if not pays else from_run, never) if text)
+        low, middle, high = line["first_call_s"]
+        yield [
+            f"`{line['solver']}`",
+            BUILT_BY.get(line["solver"], "nothing"),
+            middle,
+            low,
+            high,
+            1e3 * line["call_s"][1],
+            said or "–",
+        ]
+
+
+if __name__ == "__main__":
+    print(json.dumps(times_of(*sys.argv[1:])))

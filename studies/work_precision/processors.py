@@ -1,0 +1,101 @@
+"""Where a conclusion differs between the processors that were seen: who is ahead on a mechanism at an error.
+
+`studies.work_precision` adds the processor that it ran on to processors.csv; rows that it made on another machine are
+added by `python -m studies.work_precision.processors FOLDER`, the folder of reports from there.
+"""
+
+import sys
+from collections.abc import Sequence
+from io import StringIO
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from studies.bench import headline, tables
+from studies.bench.cli import REPORTS, StudyError
+from studies.bench.store import Output
+from studies.work_precision import rivals
+
+FILE = "processors.csv"
+TIMES = {"whole call": "call_s", "inside": "inside_s"}  # the measure of record first
+PLACE = ["case", "error", "who"]
+
+
+def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
+    """Who is ahead at each error on each mechanism, by the time of the call and by that inside; `rows`: of all runs."""
+    rows = rows[rows["group"] == rivals.GROUP]
+    lines = []
+    for time, column in TIMES.items():
+        if column not in rows:
+            continue
+        medians = tables.medians(rows.assign(call_s=rows[column]))
+        for (case, own), error in product(medians.groupby("case", sort=False), rivals.DECADES):
+            for who, at in headline.of_error(own, error).items():
+                if at["verdict"] in ("ahead", "behind", "undecided"):
+                    line = {"processor": rows["processor"].iloc[0], "time": time, "case": case, "error": error}
+                    lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
+    return pd.DataFrame(lines, columns=["processor", "time", *PLACE, "ratio", "verdict"])
+
+
+def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
+    """What stands in the file for other processors, and what was made on this one."""
+    before = pd.read_csv(path) if path.is_file() else made[:0]
+    return pd.concat([before[~before["processor"].isin(made["processor"])], made], ignore_index=True)
+
+
+def kept(output: Output, rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Keep the verdicts of these rows beside those of other processors; the findings of all."""
+    table = added(output.file(FILE), verdicts(rows))
+    output.write(FILE, table.to_csv(index=False))
+    return findings_of(table)
+
+
+def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """For each two processors: how many pairs both have, by which time, and where ahead turns to behind."""
+    found = []
+    for one, other in combinations(dict.fromkeys(table["processor"]), 2):
+        for time in TIMES:
+            sides = [table[(table["processor"] == name) & (table["time"] == time)] for name in (one, other)]
+            both = sides[0].merge(sides[1], on=PLACE, suffixes=("_one", "_other"))
+            if both.empty:
+                continue
+            turned = both[both[["verdict_one", "verdict_other"]].apply(lambda x: set(x) == {"ahead", "behind"}, axis=1)]
+            apart = np.exp(np.abs(np.log(both["ratio_one"] / both["ratio_other"])))
+            line = {
+                "processors": [one, other],
+                "time": time,
+                "n": len(both),
+                "turned": turned[PLACE].to_dict("records"),
+            }
+            found.append(line | {"apart": float(apart.median()), "most": float(apart.max())})
+            break
+    return found
+
+
+def rows_of(folder: Path) -> pd.DataFrame:
+    """The rows of `work_precision` in a folder of reports.
+
+    Raises
+    ------
+    StudyError
+        If there are none.
+    """
+    path = folder / "work_precision.csv"
+    if not path.is_file():
+        raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")
+    return pd.read_csv(StringIO(path.read_text().split("\n", 1)[1]), low_memory=False)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Add the rows of another machine."""
+    (folder,) = sys.argv[1:] if words is None else words
+    path = REPORTS / FILE
+    added(path, verdicts(rows_of(Path(folder)))).to_csv(path, index=False)
+    print(f"added to {path}; python -m studies.work_precision --redraw puts it into the reports")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,277 @@
+"""Every mechanism with a verified end x every solver of ours and of other projects: which is ahead at which error.
+
+Errors are those at the end of the reference, which is known there to more digits than by any motion between. A part of
+`studies.work_precision`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench import adaptive, figures, headline, tables
+from studies.bench.cases.four_bar import SECOND
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Run, warm_up
+from studies.bench.end_states import case_of, row_of
+from studies.bench.render import number, power
+from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
+from studies.bench.store import KeptRows, Row
+from studies.validation.study import MAKE
+from twoloop import mechanisms, solve_dae
+from twoloop.mechanisms import Problem, Reference
+
+GROUP = "every mechanism"
+DECADES = tuple(10.0**-k for k in range(3, 14))
+SHOWN = DECADES[::2]  # at which the four-bars are judged
+IN_TABLE = DECADES[::3]
+DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
+AHEAD = {"heyoka": 2.0, "python": 8.0, "compiled": 4.0}  # aimed at on the four-bars, by kind of rival
+HEADLINE = "four-bar"
+GEOMETRIES: dict[str, Callable[[], Problem]] = {
+    HEADLINE: mechanisms.four_bar,
+    "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
+}
+QUICK = ("four-bar", "knife edge")
+QUICK_SOLVERS = (headline.DEFAULT, headline.OWN_CODE, TAYLOR, "DOP853 (two-loop)", HEYOKA, "CVODE from C, Adams")
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
+BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
+STEPS = (100, 300, 1000, 3000, 10_000)  # of those of fixed steps
+QUICK_TOLERANCES = (1e-3, 1e-5)
+TIMED = 0.01  # s; a shorter run is called until it has used so much
+TIME_LIMIT = 1.0  # s of CPU of a run
+COMPILING = 30.0  # s of what is built before
+TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
+FAR = 1e-11  # ... to so much
+
+
+@cache
+def problems(quick: bool) -> dict[str, Problem]:
+    """The mechanisms by name, each with a reference."""
+    made = {name: replace(make(), name=name) for name, make in GEOMETRIES.items()}
+    made["four-bar, second"] = replace(made["four-bar, second"], reference=_end_of_second(made["four-bar, second"]))
+    for problem in (make() for make in MAKE):
+        made[problem.name] = problem
+    return {name: problem for name, problem in made.items() if not quick or name in QUICK}
+
+
+@cache
+def tags() -> dict[str, tuple[str, ...]]:
+    """What kind of mechanism each of the published ones is."""
+    return {problem.name: problem.tags for problem in (make() for make in MAKE)}
+
+
+def _end_of_second(problem: Problem) -> Reference:
+    """Its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
+
+    Raises
+    ------
+    StudyError
+        If the equation in one coordinate, which shares nothing with them, does not agree to FAR.
+    """
+    t_end, ends = 10.0, []
+    for method in ("Gauss14", "DOP853"):
+        span = (0.0, t_end)
+        result = solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=TIGHT, atol=TIGHT)
+        ends.append((result.q[:, -1], result.v[:, -1]))
+    known = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))[0]
+    apart = float(np.abs(ends[0][0] - known[:, 0]).max())
+    if apart > FAR:
+        raise StudyError(f"the end of {problem.name} is {apart:.1e} from that of the equation in one coordinate")
+    differ = max(float(np.abs(ends[0][0] - ends[1][0]).max()), 1e-15)
+    said = f"DOP853, which differs by {differ:.1e}; the equation in one coordinate, by {apart:.1e}"
+    return Reference(t_end, *ends[0], "Gauss14 at 1e-14", digits={"q": float(-np.log10(differ))}, verified=said)
+
+
+def runs(quick: bool) -> list[Run]:
+    """Every mechanism, solver and setting."""
+    found = []
+    for name, problem in problems(quick).items():
+        case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=TIMED)
+        case = replace(case, step_sizes=tuple(case.t_end / n for n in STEPS))
+        for solver in (CATALOGUE[each] for each in (QUICK_SOLVERS if quick else (*OWN, *RIVALS))):
+            grid = BUILT if solver.builds_each else TOLERANCES if solver.setting == "tol" else case.steps()
+            values = QUICK_TOLERANCES if quick else grid
+            found += [Run(case, solver, value, GROUP, 1 if quick else REPEATS) for value in values]
+    return found
+
+
+def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
+    """Rows of all runs that are of use; on the four-bars however far behind a solver is."""
+    quick = all(run.repeats == 1 for run in todo)
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
+
+
+def row_at_end(run: Run, repeat: int, built: adaptive.Built) -> Row:
+    """A repetition of a run, measured by the end of the reference."""
+    warm_up(run, repeat, built, COMPILING)
+    row = row_of(run) | {"repeat": repeat, "keeps_constraints": run.solver.keeps_constraints}
+    return row | {"n_steps": row.pop("n_accepted")}
+
+
+def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
+    """The cheapest of ours and of others at one error on one mechanism, and how default and best of ours stand."""
+    both = tables.of_both(tables.ranking(rows, error))
+    found: dict[str, Any] = {"error": error, "standing": headline.of_error(rows, error)}
+    for which, best in both.items():
+        found[which] = (
+            None if best is None else {key: best[key] for key in ("solver", "call_s", "n_evaluations", "keeps")}
+        )
+    best = found["standing"][headline.BEST]
+    if found["others"] is None and best["rival"]["solver"]:  # not asked for about so much
+        found["others"] = best["rival"] | {"n_evaluations": None, "keeps": None}
+    return found | {key: best[key] for key in ("ratio", "verdict")}
+
+
+def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """What a solver's line says: how many mechanisms, how far it leaves the constraints."""
+    ran = rows[rows["error_q"].notna()]
+    found = {
+        "solver": name,
+        "family": rows["family"].iloc[0],
+        "mechanisms": int(ran["case"].nunique()),
+    }
+    drifts = ran["violation_q"].dropna().astype(float)
+    return found | {"violation": float(drifts.max()) if len(drifts) else None}
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Ratios of the fastest rival to the fastest of ours by mechanism and decade, and what of the goals holds."""
+    by_case = {str(name): own for name, own in rows.groupby("case", sort=False)}
+    made: list[dict[str, Any]] = [
+        {"case": name, "tags": list(tags().get(name, ())), "at": [at_decade(own, error) for error in DECADES]}
+        for name, own in by_case.items()
+    ]
+    every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
+    behind = [at for at in every if at["verdict"] == "behind"]
+    found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
+    found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
+    rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
+    found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
+    found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
+    found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None
+    found |= {"down_to": DOWN_TO, "n_behind_down_to": sum(at["error"] >= 0.5 * DOWN_TO for at in behind)}
+    found["n_clear"] = sum(
+        all(at["verdict"] != "behind" for at in each["at"] if at["error"] >= 0.5 * DOWN_TO) for each in made
+    )
+    found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
+    asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
+    found["not_put"] = [name for name in found["alone"] if name not in asked]
+    found["put"] = put(rows)
+    found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
+    return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
+
+
+def put(rows: pd.DataFrame) -> dict[str, Any]:
+    """How many of the rivals our adapters could put to the mechanisms, and the ratio from which a lead counts."""
+    others = rows[rows["family"] != "two-loop"]
+    there = tables.put(others).groupby("case")["solver"].nunique()
+    there, n = there.reindex(rows["case"].unique(), fill_value=0), int(others["solver"].nunique())
+    found = {"n": n, "least": int(there.min()), "all": int((there == n).sum()), "mechanisms": len(there)}
+    return found | {"counts": tables.LEAST}
+
+
+def _four_bar(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """On a four-bar, ours ahead of heyoka, of those called from Python, and of those called from compiled code."""
+    kinds: dict[str, Callable[[pd.DataFrame], pd.Series]] = {
+        "heyoka": lambda ranked: ranked["solver"] == HEYOKA,
+        "python": lambda ranked: ranked["called_from"] == "Python",
+        "compiled": lambda ranked: (ranked["called_from"] == "compiled") & (ranked["solver"] != HEYOKA),
+    }
+    found: dict[str, Any] = {"case": name} | {kind: [] for kind in kinds}
+    for error in SHOWN:
+        ranked = tables.ranking(rows, error)
+        if ranked.empty or not (ranked["family"] == "two-loop").any():
+            continue
+        own, others = ranked[ranked["family"] == "two-loop"], ranked[ranked["family"] != "two-loop"]
+        for kind, chosen in kinds.items():
+            some = others[chosen(others)] if len(others) else others
+            if len(some):
+                line = {"error": error, "ratio": float(some["call_s"].iloc[0] / own["call_s"].iloc[0])}
+                found[kind].append(line | {"solver": some["solver"].iloc[0], "ours": own["solver"].iloc[0]})
+    return found
+
+
+def goal_lines(found: dict[str, Any]) -> Iterator[list[Any]]:
+    """Of the table of goals: kind of rival, how far ahead ours was to be, least and largest ratio on each four-bar."""
+    names = {"heyoka": "heyoka", "python": "called from Python", "compiled": "other compiled"}
+    for kind, wanted in AHEAD.items():
+        yield [names[kind], f"{wanted:g}", *(_goal(geometry[kind], wanted) for geometry in found["four_bar"])]
+
+
+def _goal(compared: list[dict[str, Any]], wanted: float) -> str:
+    if not compared:
+        return "–"
+    ratios = [at["ratio"] for at in compared]
+    missed = [power(at["error"]) for at in compared if at["ratio"] < wanted]
+    text = "–".join(dict.fromkeys((number(min(ratios)), number(max(ratios)))))
+    if not missed:
+        return text
+    return f"{text}, missed" + ("" if len(missed) == len(ratios) else f" at {', '.join(missed)}")
+
+
+def lines(found: dict[str, Any]) -> Iterator[list[Any]]:
+    """Of the table of ratios: mechanism, ratios at each error shown; those that ours alone reach are left out."""
+    for each in found["mechanisms"]:
+        if each["case"] not in found["alone"]:
+            ratios = {at["error"]: at for at in each["at"]}
+            yield [each["case"], *(_cell(ratios[error]) for error in IN_TABLE)]
+
+
+def _cell(at: dict[str, Any]) -> str:
+    """Ratios of default, compiled default and best of ours; bold: behind, in brackets: undecided."""
+    cells = [_standing(at["standing"][name]) for name in at["standing"]]
+    return cells[0] if len(set(cells)) == 1 else " · ".join(cells)
+
+
+def _standing(found: dict[str, Any]) -> str:
+    if found["ratio"] is None:
+        return {"alone": "ours", "unasked": "ours", "missed": "others", "none": "–"}[found["verdict"]]
+    text = number(found["ratio"])
+    return {"behind": f"**{text}**", "undecided": f"({text})"}.get(found["verdict"], text)
+
+
+def picture(rows: pd.DataFrame) -> Figure:
+    """The README's picture: what a call takes over error on the four-bar: default, cheapest of ours, main rivals."""
+    rows = rows[rows["case"] == HEADLINE]
+    figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
+    for solver in figures.lines_of(rows, SHOWN):
+        line = figures.with_gaps(rows[rows["solver"] == solver])
+        look = figures.look(line[line["error_q"].notna()].iloc[0])
+        axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
+    axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time of the call (ms)")
+    figures.legend(figure, [axes], figures.LEGEND)
+    figure.suptitle("Four-bar linkage, 10 s: what an accuracy costs", fontsize=10)
+    return figure
+
+
+def heat_map(found: dict[str, Any]) -> Figure:
+    """Mechanism x decade: the time of the fastest rival over that of default, compiled default and best of ours."""
+    names = [each["case"] for each in found["mechanisms"]]
+    whose = (headline.DEFAULT, headline.OWN_CODE, headline.BEST)
+    size = (4.6 * len(whose) + 2.0, 0.28 * len(names) + 1.6)
+    figure, panels = plt.subplots(1, len(whose), figsize=size, sharey=True, layout="constrained")
+    colours = plt.get_cmap("RdBu").with_extremes(bad="#e6e6e6")
+    for axes, name in zip(panels, whose, strict=True):
+        standings = [[at["standing"][name] for at in each["at"]] for each in found["mechanisms"]]
+        shown = np.array([[each["ratio"] or np.nan for each in line] for line in standings], dtype=float)
+        image = axes.imshow(shown, norm=LogNorm(0.1, 10.0), cmap=colours, aspect="auto")
+        for (i, j), value in np.ndenumerate(shown):
+            if np.isfinite(value):
+                dark = "white" if abs(np.log10(value)) > 0.6 else "black"
+                text = number(value) if standings[i][j]["verdict"] != "undecided" else f"({number(value)})"
+                axes.text(j, i, text, ha="center", va="center", fontsize=6, color=dark)
+        axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
+        axes.set_yticks(range(len(names)), names)
+        axes.grid(False)
+        axes.set(title=name, xlabel="error at the end (m, rad)")
+    figure.suptitle("Time of the fastest rival over ours (blue: ours ahead; in brackets: undecided)", fontsize=10)
+    figure.colorbar(image, ax=panels, label="ratio")
+    return figure
