@@ -76,7 +76,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     if failure == common.NOT_FINITE:
         return (
             Status.NOT_FINITE,
-            f"{stopped}: {_not_finite(run)}. The result holds what was computed before.",
+            f"{stopped}: {said_of_not_finite(run)}. The result holds what was computed before.",
         )
     if code == a.RANK_LOST or failure == common.SINGULAR:
         rows = dependent_rows(run.system, t, run.state[: run.system.n_q])
@@ -162,7 +162,7 @@ def _near_massless(run: "Run") -> str:
     return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
 
-def _not_finite(run: "Run") -> str:
+def said_of_not_finite(run: "Run") -> str:
     """Which callback returned a value that is not finite, and when, as far as it is known."""
     kind, at = int(run.work.notes[common.FAULT_KIND]), float(run.work.notes[common.FAULT_TIME])
     if kind >= 0:

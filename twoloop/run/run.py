@@ -26,7 +26,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense import Interpolator
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
-from twoloop.run.messages import outcome
+from twoloop.run.messages import outcome, said_of_not_finite
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.record import Record, Statistics, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
@@ -164,7 +164,7 @@ class Run:
                 "another position"
             )
         raise ValueError(
-            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {self._not_finite()}"
+            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {said_of_not_finite(self)}"
         )
 
     def _warn_of_redundant_rows(self) -> None:
