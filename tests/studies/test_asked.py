@@ -129,7 +129,7 @@ def test_how_many_rivals_could_be_put_is_counted():
 
 
 def test_pairs_that_were_refused_or_not_asked_for_all_are_counted_apart():
-    """One that fails by itself, or gets to the tightest tolerance, was asked for all; other numbers of runs say nothing."""
+    """One that fails by itself, or gets to the tightest tolerance, was asked for all."""
     pairs = {
         "to the end": ((1e-3, 1e-3, END), (tables.TIGHTEST, 1e-12, END)),
         "failed": ((1e-3, 1e-3, END), (1e-5, 1e-5, END), (1e-7, None, FAILED)),
