@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import gallery
+import rooms
 
 from studies.which_method import page, table
 
@@ -23,6 +24,7 @@ def write(folder: Path) -> None:
             shutil.copy(file, reports)
     (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")
     (folder / "takes.md").write_text(table(ROOT / "reports"), encoding="utf-8")
+    rooms.draw(folder / "rooms.svg")
     run_the_front_page(folder / "extra" / "front")
     gallery.write(folder / "gallery.md", folder / "extra" / "animations")
 
