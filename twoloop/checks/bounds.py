@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from twoloop.kernels.compile.caches import names_in, of_library
 from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.private import Dispatcher
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem

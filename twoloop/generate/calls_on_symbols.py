@@ -12,11 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
 from twoloop.checks.bounds import Rewritten, place_of
 from twoloop.generate.tracing import FUNCTIONS, OPERATORS, Form, Graph, Refusal, Untraceable, operand
 from twoloop.kernels.compile.caches import of_library
+from twoloop.kernels.compile.private import Dispatcher
 
 # functions of NumPy that do with arrays of forms what they do with numbers
 AS_WITH_NUMBERS = {

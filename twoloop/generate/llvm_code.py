@@ -11,11 +11,10 @@ from typing import Any
 from weakref import WeakMethod
 
 from llvmlite import ir
-from numba.core.typing import signature
 from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 
 from twoloop.kernels.compile.callbacks import VECTOR
+from twoloop.kernels.compile.private import make_array, signature
 from twoloop.kernels.data.common import OPTIONS
 
 Value = Any  # of LLVM: a double, a vector of doubles, an integer or a pointer to doubles

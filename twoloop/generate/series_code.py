@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import types
-from numba.core.dispatcher import Dispatcher
 
 from twoloop.generate import llvm_code, series_groups
 from twoloop.generate.llvm_code import INTEGER, ONE, SLACK, ZERO, Emitter, Quantities, Value, emitted
@@ -25,6 +24,7 @@ from twoloop.generate.straight_line import Solution
 from twoloop.generate.tracing import ARCTANGENT, EXPONENTIAL, LOGARITHM, PENDING, PRODUCT, RECIPROCAL, SINE, SQUARE_ROOT
 from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
 from twoloop.kernels.compile.callbacks import VECTOR, f8
+from twoloop.kernels.compile.private import Dispatcher
 
 LARGEST = 3000  # operations, which take 6 s to compile; the time grows faster than their number
 AT_ONCE = 8  # vectors that are summed in one loop, in registers

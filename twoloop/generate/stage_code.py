@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import types
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from twoloop.generate import llvm_code, straight_code
@@ -22,6 +21,7 @@ from twoloop.generate.series_groups import WIDTH
 from twoloop.generate.straight_code import OwnCode, conditions_hold, results_of
 from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
 from twoloop.kernels.compile.callbacks import VECTOR, f8
+from twoloop.kernels.compile.private import Dispatcher
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 from numba import types
-from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
 from twoloop.generate import llvm_code, llvm_trigonometry, straight_line
@@ -38,6 +36,7 @@ from twoloop.generate.tracing import (
 )
 from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
 from twoloop.kernels.compile.callbacks import VECTOR
+from twoloop.kernels.compile.private import Dispatcher, make_array
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]

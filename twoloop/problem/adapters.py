@@ -11,11 +11,11 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 from numba import njit, objmode
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from twoloop.kernels.compile.caches import named_apart, watch
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
+from twoloop.kernels.compile.private import Dispatcher
 
 Array = NDArray[np.float64]
 

@@ -3,10 +3,10 @@
 from functools import cache
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import watch
 from twoloop.kernels.compile.callbacks import compile_callback
+from twoloop.kernels.compile.private import Dispatcher
 
 FIRST = 2.0**-6  # first displacement, relative to max(1, |q|); a power of two, so that q + displacement is exact
 SHORTER = 0.125  # what follows a displacement over which the constraints bend too much

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from numba.core.dispatcher import Dispatcher
-
+from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.generated import GeneratedCode, code_of
 
 

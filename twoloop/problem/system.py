@@ -8,12 +8,12 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import check_flag, check_number, check_real, check_size, shown
 from twoloop.checks.bounds import check_callback
 from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
+from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
 from twoloop.problem.adapters import (
     ConstantMatrix,

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import LIBRARIES, CannotBeWatched, Digest
+from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
 INSTALLED = {"site-packages", "dist-packages"}  # folders

@@ -8,8 +8,9 @@ allocation.)
 import scipy.linalg.cython_lapack
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import get_cython_function_address, intrinsic
+
+from twoloop.kernels.compile.private import cgutils
 
 # places in `addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges real and complex
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")

@@ -9,6 +9,8 @@ kernel count from the end where it is negative, as none is: the code that asks f
 lie side by side.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -81,9 +83,6 @@ def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
     return _index_from_either_end(context, builder, kind, index, size)
 
 
-arrayobj.fix_integer_index = _index
-
-
 _plain_call_type: Any = BaseFunction.get_call_type
 _call_types: dict[Any, tuple[Any, Any]] = {}
 
@@ -99,6 +98,24 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         _call_types[key] = signature, self._impl_keys[signature.args]
     signature, self._impl_keys[signature.args] = _call_types[key]
     return signature
+
+
+_open = [0]  # compilations of kernels, one within another
+
+
+@contextmanager
+def _own_rules() -> Iterator[None]:
+    """These two in the place of numba's while a kernel is compiled; what others compile in this process is theirs."""
+    numbas: Any = Function
+    numbas.get_call_type, arrayobj.fix_integer_index = _call_type, _index
+    _open[0] += 1
+    try:
+        yield
+    finally:
+        _open[0] -= 1
+        if _open[0] == 0:
+            del numbas.get_call_type  # what it inherits is numba's own
+            arrayobj.fix_integer_index = _index_from_either_end
 
 
 # passes over every function that find nothing to do in kernels: whole arrays in an expression, as none is allocated;
@@ -136,12 +153,8 @@ class KernelCompiler(_Compiler):
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function and all that it calls."""
-        numbas: Any = Function
-        numbas.get_call_type = _call_type
-        try:
+        with _own_rules():
             return super().compile_extra(function)
-        finally:
-            del numbas.get_call_type  # what it inherits is numba's own
 
 
 class VectorizingCompiler(KernelCompiler):

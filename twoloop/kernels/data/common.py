@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from numba import njit, types
-from numba.core.dispatcher import Dispatcher
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
 from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
+from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.reference import Reference
 
 i8 = types.int64
