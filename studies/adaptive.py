@@ -2,10 +2,10 @@
 
 A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit at two settings
 running (a loose one may take longer than the next), has failed at two tolerances running after one that ended, or has
-taken more than `FAR` times as long as the fastest so far for no smaller an error, at two settings running. Where two of
-its errors lie more than a decade apart it is asked between them, so that nothing need be interpolated over more, and
-beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes `OUTCLASSED`
-times as long as another of its side is not repeated. A part of `studies.work_precision`.
+taken more than `FAR` times as long as the fastest of its side, ours or others', so far for no smaller an error, at two
+settings running. Where two of its errors lie more than a decade apart it is asked between them, so that nothing need be
+interpolated over more, and beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes
+`OUTCLASSED` times as long as another of its side is not repeated. A part of `studies.work_precision`.
 """
 
 import itertools
@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from studies import headline
 from studies.bench import NOTHING_RUN, Run
 from studies.store import KeptRows, Row
 from studies.tables import DECADE, LOOSEST, NEAR, TIGHTEST
@@ -23,12 +24,15 @@ FAR = 20.0
 RUNNING = 2
 ROUNDS = 4  # of asking between settings
 OUTCLASSED = 10.0  # times the least time of its side: such a run decides nothing, and is made once
-CLOSE = 5.0  # times the time of the fastest: what costs more is not asked between its settings
+CLOSE = 5.0  # times the time of the fastest of its side: what costs more is not asked between its settings
 ENDING = (*NOTHING_RUN, "RAISED")
 FEWEST_STEPS, MOST_STEPS = 10, 10**6  # of a solver of fixed steps, beyond its grid
 COARSER = 10.0**0.5  # of steps where a tolerance changes by a decade
 
+ALWAYS = (headline.DEFAULT, headline.OWN_CODE)  # what a user gets is asked for all accuracies
+
 Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
+Side = tuple[str, bool]  # a mechanism, and whether the solver is ours
 
 
 class _Progress:
@@ -38,7 +42,7 @@ class _Progress:
         self.ended, self.reached, self.failed, self.far, self.stopped = False, False, 0, 0, 0
 
     def judge(self, row: Row, fastest: float | None, all_asked: bool, tolerances: bool) -> None:
-        """Take a first repetition into account; `fastest`: the least time so far for no larger an error."""
+        """Take a first repetition into account; `fastest`: the least time of its side so far for no larger an error."""
         self.reached = self.reached or row["error_q"] is not None
         self.failed = self.failed + 1 if row["error_q"] is None and self.reached else 0
         self.stopped = self.stopped + 1 if row["status"] == "TIME_LIMIT" else 0
@@ -67,7 +71,8 @@ def collect(
     all_asked : callable, optional
         all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
     errors : sequence of float, optional
-        The accuracies that are compared, for which solvers that are not far behind are asked between their settings.
+        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, and
+        those of ALWAYS, are asked between their settings.
 
     Returns
     -------
@@ -76,13 +81,13 @@ def collect(
     """
     built: Built = set()
     progress: dict[tuple[str, str], _Progress] = {}
-    reached: dict[str, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
+    reached: dict[Side, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
     todo = list(todo)
 
     def first(run: Run) -> None:
         if run.key(0) not in kept:
             kept.add(run.key(0), make(run, 0, built))
-        row, runs = kept[run.key(0)], reached.setdefault(run.case.name, [])
+        row, runs = kept[run.key(0)], reached.setdefault(_side(run), [])
         good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
         who = progress.setdefault((run.case.name, run.solver.name), _Progress())
         who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
@@ -107,6 +112,10 @@ def collect(
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 
 
+def _side(run: Run) -> Side:
+    return run.case.name, run.solver.family == "two-loop"
+
+
 def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in todo:
@@ -115,7 +124,7 @@ def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
 
 
 def between(
-    own: Sequence[Run], kept: KeptRows, reached: Mapping[str, Sequence[tuple[float, float]]], errors: Sequence[float]
+    own: Sequence[Run], kept: KeptRows, reached: Mapping[Side, Sequence[tuple[float, float]]], errors: Sequence[float]
 ) -> list[Run]:
     """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
     rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
@@ -124,9 +133,10 @@ def between(
         return []
     error = {value: max(float(rows[value]["error_q"]), float(rows[value].get("floor") or 0.0)) for value in made}
     fastest = [
-        min((cpu for each, cpu in reached[own[0].case.name] if each <= error[value]), default=np.inf) for value in made
+        min((cpu for each, cpu in reached[_side(own[0])] if each <= error[value]), default=np.inf) for value in made
     ]
-    close = {value: rows[value]["call_s"] <= CLOSE * least for value, least in zip(made, fastest, strict=True)}
+    limit = np.inf if own[0].solver.name in ALWAYS else CLOSE
+    close = {value: rows[value]["call_s"] <= limit * least for value, least in zip(made, fastest, strict=True)}
     asked = []
     for loose, tight in itertools.pairwise(made):
         apart, inside = error[loose] / error[tight], any(error[tight] < each < error[loose] for each in errors)
@@ -174,11 +184,10 @@ def _repeated(todo: Sequence[Run], kept: KeptRows) -> list[Run]:
 
     These are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error.
     """
-    sides: dict[tuple[str, bool], list[tuple[float, float, Run]]] = {}
+    sides: dict[Side, list[tuple[float, float, Run]]] = {}
     for run in todo:
         if run.key(0) in kept and (row := kept[run.key(0)])["error_q"] is not None:
-            side = run.case.name, run.solver.family == "two-loop"
-            sides.setdefault(side, []).append((row["error_q"], row["call_s"] or 0.0, run))
+            sides.setdefault(_side(run), []).append((row["error_q"], row["call_s"] or 0.0, run))
     found = set()
     for ended in sides.values():
         least = np.inf
