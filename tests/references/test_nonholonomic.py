@@ -5,7 +5,7 @@ import pytest
 
 from references.casadi_integrators import solve_idas
 from references.cvode_c import solve_cvode_c
-from references.diffrax_dopri8 import solve_dopri8
+from references.diffrax_dopri8 import solve_diffrax
 from references.heyoka_taylor import solve_heyoka
 from references.ida import solve_ida
 from references.index1 import solve_index1
@@ -28,7 +28,7 @@ ADAPTERS = {
         lambda *start: solve_cvode_c(*start, "BDF", 1e-9, 1e-9, projected=True),
     ),
     "IDAS": ("casadi", knife_edge, lambda *start: solve_idas(*start, 1e-9, 1e-9)),
-    "diffrax": ("diffrax", knife_edge, lambda *start: solve_dopri8(*start, 1e-9, 1e-9)),
+    "diffrax": ("diffrax", knife_edge, lambda *start: solve_diffrax(*start, 1e-9, 1e-9)),
 }
 
 
