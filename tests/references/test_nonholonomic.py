@@ -6,8 +6,10 @@ import pytest
 from references.casadi_integrators import solve_idas
 from references.cvode_c import solve_cvode_c
 from references.diffrax_dopri8 import solve_diffrax
+from references.gear import solve_gear
 from references.heyoka_taylor import solve_heyoka
 from references.ida import solve_ida
+from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
 from references.nonholonomic import with_all_rows
 from twoloop import ConstrainedSystem
@@ -28,6 +30,9 @@ ADAPTERS = {
         lambda *start: solve_cvode_c(*start, "BDF", 1e-9, 1e-9, projected=True),
     ),
     "IDAS": ("casadi", knife_edge, lambda *start: solve_idas(*start, 1e-9, 1e-9)),
+    "IDA, stabilised": ("sksundae", rolling_disc, lambda *start: solve_ida(*start, "stabilised", 1e-9, 1e-9)),
+    "IDA, index 1": ("sksundae", knife_edge, lambda *start: solve_ida(*start, "index1", 1e-9, 1e-9)),
+    "IDA from C": ("sksundae", rolling_disc, lambda *start: solve_ida_c(*start, 1e-9, 1e-9)),
     "diffrax": ("diffrax", knife_edge, lambda *start: solve_diffrax(*start, 1e-9, 1e-9)),
 }
 
@@ -69,7 +74,6 @@ def test_without_the_right_hand_side_of_these_rows_there_is_no_way():
         solve_index1(system, (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
 
 
-def test_ida_has_no_such_rows_and_says_so():
-    pytest.importorskip("sksundae")
+def test_other_adapters_have_no_such_rows_and_say_so():
     with pytest.raises(ValueError, match=r"this adapter has no rows A v \+ b = 0; given 'rolling disc' with n_a = 2"):
-        solve_ida(*start(rolling_disc()), "stabilised", 1e-6, 1e-6)
+        solve_gear(*start(rolling_disc()), 0.01, 2)
