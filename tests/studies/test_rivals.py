@@ -1,5 +1,7 @@
 """Every mechanism against the rivals: ratios, goals and sentences follow from the rows; sizes and the limit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
