@@ -149,7 +149,7 @@ def between(
 
 def _tidy(run: Run, value: float) -> float:
     """The nearest tolerance of two digits, or the nearest step of which the motion takes a whole number."""
-    return float(f"{value:.2g}") if run.solver.setting == "tol" else run.case.t_end / round(run.case.t_end / value)
+    return run.case.t_end / round(run.case.t_end / value) if run.solver.setting == "h" else float(f"{value:.2g}")
 
 
 def _beyond(
@@ -166,13 +166,13 @@ def _beyond(
     """
     first, last, asked = made[0], made[-1], []
     loosest, tightest, decade = LOOSEST, TIGHTEST, DECADE
-    if run.solver.setting != "tol":
+    if run.solver.setting == "h":
         loosest, tightest, decade = run.case.t_end / FEWEST_STEPS, run.case.t_end / MOST_STEPS, COARSER
     if error[first] < max(errors) / DECADE and close[first]:
         failed = [value for value in tried if value > first]
         if not failed and first < loosest:
             asked.append(min(loosest, decade * first))
-        elif run.solver.setting != "tol" and failed and failed[0] / first > NEAR:
+        elif run.solver.setting == "h" and failed and failed[0] / first > NEAR:
             asked.append(float(np.sqrt(first * failed[0])))
     if last == tried[0] and error[last] > min(errors) and last > tightest and close[last]:
         asked.append(max(tightest, last / decade))

@@ -14,12 +14,16 @@ from studies import figures, study, tables
 from studies.bench import REPEATS, Case, Run, Solver, collect
 from studies.cases import four_bar
 from studies.cli import StudyError
+from studies.headline import OWN_CODE
 from studies.metrics import ASTRAY, LOST
 from studies.render import number, power, render, table
 from studies.solvers import (
     ADAMS,
     CATALOGUE,
+    CVODE_C,
+    DEFAULT,
     ERR_IN,
+    HEYOKA,
     IDA_C,
     IDA_FORMS,
     IRK,
@@ -40,13 +44,14 @@ TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
 EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
 OTHERS = (
-    *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C, "IDA, stabilised"),
-    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+    *(DEFAULT, OWN_CODE, "SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR),
+    *(HEYOKA, CVODE_C, IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
 )
-COMPILED = ("IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")  # for seconds: no quick runs
-DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C)
-LISTED = (*(name for name in DRAWN if name != ADAMS), "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
+# for seconds: no quick runs
+COMPILED = (OWN_CODE, HEYOKA, CVODE_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")
+DRAWN = (DEFAULT, NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, TAYLOR, HEYOKA, CVODE_C, IDA_C)
+LISTED = (*DRAWN, "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
