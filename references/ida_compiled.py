@@ -168,7 +168,7 @@ def iteration_matrix_at(
                 J[n + j, 2 * n + m + k] = Cq[k, j]
                 J[2 * n + k, n + j] = cj * Cq[k, j]
                 J[2 * n + m + k, j] = cj * Cq[k, j]
-                J[j, 2 * n + k] = Cq[k, j]
+                J[j, 2 * n + k] = Cq[k, j] if k < positions else 0.0
         for k in range(positions, m):
             J[2 * n + m + k, 2 * n + k] = 1.0
         if not exact:

@@ -58,6 +58,7 @@ def collect(
     make: Callable[[Run, int, Built], Row],
     all_asked: Callable[[Run], bool] = lambda run: False,
     errors: Sequence[float] = (),
+    always_repeated: Callable[[Run], bool] = lambda run: False,
 ) -> pd.DataFrame:
     """Rows of all runs that are of use, the repetitions interleaved.
 
@@ -73,6 +74,8 @@ def collect(
     errors : sequence of float, optional
         The accuracies that are compared, for which solvers that are not far behind the fastest of their side, and
         those of ALWAYS, are asked between their settings.
+    always_repeated : callable, optional
+        always_repeated(run): repeated, however far behind, as its time is compared with that of another such run.
 
     Returns
     -------
@@ -103,7 +106,7 @@ def collect(
         for run in more:
             first(run)
         todo += more
-    again = _repeated(todo, kept)
+    again = _repeated(todo, kept, always_repeated)
     for repeat in range(1, max((run.repeats for run in todo), default=0)):
         for run in again:
             if repeat < run.repeats and run.key(repeat) not in kept:
@@ -179,7 +182,7 @@ def _beyond(
     return asked
 
 
-def _repeated(todo: Sequence[Run], kept: KeptRows) -> list[Run]:
+def _repeated(todo: Sequence[Run], kept: KeptRows, always: Callable[[Run], bool]) -> list[Run]:
     """The runs that are repeated: those that were made and ended, and whose times may decide who is the fastest.
 
     These are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error.
@@ -193,6 +196,6 @@ def _repeated(todo: Sequence[Run], kept: KeptRows) -> list[Run]:
         least = np.inf
         for _, seconds, run in sorted(ended, key=lambda each: each[:2]):
             least = min(least, seconds)
-            if seconds <= OUTCLASSED * least:
+            if seconds <= OUTCLASSED * least or always(run):
                 found.add(run.key(0))
     return [run for run in todo if run.key(0) in found]

@@ -10,8 +10,8 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from studies import figures, study, tables
-from studies.bench import REPEATS, Case, Run, Solver, collect
+from studies import adaptive, figures, study, tables
+from studies.bench import REPEATS, Case, Run, Solver, collect, row_of
 from studies.cases import four_bar
 from studies.cli import StudyError
 from studies.headline import OWN_CODE
@@ -35,7 +35,7 @@ from studies.solvers import (
     paper_irk_at,
     paper_newmark_at,
 )
-from studies.store import Output
+from studies.store import Output, Row
 from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, causes, machine, printed, reading_runs
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.tableaux import gauss
@@ -92,9 +92,19 @@ def make(output: Output) -> pd.DataFrame:
     def highest(run: Run, result: Result) -> dict[str, float]:
         return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
 
-    first, second = four_bar.cases(output.call.quick)
+    def row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+        return row_of(run, repeat, highest, built)
+
+    def ours(run: Run) -> bool:
+        return run.solver.family == "two-loop"
+
+    quick = output.call.quick
+    todo = runs(*four_bar.cases(quick), quick)
+    compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
-        return collect(runs(first, second, output.call.quick), kept, highest)
+        rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
+        more = adaptive.collect(compared, kept, row, lambda run: True, () if quick else TARGETS, ours)
+    return pd.concat([rows, more], ignore_index=True)
 
 
 def grid(rows: pd.DataFrame, group: str) -> str:

@@ -111,7 +111,11 @@ def collected(todo: Iterator[Run], kept: KeptRows, quick: bool) -> pd.DataFrame:
 
     chosen = list(todo)
     asked = [run for run in chosen if run.solver.name != EXUDYN]
-    rows = adaptive.collect(asked, kept, make, lambda run: run.solver.family == "two-loop", () if quick else TARGETS)
+
+    def ours(run: Run) -> bool:
+        return run.solver.family == "two-loop"
+
+    rows = adaptive.collect(asked, kept, make, ours, () if quick else TARGETS, ours)
     own = adaptive.collect([run for run in chosen if run.solver.name == EXUDYN], kept, make, lambda run: True)
     return pd.concat([rows, own], ignore_index=True)
 
