@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
+from references.equations.nonholonomic import with_all_rows
 from references.equations.ode import ADVICE, ode_result, output_times, states_at
 from references.scipy.index1 import RightHandSide
 from twoloop.checks.consistency import check_start
@@ -73,9 +74,10 @@ def solve_cvode(
     """
     check_choice("method", method, METHODS)
     check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     try:
         from sksundae.cvode import CVODE
     except ImportError as error:

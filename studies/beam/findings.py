@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI
-from studies.beam.runs import DIFFERENCES, EXUDYN, PAPER, by_tip
+from studies.beam.runs import DIFFERENCES, EXUDYN, PAPER, TARGETS, by_tip
 from studies.beam.sensitivity import MESH
 from studies.bench import tables
 from studies.bench.cases.beam import SOFT, STIFF
@@ -14,7 +14,6 @@ from studies.bench.cli import StudyError
 from studies.bench.render import number
 from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, PAPER_TOL, QUARTER
 
-TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
 PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
 PAPER_STEPS = {SOFT: 1e-3, STIFF: 1e-5}  # s, its step sizes by order of magnitude
 STEPS_OVER = 10.0  # h w_max from which a step does not follow the fastest vibration: more than one and a half periods
