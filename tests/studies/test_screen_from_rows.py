@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from studies.bench.cli import REPORTS, ROOT
-from studies.bench.collector import figures, index
+from studies.bench import figures, index
 from tests.studies.test_first_screen import differing
 
 TOLD = ("work_precision", "table3", "honesty", "robustness", "energy")  # of these the screen says something
