@@ -83,9 +83,9 @@ class Output:
         return path
 
     def write(self, name: str, content: str | bytes) -> Path:
-        """Write a file, whole or not at all."""
+        """Write a file, whole or not at all; paths that a text has within the project stand as from its folder."""
         path = self.file(name)
-        data = content.encode() if isinstance(content, str) else content
+        data = content.replace(f"{ROOT}/", "").encode() if isinstance(content, str) else content
         handle, new = tempfile.mkstemp(dir=self.path, prefix=f".{name}.")
         try:
             with os.fdopen(handle, "wb") as stream:

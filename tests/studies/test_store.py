@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -171,3 +172,14 @@ def test_rows_survive_a_kill(tmp_path):
 def test_what_json_does_not_hold_is_refused():
     with pytest.raises(TypeError, match="given complex"):
         plain({"x": 1j})
+
+
+def test_no_text_tells_where_the_project_lies(tmp_path):
+    with Output(call(tmp_path)) as output:
+        output.save_rows(pd.DataFrame({"message": [f"refused ({ROOT / 'studies' / 'traps.py'}, line 56)"]}), STAMP)
+    assert "refused (studies/traps.py, line 56)" in (tmp_path / "x.csv").read_text()
+
+
+def test_no_committed_report_tells_where_it_was_made():
+    paths = (ROOT / "reports").glob("*.[cjm]*")
+    assert [path.name for path in paths if re.search(r"(?<![\w.])/\w[^ ]*/(studies|twoloop)/", path.read_text())] == []
