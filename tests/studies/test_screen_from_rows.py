@@ -6,8 +6,8 @@ import shutil
 import matplotlib.pyplot as plt
 import pytest
 
-from studies.bench.cli import REPORTS, ROOT
 from studies.bench import figures, index
+from studies.bench.cli import REPORTS, ROOT
 from tests.studies.test_first_screen import differing
 
 TOLD = ("work_precision", "table3", "honesty", "robustness", "energy")  # of these the screen says something
