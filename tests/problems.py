@@ -10,7 +10,7 @@ from scipy.special import ellipj, ellipk
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, Kit
 from twoloop.kernels.evaluation.calls import inner_loop
-from twoloop.kernels.steps.explicit_step import explicit_step
+from twoloop.kernels.steps.explicit_step import EXPLICIT
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -53,7 +53,7 @@ def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
 
 def kit_of(system):
     """What the steps of the integrator get of a system."""
-    return Kit(system.functions, inner_loop, explicit_step)
+    return Kit(system.functions, inner_loop, EXPLICIT)
 
 
 @cache

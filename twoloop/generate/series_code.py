@@ -366,7 +366,7 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
     is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
     BEGIN, ORDER, TARGET = series.N_MEMORY_SCALARS, series.ORDER, series.TARGET
     N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
-    EVALUATE_THERE = calls.EVALUATE_THERE
+    EVALUATE_THERE, Attempt = calls.EVALUATE_THERE, common.Attempt
 
     def expand(f, w, options, memory, t, unit, tolerances, state, new_state):  # type: ignore[no-untyped-def]
         order = int(options[ORDER])
@@ -382,7 +382,7 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
         if not own_factors:
             code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
             if code != DONE:
-                return code, np.inf
+                return Attempt(code, np.inf, 0.0)
         begin(scratch, series, r, c, lam, t, unit, state)
         for k in range(1, order):
             find_order(scratch, series, r, c, t, unit, k)
@@ -390,10 +390,10 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
                 f.instead(f, w, r, c, t, unit, tolerances, a, lam)
             take_order(scratch, series, a, lam, unit, k)
         w.counters[N_EVALUATIONS] += order - 1
-        return DONE if is_finite(series, order) else NOT_FINITE, 0.0
+        return Attempt(DONE if is_finite(series, order) else NOT_FINITE, 0.0, 0.0)
 
     options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **common.OPTIONS}
-    return compile_kept(expand, common.STEP, (_stamp(), key), **options)
+    return compile_kept(expand, common.ATTEMPT, (_stamp(), key), **options)
 
 
 def _stamp() -> str:

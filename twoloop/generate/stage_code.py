@@ -128,7 +128,7 @@ class CompiledStages(NamedTuple):
     @property
     def memory_size(self) -> int:
         """Length of `memory`."""
-        return 1 + 4 * self.code.n + self.code.scratch_size()
+        return 4 * self.code.n + self.code.scratch_size()
 
 
 _COMPILED = Newest()
@@ -167,10 +167,10 @@ def _compile(code: StageCode, key: str) -> Dispatcher:
     )
     tableau_of, largest_error = explicit.tableau_of, explicit.largest_error
     N_EVALUATIONS, N_FACTORIZATIONS, DONE = common.N_EVALUATIONS, common.N_FACTORIZATIONS, common.DONE
-    ESTIMATE, EVALUATE_THERE = common.ESTIMATE, calls.EVALUATE_THERE
+    ESTIMATE, EVALUATE_THERE, Attempt = common.ESTIMATE, calls.EVALUATE_THERE, common.Attempt
 
     def stages(f, w, options, memory, t, h, tolerances, state, new_state):  # type: ignore[no-untyped-def]
-        estimates, scratch = memory[1 : 1 + 4 * n], memory[1 + 4 * n :]
+        estimates, scratch = memory[: 4 * n], memory[4 * n :]
         q, v, a = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
         _, A, b, c, fine, coarse = tableau_of(options)
         begin(scratch, state)
@@ -181,15 +181,16 @@ def _compile(code: StageCode, key: str) -> Dispatcher:
             else:
                 code = f.general(f, w, EVALUATE_THERE, t + c[j] * h, q, v, 0.0, a, w.lam)
                 if code != DONE:
-                    return code, np.inf
+                    return Attempt(code, np.inf, 0.0)
                 put(scratch, j, new_state)
         finish(scratch, b, fine, coarse, h, new_state, estimates)
         if tolerances[ESTIMATE] == 0.0:
-            return DONE, 0.0
-        return DONE, largest_error(tolerances, state, new_state, estimates[: 2 * n], estimates[2 * n :])
+            return Attempt(DONE, 0.0, 0.0)
+        error = largest_error(tolerances, state, new_state, estimates[: 2 * n], estimates[2 * n :])
+        return Attempt(DONE, error, 0.0)
 
     options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **common.OPTIONS}
-    return compile_kept(stages, common.STEP, (_stamp(), key), **options)
+    return compile_kept(stages, common.ATTEMPT, (_stamp(), key), **options)
 
 
 @cache

@@ -6,11 +6,19 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import (
+    EXPONENT,
+    FACTOR_MIN,
+    N_PAST,
+    N_RULE,
+    SAFETY,
+    factor_of,
+    remember,
+)
 from twoloop.kernels.data.common import (
     AUGMENTED,
     BY_GENERAL,
     DEFECT,
-    DEPARTURE,
     DONE,
     EXPLICIT_STEP,
     FAULT_KIND,
@@ -36,7 +44,6 @@ from twoloop.kernels.data.common import (
     PIVOT,
     SENSITIVITY,
     SINGULAR,
-    STEP_FACTOR,
     STRAIGHT,
     UNCHECKED,
     VECTOR,
@@ -77,19 +84,14 @@ SHORT = 0.5  # of the longest of the last steps: a step below it may be near a s
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
 FADING = 0.98  # of the longest step, with each accepted one
-KEPT = 1.2  # with PREDICTIVE factors from 1 to this leave the step as it is: a change costs Newton's method factors
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 SUDDEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
-# places in `control`, constant during a run
+# places in `control`, constant during a run, after the rule of controller.py
 (
-    SAFETY,
-    FACTOR_MIN,
-    FACTOR_MAX,
-    EXPONENT,  # the step factor is err**-EXPONENT
     MAX_STEP,
     FIXED_STEP,  # 0: step-size control
     LIMIT_START,  # h_max at the beginning of a step
@@ -98,8 +100,6 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     MAX_STEPS,  # accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is renewed
-    PREDICTIVE,  # 1: the step factor also follows the trend since the last accepted step (Gustafsson), see also KEPT
-    LEAST_ERROR,  # what an error below it counts as in the trend (Hairer & Wanner II, IV.8)
     MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
     BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
     SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
@@ -108,13 +108,13 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see SUDDEN
     N_CONTROL,
-) = range(22)
+) = range(N_RULE, N_RULE + 17)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
-# places in `clock`, carried from call to call
+# places in `clock`, carried from call to call, after the past of controller.py
 (
     T,
     H_NEXT,
@@ -125,8 +125,6 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     N_FIXED,
     FAILURE_CODE,
     H_FAILED,
-    H_BEFORE,  # size and error of the last accepted step
-    ERROR_BEFORE,
     H_LONG,  # the longest of the last steps, fading
     LARGEST_PIVOT,  # of the smallest pivots of C_q so far
     JUMP_FROM,  # the interval in which C_t or b jumps, where one lies ahead; else infinite
@@ -134,7 +132,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     LEAPS,  # 1: the next step is that over it, and new_state its end
     ROUGH_TO,  # where the last step ended that was refused for a sudden error
     N_CLOCK,
-) = range(18)
+) = range(N_PAST, N_PAST + 16)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -256,24 +254,21 @@ def advance(
             size = left
         elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
             return STEP_TOO_SMALL
-        w.notes[DEPARTURE] = 0.0
         w.notes[ORIENTATION_NEW] = 0.0
         if clock[FAILURE_CODE] == DONE:
             w.notes[FAULT_KIND] = -1.0
-        w.notes[STEP_FACTOR] = 0.0
         w.notes[DEFECT] = -1.0
         if leaps:
-            code, error = DONE, 0.0
+            code, error, factor = DONE, 0.0, 0.0
             w.notes[DEFECT] = 0.0
             w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
         else:
-            code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
+            code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and np.isfinite(error) and not leaps and control[SYMMETRIC] == 1.0:
             code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
             if code == CHANGED:
-                memory[0] = 0.0  # what the step keeps is of one that is not taken
-                w.notes[DEPARTURE] = 0.0
-                code, error = f.step(f, w, options, memory, t, size, tolerances, state, new_state)
+                f.settle(f, w, options, memory, tolerances, False)
+                code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
         if code == DONE and not np.isfinite(error):
             code = NOT_FINITE
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
@@ -282,7 +277,7 @@ def advance(
         if control[DRIVEN] == 1.0 and not leaps:
             kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
             if kind == JUMP or (kind == RAMP and accepted and not fixed):
-                memory[0] = 0.0
+                f.settle(f, w, options, memory, tolerances, False)
                 w.counters[N_REJECTED_ERROR] += 1
                 clock[FAILURE_CODE] = DONE
                 if kind == JUMP:
@@ -292,7 +287,8 @@ def advance(
                 else:
                     clock[H_NEXT] = max(low - t, high - low)
                 continue
-        memory[0] = 1.0 if accepted else 0.0
+        if not leaps:
+            f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
             w.counters[N_REJECTED_CONVERGENCE] += 1
             clock[FAILURE_CODE] = code
@@ -315,23 +311,13 @@ def advance(
             if code in (SINGULAR, INNER_DIVERGED) and renew_partition(f, w, t, state[:n]) != DONE:
                 return RANK_LOST
             continue
-        factor = control[FACTOR_MAX]
         if error > SUDDEN and not accepted:
             clock[ROUGH_TO] = t + size
         error *= strict
-        if w.notes[STEP_FACTOR] > 0.0:
-            factor = w.notes[STEP_FACTOR]
-            if strict > 1.0 and error > 0.0:  # the step does not know of `strict`, and may want to grow
-                factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
-        elif error > 0.0:
-            power = 1.0 / error if control[EXPONENT] == 1.0 else error ** -control[EXPONENT]
-            factor = control[SAFETY] * power
-            if accepted and control[PREDICTIVE] == 1.0 and clock[ERROR_BEFORE] > 0.0:
-                trend = size / clock[H_BEFORE] * (clock[ERROR_BEFORE] / error) ** control[EXPONENT]
-                factor = min(factor, factor * trend)
-            factor = min(control[FACTOR_MAX], max(control[FACTOR_MIN], factor))
-            if accepted and control[PREDICTIVE] == 1.0 and 1.0 <= factor <= KEPT:
-                factor = 1.0
+        if factor == 0.0:
+            factor = factor_of(control, clock, size, error)
+        elif strict > 1.0 and error > 0.0:  # the step does not know of `strict`, and may want to grow
+            factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
             w.counters[N_REJECTED_ERROR] += 1
@@ -352,7 +338,7 @@ def advance(
         gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
         w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
         clock[H_LONG] = max(size, FADING * clock[H_LONG])
-        clock[H_BEFORE], clock[ERROR_BEFORE] = size, max(error, control[LEAST_ERROR])
+        remember(control, clock, size, error)
         clock[N_FIXED] += in_grid
         if reaches:
             clock[T] = goal

@@ -317,11 +317,12 @@ def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states
             before = out_t[r - 1]
             out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (rows - 1)
             if code == DONE:
-                code, _ = f.step(f, w, options, memory, before, out_t[r] - before, tolerances, state, new_state)
+                size = out_t[r] - before
+                code, _, _ = f.attempt(f, w, options, memory, before, size, tolerances, state, new_state)
                 if code != DONE and renew_partition(f, w, before, state[:n]) == DONE:
                     copy(at_rest, memory)
-                    code, _ = f.step(f, w, options, memory, before, out_t[r] - before, tolerances, state, new_state)
-            memory[0] = 1.0
+                    code, _, _ = f.attempt(f, w, options, memory, before, size, tolerances, state, new_state)
+                f.settle(f, w, options, memory, tolerances, True)
             copy(new_state, state)
             copy(new_state[: 3 * n], out[r])
         if code != DONE:

@@ -62,13 +62,10 @@ class Adams:
                 "out, or take another method"
             )
         return Plan(
-            kernels.adams_step,
+            kernels.ADAMS,
             np.array([LARGEST_MOVE]),
             np.zeros(kernels.memory_size(n_q)),
-            exponent=1.0,  # the step returns the root of its error that belongs to its order
-            safety=kernels.SAFETY,
-            factor_min=0.1,
-            factor_max=kernels.START_GROWTH,
+            exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
             compilable=True,
         )

@@ -42,13 +42,10 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
     from twoloop.kernels.control import switching as kernels
 
     plans = (first, second)
-    each = [
-        [plan.safety, plan.exponent, plan.factor_min, plan.factor_max, plan.reuse, plan.predictive * plan.least_error]
-        for plan in plans
-    ]
+    each = [[*plan.rule, plan.reuse] for plan in plans]
     return replace(
         first,
-        step=kernels.switching_step,
+        step=kernels.SWITCHING,
         options=kernels.switching_options(
             limit, looks, MATRIX_COST + n_q / 8.0, dearer, each, first.options, second.options
         ),

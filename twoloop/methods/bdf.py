@@ -75,10 +75,9 @@ class BDF:
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         outer_tol = outer_tolerance(rtol, atol, fixed) if self.outer_tol is None else self.outer_tol
         return Plan(
-            kernels.bdf_step,
+            kernels.BDF,
             kernels.options_array(self.max_order, inner_tol, outer_tol, gauss(kernels.STARTER_STAGES)),
             np.zeros(kernels.memory_size(n_q)),
-            exponent=1.0,  # the step returns the root of its error that belongs to its order
-            safety=kernels.SAFETY,
+            exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
             apart=True,
         )

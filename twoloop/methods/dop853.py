@@ -83,7 +83,7 @@ class DOP853:
         source = scipy.integrate.DOP853
         s, free = len(source.B), self.stages == "free"
         plan = Plan(
-            kernels.explicit_step,
+            kernels.EXPLICIT,
             kernels.options_array(
                 source.A,
                 source.B,
@@ -97,9 +97,8 @@ class DOP853:
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,
             safety=SAFETY,
-            predictive=free,
             watchful=free,
-            least_error=LEAST_ERROR,
+            least_error=LEAST_ERROR if free else 0.0,
             rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,
             compilable=free,
@@ -110,7 +109,7 @@ class DOP853:
         made = compiled_stages(self.code, s)
         return replace(
             plan,
-            step=kernels.compiled_explicit_step,
+            step=kernels.COMPILED_EXPLICIT,
             memory=np.zeros(max(plan.memory.size, made.memory_size)),
             own=made.function,
             instead=kernels.explicit_step,

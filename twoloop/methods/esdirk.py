@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_choice
-from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, least_tolerance
+from twoloop.methods.plan import INNER_TOL, LEAST_ERROR, Plan, check_tolerances, least_tolerance
 
 Array = NDArray[np.float64]
 
@@ -115,13 +115,13 @@ class ESDIRK:
             outer_tol = min(OUTER_SHARE * tolerance, LOOSEST_OUTER) * min(1.0, (tolerance / FEW_STEPS) ** exponent)
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
-            kernels.diagonal_step,
+            kernels.DIAGONAL,
             kernels.diagonal_options(
                 A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol, self.tested == "all", order == 2
             ),
             kernels.diagonal_memory(len(embedded), n_q),
             exponent=exponent,
             safety=SAFETY,
-            predictive=True,
+            least_error=LEAST_ERROR,
             rough=ROUGH[self.formula],
         )

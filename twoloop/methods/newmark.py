@@ -79,7 +79,7 @@ class Newmark:
         options[kernels.OUTER_TOL] = outer_tol
         options[kernels.ERROR_TOL] = 0.0 if self.error_tol is None else self.error_tol
         return Plan(
-            kernels.newmark_step,
+            kernels.NEWMARK,
             options,
             np.zeros(kernels.N_MEMORY_SCALARS + n_q),
             exponent=1.0 / 2.0 if self.error_tol is None else 1.0 / 3.0,

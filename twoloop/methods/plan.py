@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 # Newton in the inner loop converges quadratically and is tested on its last correction: about the square is left
 INNER_TOL = 1e-8
-LEAST_ERROR = 0.01  # of the tolerance: less counts as this in the trend that the step size follows
+LEAST_ERROR = 0.01  # `least_error` of a Plan, of most methods
 ROUGH = 10.0  # `rough` of a Plan, as measured for most methods
 LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
@@ -24,7 +24,7 @@ LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to 
 class Plan:
     """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
 
-    step: Any
+    step: Any  # a Step of kernels/data/common.py
     options: Array
     memory: Array
     exponent: float
@@ -37,8 +37,7 @@ class Plan:
     limit_factor: float = 0.7
     limit_memory: int = 10
     symmetric: bool = False
-    predictive: bool = False
-    least_error: float = LEAST_ERROR
+    least_error: float = 0.0  # what a smaller error counts as in the trend that the step size follows; 0: follows none
     rough: float = 1.0  # how many times less than its error the estimate of a step may be where a force jumps
     reuse: float = 0.0  # correction of a position up to which the Jacobian before it serves, within a step
     watchful: bool = False  # whether short steps are a reason to look how near a singular position is
@@ -56,6 +55,11 @@ class Plan:
     provisional: bool = False  # whether that takes over, too, where steps turn out to be no longer than its own may be
     traced: tuple[Any, ...] = ()  # what the callbacks were traced to, where a step goes by that: see traced_values.py
     within_newton: "Plan | None" = None  # the same, parts included, of steps by Newton's method; None: not divided
+
+    @property
+    def rule(self) -> list[float]:
+        """Of step-size control, see kernels/control/controller.py."""
+        return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
 
 
 def least_tolerance(rtol: float, atol: float) -> float:

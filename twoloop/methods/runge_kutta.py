@@ -7,7 +7,7 @@ import numpy as np
 
 from twoloop.checks.arguments import check_choice, shown
 from twoloop.methods.auto import switching
-from twoloop.methods.plan import INNER_TOL, ROUGH, Plan, check_tolerances, outer_tolerance
+from twoloop.methods.plan import INNER_TOL, LEAST_ERROR, ROUGH, Plan, check_tolerances, outer_tolerance
 from twoloop.methods.tableaux import Tableau
 
 NEWTON_TOL_FIXED = 1e-12  # the outer tolerance of fixed steps where stiff forces magnify rounding
@@ -147,12 +147,11 @@ class RungeKutta:
             tableau.order - 1.0,
         )
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
-        plan = Plan(kernels.runge_kutta_step, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
+        plan = Plan(kernels.RUNGE_KUTTA, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
         if self.outer == "paper":
-            step = kernels.paper_step
             return replace(
                 plan,
-                step=step,
+                step=kernels.PAPER,
                 factor_min=0.5,
                 limit_start=1.0,
                 limit_factor=1.0,
@@ -160,11 +159,11 @@ class RungeKutta:
                 lands=True,
                 rough=1.0,
             )
-        plan = replace(plan, predictive=True, symmetric=self.partition == "symmetric", parts=self._parts())
+        plan = replace(plan, least_error=LEAST_ERROR, symmetric=self.partition == "symmetric", parts=self._parts())
         if self.variables == "momenta":
             from twoloop.kernels.steps import canonical_step as momenta
 
-            return replace(plan, step=momenta.momenta_step, memory=np.zeros(momenta.memory_size(tableau.stages, n_q)))
+            return replace(plan, step=momenta.MOMENTA, memory=np.zeros(momenta.memory_size(tableau.stages, n_q)))
         if self.outer == "fixed-point":
             return plan
         newton = self._newton_plan(plan, n_q)
@@ -180,7 +179,7 @@ class RungeKutta:
         n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
         made = replace(
             plan,
-            step=newton.newton_step,
+            step=newton.NEWTON,
             options=np.concatenate([plan.options, extra]),
             memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
             exponent=1.0 / (tableau.stages + 1),

@@ -106,7 +106,7 @@ class Taylor:
         highest = order + 1
         widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
         plan = Plan(
-            taylor.taylor_step,
+            taylor.TAYLOR,
             _options(program, highest, widths),
             np.zeros(series.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
             exponent=1.0 / highest,
@@ -126,7 +126,7 @@ class Taylor:
         code = compiled_series(program, self.code)
         return replace(
             plan,
-            step=taylor.compiled_taylor_step,
+            step=taylor.COMPILED_TAYLOR,
             memory=np.zeros(code.memory_size(highest)),
             own=code.function,
             instead=taylor.solve_order,

@@ -117,12 +117,7 @@ class Run:
     def _control_by(self, plan: Plan) -> None:
         """Step-size control as a plan wants it."""
         a, control = self.a, self.control
-        control[a.SAFETY], control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.safety, plan.factor_min, plan.factor_max
-        control[a.EXPONENT], control[a.PREDICTIVE], control[a.LEAST_ERROR] = (
-            plan.exponent,
-            plan.predictive,
-            plan.least_error,
-        )
+        control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
         control[a.ROUGH] = plan.rough
@@ -424,7 +419,7 @@ class Run:
         self._limit_steps()
         self.clock[self.a.FAILURE_CODE] = common.DONE
         self.clock[self.a.H_NEXT] = self.clock[self.a.H_FAILED]
-        self.clock[self.a.H_BEFORE] = self.clock[self.a.ERROR_BEFORE] = 0.0
+        self.clock[: self.a.N_PAST] = 0.0
 
     def _bridge(self) -> tuple[Plan, Array]:
         """The plan and the controls for steps across a singular position, see kernels/steps/bridge.py."""
@@ -435,8 +430,7 @@ class Run:
         self.crossings.append([(float(clock[a.T]), self.state.copy())])
         plan = DOP853().plan(self.system.n_q, self.rtol, float(self.tolerances[common.ATOL :].min()), False)
         control = self.control.copy()
-        control[a.SAFETY], control[a.EXPONENT], control[a.PREDICTIVE] = plan.safety, plan.exponent, 0.0
-        control[a.FACTOR_MIN], control[a.FACTOR_MAX] = plan.factor_min, plan.factor_max
+        control[: a.N_RULE] = replace(plan, least_error=0.0).rule
         control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
         control[a.GIVES_WAY] = 0.0
         if control[a.FIXED_STEP] == 0.0:
@@ -444,7 +438,7 @@ class Run:
         clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
         self.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
         clock[a.H_NEXT] = self.lengths.pop(0)
-        return replace(plan, step=bridge.bridging_step), control
+        return replace(plan, step=bridge.BRIDGING), control
 
     def _beyond(self, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
         """What goes on after an attempt at a step across: the same, or the run's own steps again."""
@@ -461,7 +455,7 @@ class Run:
             self.control[a.BRIDGE] = 0.0
         self.crossings[-1].append((float(self.clock[a.T]), self.state.copy()))
         self.plan.memory[:] = self.memory
-        self.clock[a.H_BEFORE] = self.clock[a.ERROR_BEFORE] = 0.0
+        self.clock[: a.N_PAST] = 0.0
         return self.plan, self.control, a.PAUSED
 
     def leap(self, t1: float) -> bool:

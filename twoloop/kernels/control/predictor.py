@@ -8,7 +8,7 @@ this sign needs a prediction that is nearly exact, as short steps through a sing
 """
 
 from twoloop.kernels.algebra.factors import sign_of
-from twoloop.kernels.data.common import ATOL, DEPARTURE, DONE, ESTIMATE, ORIENTATION, ORIENTATION_NEW, RTOL, merged
+from twoloop.kernels.data.common import ATOL, DONE, ESTIMATE, ORIENTATION, ORIENTATION_NEW, RTOL, merged
 from twoloop.kernels.evaluation.calls import restore
 
 SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
@@ -49,12 +49,7 @@ def departure(w, tolerances, h, q, v, q1):
 
 @merged
 def restore_predicted(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Put the prediction (q1, v1) of a step of h from (q, v) on the constraints, as `restore` does.
-
-    The departure goes into w.notes where it is larger than what stands there.
-    """
+    """Put the prediction (q1, v1) of a step of h from (q, v) on the constraints, as `restore` does; code, departure."""
     keep_predicted(w, q1)
     code = restore(f, w, t, q1, v1, inner_tol)
-    if code == DONE:
-        w.notes[DEPARTURE] = max(w.notes[DEPARTURE], departure(w, tolerances, h, q, v, q1))
-    return code
+    return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0

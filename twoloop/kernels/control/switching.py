@@ -10,14 +10,16 @@ run has cost a few times as much. Costs are counted in evaluations of the explic
 mechanism one of the implicit method counts several times. This is left in the same way, after a trial of the explicit
 method, where its own steps have come below that limit. What is not kept is next tried after twice as many looks.
 
-Both methods are called by their addresses, f.first and f.second, and are compiled once, where they are.
+Both methods are called by their addresses, and are compiled once, where they are.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import ERROR_BEFORE, H_BEFORE, LEAST_ERROR, N_PAST, N_RULE, factor_of
 from twoloop.kernels.data.common import (
+    ATTEMPT,
     DONE,
     ESTIMATE,
     EXPLICIT_STEP,
@@ -28,16 +30,17 @@ from twoloop.kernels.data.common import (
     OUTER_DIVERGED,
     REUSE,
     ROUNDED,
-    STEP,
-    STEP_FACTOR,
+    SETTLE,
     STRAIGHT,
+    Attempt,
+    Step,
     compiled,
     inlined,
     kernel,
+    merged,
 )
 from twoloop.kernels.evaluation.calls import PROJECT, evaluate, renew_partition
 
-KEPT = 1.2  # see advance.py
 EARLY = 100.0  # evaluations before the first look at the rate
 INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
 ITERATIONS = 4
@@ -55,7 +58,7 @@ INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is
 BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
 STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
 MEAN = 0.8  # weight of the steps before in the mean step
-SETTLE = 5.0  # accepted steps of a trial before its price is taken
+SETTLED = 5.0  # accepted steps of a trial before its price is taken
 WINDOW = 10.0  # accepted steps over which it is
 SAME = 1e-9  # relative: steps that are of one length but for rounding
 GAIN = 1.2  # what a method on trial must be cheaper by
@@ -63,18 +66,19 @@ PATIENCE = 4.0  # looks before the next trial
 
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 
-# places in `options`: of the pair, then SAFETY ... REUSE_OF of the first and of the second method; then their options
+# places in `options`: of the pair, then of the first and of the second method a rule, see controller.py, and REUSE_OF;
+# then their options
 # LIMIT: h rho from which on the implicit method is tried, found at so many LOOKS in a row
 # DEARER: evaluations of the first method that one of the second costs
 LIMIT, LOOKS, MATRIX_COST, DEARER, SIZE_1, N_PAIR = range(6)
-SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, REUSE_OF, LEAST_ERROR, N_OF_EACH = range(7)  # LEAST_ERROR 0: no trend
+REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
-# places in `memory`: advance() sets LAST_ACCEPTED; behind the scalars two directions (n_q), then the two memories
+# places in `memory`: scalars, two directions (n_q), then the two memories
 (
-    LAST_ACCEPTED,
     PHASE,
     STEPS,  # accepted in this phase
+    MAY_LOOK,  # 1: the last attempt was accepted
     LOOK_AT,  # evaluations at which to look again
     LOOKS_TO_WAIT,
     WAIT,
@@ -84,8 +88,8 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     RATE,  # the last one found, 1 / s
     FIRST_MEMORY,
     H_MEAN,
-    H_BEFORE,  # size and error of the last accepted step of this phase
-    ERROR_BEFORE,
+    PAST,  # of the steps of this phase, see controller.py
+    _PAST_ERROR,
     H_TRIED,
     ERROR_TRIED,
     N_TRIALS,
@@ -103,7 +107,7 @@ def switching_options(
     first: ArrayLike,
     second: ArrayLike,
 ) -> NDArray[np.float64]:
-    """`options`: of the pair, see LIMIT and what follows; then six numbers of each; then their own."""
+    """`options`: of the pair, see LIMIT and what follows; then a rule and REUSE_OF of each; then their own."""
     first = np.asarray(first, dtype=np.float64)
     scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
@@ -116,6 +120,16 @@ def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[n
     scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
     directions = np.concatenate([0.3 + 0.1 * (np.arange(n_q) % 7)] * 2)
     return np.concatenate([scalars, directions, first, second])
+
+
+@merged
+def _is_explicit(memory):
+    return memory[PHASE] == EXPLICIT or memory[PHASE] == BACK_ON_TRIAL
+
+
+@inlined
+def _past(memory):
+    return memory[PAST : PAST + N_PAST]
 
 
 @inlined
@@ -215,7 +229,7 @@ def _cost(w, options):
 def _price(w, options, memory, t):
     """What a second of motion has cost since the price was last begun, in evaluations of the first method."""
     price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
-    return price if memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL) else options[DEARER] * price
+    return price if _is_explicit(memory) else options[DEARER] * price
 
 
 @compiled
@@ -223,7 +237,7 @@ def _enter(w, options, memory, n, phase, t):
     """Begin another phase; its method knows nothing of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
-    memory[ERROR_BEFORE] = 0.0
+    memory[PAST + ERROR_BEFORE] = 0.0
     memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
 
@@ -231,9 +245,9 @@ def _enter(w, options, memory, n, phase, t):
 @compiled
 def _settle_trial(w, options, memory, n, t):
     """Whether the method on trial is kept; returns the phase to begin, or -1."""
-    if memory[STEPS] == SETTLE:
+    if memory[STEPS] == SETTLED:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-    if memory[STEPS] < SETTLE + WINDOW:
+    if memory[STEPS] < SETTLED + WINDOW:
         return -1
     price = _price(w, options, memory, t)
     keeps = price * GAIN <= memory[PRICE]
@@ -282,22 +296,26 @@ def _restart(memory):
         memory[i] = 0.0
 
 
-@compiled
-def _factor(memory, each, h, error):
-    """The step factor as advance() would choose it for the method alone, from the error and its trend."""
-    if error == 0.0:
-        return each[FACTOR_MAX]
-    factor = each[SAFETY] * error ** -each[EXPONENT]
-    if error <= 1.0 and each[LEAST_ERROR] > 0.0 and memory[ERROR_BEFORE] > 0.0:
-        trend = h / memory[H_BEFORE] * (memory[ERROR_BEFORE] / error) ** each[EXPONENT]
-        factor = min(factor, factor * trend)
-    factor = min(each[FACTOR_MAX], max(each[FACTOR_MIN], factor))
-    return 1.0 if each[LEAST_ERROR] > 0.0 and error <= 1.0 and 1.0 <= factor <= KEPT else factor
+@kernel(SETTLE)
+def settle_switching(f, w, options, memory, tolerances, accepted):
+    """Settle the method that made the attempt, and count its accepted steps."""
+    first, second = _memories(memory, w.Q.size)
+    begin = N_OPTIONS + int(options[SIZE_1])
+    memory[MAY_LOOK] = 0.0
+    if _is_explicit(memory):
+        f.settle_first(f, w, options[N_OPTIONS:begin], first, tolerances, accepted)
+    else:
+        f.settle_second(f, w, options[begin:], second, tolerances, accepted)
+    if accepted:
+        memory[STEPS] += 1.0
+        memory[MAY_LOOK] = 1.0
+        past = _past(memory)
+        past[H_BEFORE], past[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt by one of the two, and the step that it asks for next, as advance() would choose it.
+    """One attempt by one of the two, with the step factor that the controller would choose for it alone.
 
     A method of the second kind begins anew each time; its memory is all zeros then.
     """
@@ -306,49 +324,45 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if np.isnan(memory[T_BEGIN]):  # of a run, or of what is left of it beyond a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
         memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY
-    memory[STEPS] += memory[LAST_ACCEPTED]
-    if memory[LAST_ACCEPTED] == 1.0:
-        memory[H_BEFORE], memory[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
-    if memory[LAST_ACCEPTED] == 1.0 and tolerances[ESTIMATE] == 1.0:
+    if memory[MAY_LOOK] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _settle_trial(w, options, memory, n, t)
         elif w.counters[N_EVALUATIONS] >= memory[LOOK_AT]:
             phase = _look(f, w, options, memory, t, state, new_state)
         if phase >= 0:
-            was_explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
-            is_explicit = phase in (EXPLICIT, BACK_ON_TRIAL)
+            was_explicit = _is_explicit(memory)
             _enter(w, options, memory, n, phase, t)
-            if was_explicit != is_explicit:
-                _restart(first if is_explicit else second)
-    explicit = memory[PHASE] in (EXPLICIT, BACK_ON_TRIAL)
+            if was_explicit != _is_explicit(memory):
+                _restart(second if was_explicit else first)
+    explicit = _is_explicit(memory)
     w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
     each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
     w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
     if explicit:
-        first[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
-        code, error = f.first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
+        code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0:  # a constant step cannot become shorter
             _enter(w, options, memory, n, IMPLICIT, t)
             _restart(second)
             w.notes[EXPLICIT_STEP] = 0.0
-            code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
+            code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
         # only steps of the first method may look at the equations within them; others have to be short
         if tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + SAME):
-            w.notes[STEP_FACTOR] = tolerances[GAP] / h
-            return DONE, 1.0 + SAME
-        second[0] = memory[LAST_ACCEPTED] if memory[STEPS] > 0.0 else 0.0
-        code, error = f.second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
+            return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
+        code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
     if code != DONE or not np.isfinite(error):
-        return code, error
+        return Attempt(code, error, 0.0)
     if memory[PHASE] == ON_TRIAL:
         error *= STRICT
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
-    if w.notes[STEP_FACTOR] == 0.0:  # else the method knows better
-        w.notes[STEP_FACTOR] = _factor(memory, each, h, error)
+    if factor == 0.0:
+        factor = factor_of(each, _past(memory), h, error)
     if not explicit:
-        w.notes[STEP_FACTOR] = min(w.notes[STEP_FACTOR], max(tolerances[GAP] / h, 1.0))
-    return code, error
+        factor = min(factor, max(tolerances[GAP] / h, 1.0))
+    return Attempt(DONE, error, factor)
+
+
+SWITCHING = Step(switching_step, settle_switching)

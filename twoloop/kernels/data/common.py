@@ -137,7 +137,6 @@ def _type_of_work(value: Any, context: Any) -> Any:
 # places in Work.notes
 (
     SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
-    DEPARTURE,  # how far the predicted dependents were off in this attempt, see predictor.py
     ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
     ORIENTATION_NEW,  # ... and at the end of this attempt
     FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
@@ -154,7 +153,6 @@ def _type_of_work(value: Any, context: Any) -> Any:
     CONTRADICTION,  # row that was taken for redundant and is violated
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
-    STEP_FACTOR,  # the step that a method asks for next, over this one; 0: advance() chooses it from the error
     MASS_SCALE,  # s of the augmented matrix, see augmented.py
     FACTORED,  # 1: its factors belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
@@ -168,7 +166,7 @@ def _type_of_work(value: Any, context: Any) -> Any:
     KINK_AFTER,
     LEANING,  # largest share of a row that counts in a redundant one, as at the first look under this partition
     N_NOTES,
-) = range(32)
+) = range(30)
 
 # what a kernel returns: DONE, or why it could not
 (
@@ -184,6 +182,27 @@ def _type_of_work(value: Any, context: Any) -> Any:
 ) = range(9)
 
 
+class Attempt(NamedTuple):
+    """What a step says of itself: made or not, how wrong, and how long the next one should be.
+
+    code : DONE, or why it could not be made.
+    error : over the tolerances; it is accepted from 1 down. A step that is longer than the method allows, and was not
+        made, is wrong by as many times as it is too long.
+    factor : the length that the method asks for next, over this one; 0: the controller chooses it from the error.
+    """
+
+    code: int
+    error: float
+    factor: float
+
+
+class Step(NamedTuple):
+    """A step, and what is to become of what it kept in its memory, once it is known whether it was accepted."""
+
+    attempt: Any = None
+    settle: Any = None
+
+
 class Kit:
     """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
@@ -197,15 +216,17 @@ class Kit:
         self,
         functions: Any,
         inner: Any = None,
-        step: Any = None,
-        first: Any = None,
-        second: Any = None,
+        step: Step | None = None,
+        first: Step | None = None,
+        second: Step | None = None,
         general: Any = None,
         own: Any = None,
         instead: Any = None,
     ):
-        self.functions, self.inner, self.step, self.first, self.second = functions, inner, step, first, second
-        self.general, self.own, self.instead = general, own, instead
+        self.functions, self.inner, self.general, self.own, self.instead = functions, inner, general, own, instead
+        self.attempt, self.settle = step or Step()
+        self.attempt_first, self.settle_first = first or Step()
+        self.attempt_second, self.settle_second = second or Step()
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -220,10 +241,14 @@ for _name, _kind in KINDS.items():
 INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
 for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
-# (kit, work, options, memory, t, h, tolerances, state, new_state) -> (code, normalised error)
-STEP = types.Tuple((i8, f8))(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-for _name in ("step", "first", "second", "own", "instead"):
-    KIT.add_function(_name, STEP)
+# (kit, work, options, memory, t, h, tolerances, state, new_state) -> Attempt
+ATTEMPT = types.NamedTuple((i8, f8, f8), Attempt)(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
+for _name in ("attempt", "attempt_first", "attempt_second", "own", "instead"):
+    KIT.add_function(_name, ATTEMPT)
+# (kit, work, options, memory, tolerances, accepted)
+SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
+for _name in ("settle", "settle_first", "settle_second"):
+    KIT.add_function(_name, SETTLE)
 
 
 @typeof_impl.register(Kit)

@@ -14,15 +14,28 @@ g_i = int c_i ds and G_i = int (1 - s) c_i ds give velocities and positions; all
 import numpy as np
 
 from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.common import ATOL, DEPARTURE, DONE, N_OUTER, RTOL, STEP, inlined, kernel, merged
+from twoloop.kernels.data.common import (
+    ATOL,
+    ATTEMPT,
+    DONE,
+    N_OUTER,
+    RTOL,
+    SETTLE,
+    Attempt,
+    Step,
+    inlined,
+    kernel,
+    merged,
+)
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do
 N_TERMS = HIGHEST + 2  # differences that a step makes, and coefficients g and G
 STRICT = 5.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
-SAFETY = 0.8  # of advance()
+SAFETY = 0.8  # of a step factor
 GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
 START_GROWTH = 2.0  # ... while the order still rises with every step
+LEAST_FACTOR = 0.1  # after a step whose dependents are far from the prediction
 RESTART_AFTER = 3  # failures in a row, after which the method begins again with order 1
 
 # eight Gauss nodes on [0, 1]: exact for c_i and (1 - s) c_i up to i = 15
@@ -33,8 +46,6 @@ REST = WEIGHTS * (1.0 - NODES)
 THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more is repeated
 # places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _tables
 (
-    LAST_ACCEPTED,  # set by advance() after every attempt
-    TRIAL,  # 1: the last attempt left a table that takes over if it was accepted
     WHICH,  # of the two tables, that of the last accepted step
     ORDER,
     DEPTH,  # accelerations in the history
@@ -43,7 +54,7 @@ THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more
     FAILED,  # attempts in a row that were refused
     NEXT_ORDER,
     N_SCALARS,
-) = range(10)
+) = range(8)
 PSI, NEW_PSI, BETA, SPEED, PLACE, NODE, N_ROWS = range(7)  # SPEED holds g, PLACE holds G
 
 
@@ -78,12 +89,10 @@ def _scratch(memory, n):
     return memory[start : start + width], memory[start + width : start + 2 * width]
 
 
-@merged
-def _take_over(memory):
-    """Make the last attempt the history, if it was accepted; else note that it failed."""
-    left = memory[TRIAL]
-    memory[TRIAL] = 0.0
-    if memory[LAST_ACCEPTED] == 0.0:
+@kernel(SETTLE)
+def settle_adams(f, w, options, memory, tolerances, accepted):
+    """Make an attempt the history, if it was accepted; else note that it failed."""
+    if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
         if memory[ORDER] > 1.0:
@@ -91,8 +100,6 @@ def _take_over(memory):
         memory[ORDER] = min(memory[ORDER], memory[NEXT_ORDER])
         if memory[FAILED] >= RESTART_AFTER:
             memory[DEPTH] = 0.0
-        return
-    if left == 0.0:
         return
     memory[FAILED] = 0.0
     memory[WHICH] = 1.0 - memory[WHICH]
@@ -210,7 +217,7 @@ def _error(g, G, h, order, largest_v, largest_q):
 
 @merged
 def _next(memory, h, k, table, d, n):
-    """The largest error of this attempt over the tolerances; choose the next order, and say what its error is.
+    """The largest error of this attempt over the tolerances, and the step factor; choose the next order.
 
     Order rules as in STEP: lower where the error would not be larger, higher where it would be smaller, after k + 1
     steps at order k; while the method starts, higher with every step.
@@ -248,21 +255,19 @@ def _next(memory, h, k, table, d, n):
                 order, expected = k + 1, above
     memory[NEXT_ORDER] = float(order)
     if not np.isfinite(error):
-        return np.inf
-    root = expected ** (1.0 / (order + 1.0))
+        return np.inf, 0.0
     if error > 1.0:
-        return min(max(error ** (1.0 / (k + 1.0)), 1.0 + 1e-9), SAFETY / SHRINKAGE)
-    return min(max(root, SAFETY / (START_GROWTH if starting else GROWTH)), 1.0)
+        return error, max(SAFETY * error ** (-1.0 / (k + 1.0)), SHRINKAGE)
+    root = expected ** (1.0 / (order + 1.0))
+    return error, SAFETY / min(max(root, SAFETY / (START_GROWTH if starting else GROWTH)), 1.0)
 
 
-@kernel(STEP, vectorized=True)
+@kernel(ATTEMPT, vectorized=True)
 def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt; the error returned is such that advance() takes the step factor SAFETY over it."""
+    """One attempt, with the step factor of the order that it chooses."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    if memory[DEPTH] > 0.0:
-        _take_over(memory)
     if memory[DEPTH] == 0.0:
         _begin(memory, n, state)
     k = int(memory[ORDER])
@@ -273,7 +278,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # if the evaluation fails
     code = evaluate_there(f, w, t + h, q1, v1, a1)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     per_v, per_q = _scratch(memory, n)
     d = new[N_TERMS]
     rtol = tolerances[RTOL]
@@ -283,9 +288,9 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         per_v[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
     for m in range(n):
         per_q[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
-    error = _next(memory, h, k, new, d, n)
+    error, factor = _next(memory, h, k, new, d, n)
     if not error <= 1.0:
-        return DONE, error
+        return Attempt(DONE, error, factor)
     g, G = _row(memory, SPEED)[k], _row(memory, PLACE)[k]
     for m in range(n):
         q1[m] += h * h * G * d[m]
@@ -293,9 +298,13 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     keep_predicted(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     for m in range(n):
         d[m] = a1[m] - new[0, m]
-    w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
-    memory[TRIAL] = 1.0
-    return DONE, max(error, w.notes[DEPARTURE])
+    off = departure(w, tolerances, h, q, v, q1)
+    if off > 0.0:
+        factor = min(factor, max(SAFETY / off, LEAST_FACTOR))
+    return Attempt(DONE, max(error, off), factor)
+
+
+ADAMS = Step(adams_step, settle_adams)

@@ -14,12 +14,15 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure
 from twoloop.kernels.data.common import (
     ATOL,
+    ATTEMPT,
     DONE,
     ESTIMATE,
     N_OUTER,
     OUTER_DIVERGED,
     RTOL,
-    STEP,
+    SETTLE,
+    Attempt,
+    Step,
     compiled,
     inlined,
     kernel,
@@ -32,7 +35,8 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
 MAX_ITERATIONS = 60
-SAFETY = 0.9  # of advance(): the next step is SAFETY over the returned error times this one
+SAFETY = 0.9  # of a step factor
+LEAST_FACTOR = 0.2
 STRICT = 10.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
 BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
 NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
@@ -43,7 +47,6 @@ GROWTH = 2.0  # the most by which a step grows
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
 # places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
 (
-    LAST_ACCEPTED,  # set by advance() after every attempt
     HAS_TRIAL,  # whether the last attempt left differences at its end
     ORDER,
     DEPTH,  # the highest difference there is
@@ -51,7 +54,7 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
     NEXT_ORDER,
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
-) = range(8)
+) = range(7)
 # rows of coefficients: times since the points of the history, from its last point and from the end of the step; the
 # error constants of orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
@@ -85,14 +88,15 @@ def _blocks(memory, n):
     return differences, trial, memory[o : o + 2 * n], memory[o + 2 * n : o + 4 * n], memory[o + 4 * n :]
 
 
-@compiled
-def _take_over(memory, differences, trial):
-    """Make the trial differences the history, if the last attempt was accepted."""
+@kernel(SETTLE)
+def settle_bdf(f, w, options, memory, tolerances, accepted):
+    """Make the trial differences the history, if the attempt was accepted."""
+    differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     left = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
     if left == 0.0:
         return
-    if memory[LAST_ACCEPTED] == 0.0:
+    if not accepted:
         memory[ORDER] = memory[NEXT_ORDER]
         memory[AGE] = 0.0
         return
@@ -198,10 +202,7 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _judge(options, memory, tolerances, trial, y, y1, d):
-    """Estimate the error from d = y1 - prediction and choose the next order, into memory.
-
-    Returns an error that exceeds 1 where the estimate does, and from which advance() makes the step size chosen here.
-    """
+    """Estimate the error from d = y1 - prediction, choose the next order, into memory, and the step factor."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
@@ -220,7 +221,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
     if not error <= 1.0:
         if below < here:
             memory[NEXT_ORDER] = k - 1
-        return error ** (1.0 / (k + 1))
+        return error, max(SAFETY * error ** (-1.0 / (k + 1)), LEAST_FACTOR)
     factor = (BIAS * here) ** (-1.0 / (k + 1))
     if memory[AGE] >= k:  # the estimates come from k + 1 steps of this order
         lower, higher = (BIAS * below) ** (-1.0 / k), (BIAS * above) ** (-1.0 / (k + 2))
@@ -233,7 +234,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
             factor = 1.0
     else:
         factor = min(factor, 1.0)
-    return SAFETY / min(max(factor, SAFETY), GROWTH)
+    return error, min(max(factor, SAFETY), GROWTH)
 
 
 @compiled
@@ -262,7 +263,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     V_stage = scratch[2 * s * n : 3 * s * n].reshape((s, n))
     for j in range(s):
         copy(state[2 * n : 3 * n], A_stage[j])
-    code = iterate_accelerations(
+    code, _ = iterate_accelerations(
         f,
         w,
         options[N_SCALARS:],
@@ -283,7 +284,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     return code
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt: predict from the history, correct, and choose the order and the size of the next step.
 
@@ -293,7 +294,6 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     y, y1 = state[: 2 * n], new_state[: 2 * n]
     differences, trial, prediction, rate, scratch = _blocks(memory, n)
     fixed = tolerances[ESTIMATE] == 0.0
-    _take_over(memory, differences, trial)
     if memory[DEPTH] == 0.0:
         _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
     k = int(memory[ORDER])
@@ -303,16 +303,22 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     else:
         code = _correct(f, w, options, t + h, h, k, prediction, rate, new_state, scratch[:n])
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     d = prediction
     for m in range(2 * n):
         d[m] = y1[m] - prediction[m]
-    error = 0.0
+    error, factor = 0.0, 0.0
     if fixed:
         memory[NEXT_ORDER] = min(k + 1, int(options[HIGHEST]))
     else:
-        error = _judge(options, memory, tolerances, trial, y, y1, d)
-        error = max(error, departure(w, tolerances, h, y[:n], y[n:], y1[:n]))
+        error, factor = _judge(options, memory, tolerances, trial, y, y1, d)
+        off = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
+        if off > 0.0:
+            factor = min(factor, max(SAFETY / off, LEAST_FACTOR))
+        error = max(error, off)
     memory[HAS_TRIAL] = 1.0
     _extend(memory, trial, y1, d)
-    return DONE, error
+    return Attempt(DONE, error, factor)
+
+
+BDF = Step(bdf_step, settle_bdf)

@@ -9,9 +9,11 @@ Stages leave these by their truncation error, which the distance from the singul
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import keep_predicted
 from twoloop.kernels.data.common import (
     ATOL,
+    ATTEMPT,
     DONE,
     ESTIMATE,
     N_OUTER,
@@ -20,7 +22,8 @@ from twoloop.kernels.data.common import (
     PIVOT,
     RTOL,
     SINGULAR,
-    STEP,
+    Attempt,
+    Step,
     kernel,
 )
 from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, find_tangents, renew_partition
@@ -39,7 +42,7 @@ from twoloop.kernels.steps.explicit_step import (
 NEARER = 0.5  # of the smallest pivot at the start of a step, which there must be at its end
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt; `options` and `memory` are those of explicit_step."""
     s, A, b, c, fine, coarse = tableau_of(options)
@@ -61,18 +64,18 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code == DONE:
             code = accelerations(f, w, t + c[j] * h, q_stage, slopes[j, :n], slopes[j, n : 2 * n], w.lam)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
     _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other)
         if not error <= 1.0:
-            return DONE, error
+            return Attempt(DONE, error, 0.0)
     code = renew_partition(f, w, t + h, q1)
     if code == DONE and w.notes[PIVOT] < NEARER * pivot:
         code = SINGULAR  # from there it would be harder still
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     keep_predicted(w, q1)
     w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
@@ -80,4 +83,7 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
         m = w.dependent[k]
         scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
         error = max(error, abs(w.predicted[k] - q1[m]) / scale * tolerances[ESTIMATE])
-    return code, error
+    return Attempt(code, error, 0.0)
+
+
+BRIDGING = Step(bridging_step, nothing_to_settle)

@@ -17,8 +17,8 @@ from twoloop.kernels.algebra.factors import columns_of, rows_of, solve
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.common import (
+    ATTEMPT,
     CONSTANT_MASS,
-    DEPARTURE,
     DONE,
     ESTIMATE,
     MASS_NOT_DEFINITE,
@@ -27,7 +27,9 @@ from twoloop.kernels.data.common import (
     N_OUTER,
     N_PARTITIONS,
     OUTER_DIVERGED,
-    STEP,
+    SETTLE,
+    Attempt,
+    Step,
     compiled,
     inlined,
     kernel,
@@ -51,10 +53,10 @@ from twoloop.kernels.steps.fixed_point_step import (
     keep_rest,
     rests,
 )
-from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, interpolate, tableau_of
+from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
 
-# places in `memory`: advance() sets the first after every attempt; then stage blocks (s, n), vectors (n), matrices
-LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, PARTITION_NUMBER, N_MEMORY_SCALARS = range(7)
+# places in `memory`: scalars, then stage blocks (s, n), vectors (n), matrices; GOES_ON: the last attempt was accepted
+GOES_ON, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, PARTITION_NUMBER, N_MEMORY_SCALARS = range(7)
 V_PREVIOUS, R_PREVIOUS, V_TRIAL, R_TRIAL, V_HALF, R_HALF, Q_STAGE, P_STAGE, N_BLOCKS = range(9)
 P_START, P_END, RATE, MV, V_NEW, SHIFTED, U, Q_FULL, V_FULL, Q_MID, V_MID, P_MID, REST = range(13)
 N_VECTORS = REST + N_RESTS
@@ -208,7 +210,7 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
 
     V_stage, R_stage hold predicted velocities and rates of p on entry.
     On return they have converged, and q1, p1, v1 are the end of the step, on the constraints; q1 and p1 are summed with
-    compensation if there are rows of `rest`.
+    compensation if there are rows of `rest`. Returns the code, and how far the prediction of the dependents was off.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -249,11 +251,11 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
             if code == DONE:
                 code = _tangents(f, w, t + c[j] * h, Q_stage[j], tangent, reduced, u)
             if code != DONE:
-                return code
+                return code, 0.0
             _velocities(w, tangent, reduced, u, P_stage[j], v)
             code = _momentum_rates(f, w, t + c[j] * h, Q_stage[j], v, tangent, Mv, shifted, R_stage[j])
             if code != DONE:
-                return code
+                return code, 0.0
             for m in w.independent:
                 difference = abs(v[m] - V_stage[j, m])
                 change = max(change, difference / max(abs(v[m]), 1.0))
@@ -265,17 +267,17 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
         if iteration < 2:
             first = max(first, change)
         elif not change <= GROWTH * first:
-            return OUTER_DIVERGED
+            return OUTER_DIVERGED, 0.0
         elif change >= earlier:  # two iterations back: errors go from q to p in one iteration and back in the next
             if change <= rounding_floor(q):
                 converged = True
                 break
             if iteration >= PATIENCE:
-                return OUTER_DIVERGED
+                return OUTER_DIVERGED, 0.0
         earlier = before if iteration > 0 else np.inf
         before = change
     if not converged:
-        return OUTER_DIVERGED
+        return OUTER_DIVERGED, 0.0
     for m in range(n):
         in_q = 0.0
         for k in range(s):
@@ -294,16 +296,36 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
             p1[m], rest[3, m] = compensated(p[m], rest[1, m], h * in_p)
     forget(w.dependent, rest)
     keep_predicted(w, q1)
-    code = dependent_positions(f, w, t + h, q1, v1, options[INNER_TOL])
+    code, off = dependent_positions(f, w, t + h, q1, v1, options[INNER_TOL]), 0.0
     if code == DONE:
-        w.notes[DEPARTURE] = max(w.notes[DEPARTURE], departure(w, tolerances, h, q, v0, q1))
+        off = departure(w, tolerances, h, q, v0, q1)
         code = _tangents(f, w, t + h, q1, tangent, reduced, u)
     if code == DONE:
         _velocities(w, tangent, reduced, u, p1, v1)
-    return code
+    return code, off
 
 
-@kernel(STEP)
+@inlined
+def _rests_of(memory, s, n, tolerances):
+    return rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
+
+
+@kernel(SETTLE)
+def settle_momenta(f, w, options, memory, tolerances, accepted):
+    """The stages of an accepted step are what the next one is predicted from, and begins with."""
+    s, n = int(options[STAGES]), w.Q.size
+    memory[GOES_ON] = 0.0
+    if accepted and memory[HAS_TRIAL] == 1.0:
+        for j in range(s):
+            copy(_block(memory, s, n, V_TRIAL)[j], _block(memory, s, n, V_PREVIOUS)[j])
+            copy(_block(memory, s, n, R_TRIAL)[j], _block(memory, s, n, R_PREVIOUS)[j])
+        memory[H_PREVIOUS] = memory[H_TRIAL]
+        memory[HAS_PREVIOUS] = memory[GOES_ON] = 1.0
+        keep_rest(_rests_of(memory, s, n, tolerances))
+    memory[HAS_TRIAL] = 0.0
+
+
+@kernel(ATTEMPT)
 def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt by a fixed-point iteration on (q_i, p_i); error and extrapolation as in `runge_kutta_step`."""
     s, _, _, _, _, c = tableau_of(options)
@@ -321,29 +343,20 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     tangent = _matrix(memory, s, n, n_dof, n, TANGENT)
     reduced = _matrix(memory, s, n, n_dof, n_dof, REDUCED_MASS)
     weights = memory[memory.size - s :]
-    rest = rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
+    rest = _rests_of(memory, s, n, tolerances)
     # momenta and their rates belong to a partition: under another one they predict nothing
     same = memory[PARTITION_NUMBER] == w.counters[N_PARTITIONS]
     memory[PARTITION_NUMBER] = w.counters[N_PARTITIONS]
-    goes_on = memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0
-    if goes_on:
-        for j in range(s):
-            copy(v_trial[j], v_previous[j])
-            copy(r_trial[j], r_previous[j])
-        memory[H_PREVIOUS] = memory[H_TRIAL]
-        memory[HAS_PREVIOUS] = 1.0
-        keep_rest(rest)
-    memory[HAS_TRIAL] = 0.0
     if not same:
         memory[HAS_PREVIOUS] = 0.0
     ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
-    if goes_on and tolerances[ESTIMATE] == 0.0 and ratio <= FARTHEST:
+    if memory[GOES_ON] == 1.0 and tolerances[ESTIMATE] == 0.0 and ratio <= FARTHEST:
         copy(p1, p)  # to find them from v, which is rounded, would let the energy drift
     else:
         rest[:, :] = 0.0
         code = _tangents(f, w, t, q, tangent, reduced, _vector(memory, s, n, U))
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         _momenta(w, tangent, v, Mv, p)
     if ratio <= FARTHEST:
         for j in range(s):
@@ -352,13 +365,13 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     else:
         code = _momentum_rates(f, w, t, q, v, tangent, Mv, _vector(memory, s, n, SHIFTED), rate)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         for j in range(s):
             copy(v, v_trial[j])
             copy(rate, r_trial[j])
-    code = _iterate(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1, rest)
+    code, off = _iterate(f, w, options, memory, tolerances, t, h, q, v, p, v_trial, r_trial, q1, p1, v1, rest)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         copy(q1, q_full)
@@ -366,16 +379,15 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         for j in range(s):
             interpolate(c, 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 * c[j], r_trial, weights, r_half[j])
-        w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
-        code = _iterate(
+        code, off_mid = _iterate(
             f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid, rest
         )
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 + 0.5 * c[j], r_trial, weights, r_half[j])
-        code = _iterate(
+        code, off = _iterate(
             f,
             w,
             options,
@@ -394,11 +406,15 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             rest,
         )
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
+        off = max(off, off_mid)  # of the two half steps, from which the run goes on
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
-    return code, max(error, w.notes[DEPARTURE])
+    return Attempt(code, max(error, off), 0.0)
+
+
+MOMENTA = Step(momenta_step, settle_momenta)

@@ -21,8 +21,8 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.common import (
     ATOL,
+    ATTEMPT,
     BANDWIDTH,
-    DEPARTURE,
     DONE,
     ESTIMATE,
     FORCE_BY_Q_GIVEN,
@@ -30,7 +30,9 @@ from twoloop.kernels.data.common import (
     N_OUTER,
     OUTER_DIVERGED,
     RTOL,
-    STEP,
+    SETTLE,
+    Attempt,
+    Step,
     compiled,
     inlined,
     kernel,
@@ -51,7 +53,6 @@ from twoloop.kernels.steps.newton_memory import (
     H_FACTORED,
     HAS_JACOBIAN,
     HAS_TRIAL,
-    LAST_ACCEPTED,
     LASTING,
     N_EIGEN_SCALARS,
     PARTITION_NUMBER,
@@ -281,7 +282,17 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
         v1[w.independent[i]] -= e_v[i]
 
 
-@kernel(STEP, vectorized=True)
+@kernel(SETTLE)
+def settle_diagonal(f, w, options, memory, tolerances, accepted):
+    """The last stage of an accepted step is the first of the next one."""
+    if accepted:
+        s = int(options[TAIL])
+        _, A_stage, a_end = _stages(memory, s, w.Q.size)
+        copy(A_stage[s - 1], a_end)  # F at the state would magnify what Newton's method left by stiffness
+        memory[FRESH] = 0.0
+
+
+@kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt: the stages one after another, the last of which is the end of the step."""
     s = int(options[TAIL])
@@ -292,9 +303,6 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     V_stage, A_stage, a_end = _stages(memory, s, n)
-    if memory[LAST_ACCEPTED] == 1.0:
-        copy(A_stage[s - 1], a_end)  # F at the state would magnify what Newton's method left by stiffness
-        memory[FRESH] = 0.0
     if memory[HAS_TRIAL] == 0.0 or memory[PARTITION_NUMBER] != w.notes[GENERATION]:
         memory[HAS_TRIAL] = 1.0
         memory[PARTITION_NUMBER] = w.notes[GENERATION]
@@ -322,7 +330,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code = _solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
         if code != DONE:
             memory[HAS_JACOBIAN] = 0.0
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
     for m in w.dependent:  # as the formula has them, beside those that the constraints give
@@ -333,11 +341,14 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if tolerances[ESTIMATE] == 1.0:
         error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights)
         if not error <= 1.0:
-            return DONE, error
+            return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
             _extrapolate(f, w, options, memory, h, q1, v1)
     keep_predicted(w, q1)
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
-        w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
-    return code, max(error, w.notes[DEPARTURE])
+        error = max(error, departure(w, tolerances, h, q, v, q1))
+    return Attempt(code, error, 0.0)
+
+
+DIAGONAL = Step(diagonal_step, settle_diagonal)

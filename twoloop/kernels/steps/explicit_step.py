@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.common import (
     ATOL,
-    DEPARTURE,
+    ATTEMPT,
     DONE,
     ESTIMATE,
     N_OUTER,
     NEARLY_SINGULAR,
     RTOL,
-    STEP,
+    Attempt,
+    Step,
     compiled,
     inlined,
     kernel,
@@ -28,8 +30,7 @@ from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
-# vectors in `memory` after memory[0], which is advance()'s; then the slopes of the stages. Each has 2 n_q numbers, and
-# zeros up to a multiple of BLOCK
+# vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8
 
@@ -57,7 +58,7 @@ def options_array(
 
 def memory_size(s: int, n_q: int) -> int:
     """Length of `memory` for s stages and n_q coordinates."""
-    return 1 + (N_VECTORS + s) * (-(-2 * n_q // BLOCK) * BLOCK)
+    return (N_VECTORS + s) * (-(-2 * n_q // BLOCK) * BLOCK)
 
 
 @inlined
@@ -77,13 +78,13 @@ def tableau_of(options):
 
 @inlined
 def _vector(memory, n, which):
-    return memory[1 + which * _width(n) : 1 + (which + 1) * _width(n)]
+    return memory[which * _width(n) : (which + 1) * _width(n)]
 
 
 @inlined
 def _slopes(memory, s, n):
     """Velocities and accelerations of the stages, side by side."""
-    begin = 1 + N_VECTORS * _width(n)
+    begin = N_VECTORS * _width(n)
     return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
 
 
@@ -151,7 +152,7 @@ def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other):
     return largest_error(tolerances, y, y1, one[: y.size], other[: y.size])
 
 
-@kernel(STEP, vectorized=True)
+@kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt; one that the estimate refuses ends without the accelerations at its end."""
     s, A, b, c, fine, coarse = tableau_of(options)
@@ -173,36 +174,40 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         else:
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
     _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other)
         if not error <= 1.0:
-            return DONE, error
+            return Attempt(DONE, error, 0.0)
     keep_predicted(w, q1)
     if free:
         code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     else:
         code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
-        w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
-    return code, max(error, w.notes[DEPARTURE])
+        error = max(error, departure(w, tolerances, h, q, v, q1))
+    return Attempt(code, error, 0.0)
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def compiled_explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """The same with stages by f.own, code made for the mechanism, which are free; f.instead is explicit_step."""
     if w.notes[NEARLY_SINGULAR] != 0.0:
         return f.instead(f, w, options, memory, t, h, tolerances, state, new_state)
     n = w.Q.size
     w.counters[N_OUTER] += 1
-    code, error = f.own(f, w, options, memory, t, h, tolerances, state, new_state)
+    code, error, _ = f.own(f, w, options, memory, t, h, tolerances, state, new_state)
     if code != DONE or not error <= 1.0:
-        return code, error
+        return Attempt(code, error, 0.0)
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     keep_predicted(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code == DONE:
-        w.notes[DEPARTURE] = departure(w, tolerances, h, state[:n], state[n : 2 * n], q1)
-    return code, max(error, w.notes[DEPARTURE])
+        error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
+    return Attempt(code, error, 0.0)
+
+
+EXPLICIT = Step(explicit_step, nothing_to_settle)
+COMPILED_EXPLICIT = Step(compiled_explicit_step, nothing_to_settle)

@@ -7,16 +7,19 @@ twice to q'' = a), `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.common import (
     ATOL,
-    DEPARTURE,
+    ATTEMPT,
     DONE,
     ESTIMATE,
     N_OUTER,
     OUTER_DIVERGED,
     RTOL,
-    STEP,
+    SETTLE,
+    Attempt,
+    Step,
     compiled,
     exact,
     inlined,
@@ -30,6 +33,7 @@ from twoloop.kernels.steps.stages import (
     INNER_TOL,
     OUTER_TEST,
     OUTER_TOL,
+    STAGES,
     end_error,
     interpolate,
     tableau_of,
@@ -42,8 +46,8 @@ SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there f
 SUDDEN = 10.0  # what that has to be in the paper's procedure, which has no such estimate, before it counts
 PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
-# places in `memory`: advance() sets LAST_ACCEPTED after every attempt; then stage blocks (s, n_q) and vectors (n_q)
-LAST_ACCEPTED, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(6)
+# places in `memory`: scalars, then stage blocks (s, n_q) and vectors (n_q)
+HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 N_RESTS = 4  # rows of REST: what rounding took from q and from v, at the last accepted step and in this attempt
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
@@ -103,8 +107,8 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     A_stage holds their prediction on entry.
     Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
     undamped systems the iteration's rate is the square of the first-order one. On return A_stage has converged and
-    (q1, v1) is the end of the step, on the constraints; w.notes[DEPARTURE] grows to how far its prediction was off.
-    The sums are compensated where `rest` has rows.
+    (q1, v1) is the end of the step, on the constraints. The sums are compensated where `rest` has rows. Returns the
+    code, and how far the prediction of the dependents was off.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -134,7 +138,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
         for j in range(s):
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1)
             if code != DONE:
-                return code
+                return code, 0.0
             for m in w.independent:
                 difference = h * abs(q1[m] - A_stage[j, m])
                 change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
@@ -146,16 +150,16 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
         if iteration == 0:
             first = change
         elif not change <= GROWTH * first:
-            return OUTER_DIVERGED
+            return OUTER_DIVERGED, 0.0
         elif change >= before:
             if change <= rounding_floor(q):
                 converged = True
                 break
             if iteration >= PATIENCE:
-                return OUTER_DIVERGED
+                return OUTER_DIVERGED, 0.0
         before = change
     if not converged:
-        return OUTER_DIVERGED
+        return OUTER_DIVERGED, 0.0
     for m in range(n):
         in_q = 0.0
         in_v = 0.0
@@ -276,7 +280,26 @@ def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
     return restore(f, w, t, q1, v1, options[INNER_TOL]), error
 
 
-@kernel(STEP)
+@inlined
+def _rests_of(memory, s, n, tolerances):
+    return rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
+
+
+@kernel(SETTLE)
+def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
+    """The stages of an accepted step are what the next one is predicted from."""
+    s, n = int(options[STAGES]), w.Q.size
+    if accepted and memory[HAS_TRIAL] == 1.0:
+        previous, trial = _block(memory, s, n, PREVIOUS), _block(memory, s, n, TRIAL)
+        for j in range(s):
+            copy(trial[j], previous[j])
+        memory[H_PREVIOUS] = memory[H_TRIAL]
+        memory[HAS_PREVIOUS] = 1.0
+        keep_rest(_rests_of(memory, s, n, tolerances))
+    memory[HAS_TRIAL] = 0.0
+
+
+@kernel(ATTEMPT)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt, a fixed-point iteration on the accelerations; to estimate the error, a step of h and two of h/2.
 
@@ -296,53 +319,48 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_full, v_full = _vector(memory, s, n, Q_FULL), _vector(memory, s, n, V_FULL)
     q_mid, v_mid = _vector(memory, s, n, Q_MID), _vector(memory, s, n, V_MID)
     weights = memory[memory.size - s :]
-    rest = rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
-    if memory[LAST_ACCEPTED] == 1.0 and memory[HAS_TRIAL] == 1.0:
-        for j in range(s):
-            copy(trial[j], previous[j])
-        memory[H_PREVIOUS] = memory[H_TRIAL]
-        memory[HAS_PREVIOUS] = 1.0
-        keep_rest(rest)
-    memory[HAS_TRIAL] = 0.0
+    rest = _rests_of(memory, s, n, tolerances)
     ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
     for j in range(s):
         if ratio <= FARTHEST:
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
+    code, off = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         copy(q1, q_full)
         copy(v1, v_full)
         for j in range(s):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
-        w.notes[DEPARTURE] = 0.0  # of the two half steps, from which the run goes on
         g = 0.5 * h
-        code = iterate_accelerations(f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rest)
+        code, off_mid = iterate_accelerations(
+            f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rest
+        )
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
-        code = iterate_accelerations(
+        code, off = iterate_accelerations(
             f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rest
         )
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
+        off = max(off, off_mid)  # of the two half steps, from which the run goes on
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         error = max(error, SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, trial))
-    return code, max(error, w.notes[DEPARTURE])
+    return Attempt(code, max(error, off), 0.0)
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt in the manner of the paper (Sects. 3.1-3.3): a step of h, two of h/2, their difference the error."""
     s, _, _, _, _, _ = tableau_of(options)
@@ -358,7 +376,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q_old, v_old = _vector(memory, s, n, Q_OLD), _vector(memory, s, n, V_OLD)
     code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         copy(q1, q_full)
@@ -370,18 +388,22 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code == DONE:
             code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         code = iterate_first_order(
             f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
         )
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         beside = SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, A_full)
         if error <= 1.0 and beside > SUDDEN:
             error = beside
-    return code, error
+    return Attempt(code, error, 0.0)
+
+
+RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
+PAPER = Step(paper_step, nothing_to_settle)

@@ -3,15 +3,18 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure
 from twoloop.kernels.data.common import (
     ATOL,
+    ATTEMPT,
     DONE,
     ESTIMATE,
     N_OUTER,
     OUTER_DIVERGED,
     RTOL,
-    STEP,
+    Attempt,
+    Step,
     compiled,
     kernel,
     merged,
@@ -21,8 +24,8 @@ from twoloop.kernels.evaluation.calls import evaluate_state, rounding_floor
 MAX_ITERATIONS = 60
 TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
 
-# places in `memory` before the new accelerations; the first is advance()'s
-SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(1, 5)
+# places in `memory` before the new accelerations
+SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
 # places in `options`
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
@@ -67,7 +70,7 @@ def _error(options, tolerances, rate, h, q, v, a, a1):
     return np.sqrt(total) / options[ERROR_TOL] if options[ERROR_TOL] > 0.0 else largest
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt: (12) for the independent coordinates, inner loop, accelerations, until these stop changing."""
     n = w.Q.size
@@ -86,7 +89,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             v1[m] = v[m] + h * ((1.0 - gamma) * a[m] + gamma * a1[m])
         code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a_new, lam1)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         change = 0.0
         for m in w.independent:
             difference = h * abs(a_new[m] - a1[m])
@@ -103,8 +106,11 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])
                     error = max(error, departure(w, tolerances, h, q, v, q1))
-            return DONE, error
+            return Attempt(DONE, error, 0.0)
         if not change <= before:
-            return OUTER_DIVERGED, np.inf
+            break
         before = change
-    return OUTER_DIVERGED, np.inf
+    return Attempt(OUTER_DIVERGED, np.inf, 0.0)
+
+
+NEWMARK = Step(newmark_step, nothing_to_settle)

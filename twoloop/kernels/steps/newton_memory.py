@@ -10,9 +10,8 @@ from twoloop.kernels.steps.stages import N_SCALARS
 # VELOCITIES: 1 if their error is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
-# places in `memory`: advance() sets LAST_ACCEPTED after every attempt
+# places in `memory`
 (
-    LAST_ACCEPTED,
     HAS_TRIAL,
     H_TRIAL,
     HAS_PREVIOUS,
@@ -26,7 +25,7 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     SYMMETRIC,  # 1: the matrix of diagonal.py was factored as a symmetric one
     LASTING,  # s, of diagonal.py: how long an error of velocity lasts; 0: not known
     N_MEMORY_SCALARS,
-) = range(14)
+) = range(13)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # spaces of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue

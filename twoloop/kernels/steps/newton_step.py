@@ -20,8 +20,8 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.common import (
     ATOL,
+    ATTEMPT,
     BANDWIDTH,
-    DEPARTURE,
     DONE,
     ESTIMATE,
     GENERATION,
@@ -29,7 +29,9 @@ from twoloop.kernels.data.common import (
     N_OUTER,
     OUTER_DIVERGED,
     RTOL,
-    STEP,
+    SETTLE,
+    Attempt,
+    Step,
     compiled,
     kernel,
     merged,
@@ -51,7 +53,6 @@ from twoloop.kernels.steps.newton_memory import (
     HAS_JACOBIAN,
     HAS_PREVIOUS,
     HAS_TRIAL,
-    LAST_ACCEPTED,
     N_EIGEN_SCALARS,
     N_REAL,
     PARTITION_NUMBER,
@@ -307,7 +308,21 @@ def _middle(c):
     return c[found]
 
 
-@kernel(STEP)
+@kernel(SETTLE)
+def settle_newton(f, w, options, memory, tolerances, accepted):
+    """The stages of an accepted step are what the next one is predicted from; its state is another than the last."""
+    s, n = int(options[STAGES]), w.Q.size
+    if accepted:
+        memory[FRESH] = 0.0
+        if memory[HAS_TRIAL] == 1.0:
+            for j in range(s):
+                copy(block(memory, s, n, TRIAL)[j], block(memory, s, n, PREVIOUS)[j])
+            memory[H_PREVIOUS] = memory[H_TRIAL]
+            memory[HAS_PREVIOUS] = 1.0
+    memory[HAS_TRIAL] = 0.0
+
+
+@kernel(ATTEMPT)
 def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt with Newton's method as the outer loop and an embedded estimate of the error."""
     s, _, _, b, bA, c = tableau_of(options)
@@ -317,14 +332,6 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     previous, trial = block(memory, s, n, PREVIOUS), block(memory, s, n, TRIAL)
     weights = memory[memory.size - s :]
     q_mid, v_mid, a_mid = vector(memory, s, n, Q_MID), vector(memory, s, n, V_MID), vector(memory, s, n, A_MID)
-    if memory[LAST_ACCEPTED] == 1.0:
-        memory[FRESH] = 0.0
-        if memory[HAS_TRIAL] == 1.0:
-            for j in range(s):
-                copy(trial[j], previous[j])
-            memory[H_PREVIOUS] = memory[H_TRIAL]
-            memory[HAS_PREVIOUS] = 1.0
-    memory[HAS_TRIAL] = 0.0
     if memory[PARTITION_NUMBER] != w.notes[GENERATION]:
         memory[HAS_JACOBIAN] = 0.0
         memory[PARTITION_NUMBER] = w.notes[GENERATION]
@@ -340,11 +347,11 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 v_mid[m] = v[m] + x * a[m]
             code = evaluate(f, w, t + x, q_mid, v_mid, options[INNER_TOL], a_mid)
             if code != DONE:
-                return code, np.inf
+                return Attempt(code, np.inf, 0.0)
             multipliers(f, w, t + x, q_mid, v_mid, a_mid, w.lam)
             code = derivatives_at(f, w, options, memory, s, t + x, q_mid, v_mid, a_mid)
             if code != DONE:
-                return code, np.inf
+                return Attempt(code, np.inf, 0.0)
             memory[HAS_JACOBIAN] = 1.0
             memory[FRESH] = 1.0
             memory[H_FACTORED] = 0.0
@@ -352,7 +359,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code = factor_systems(f, w, options, memory, s, h)
             if code != DONE:
                 memory[HAS_JACOBIAN] = 0.0
-                return code, np.inf
+                return Attempt(code, np.inf, 0.0)
         ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
         for j in range(s):
             if ratio <= FARTHEST:
@@ -363,7 +370,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code == DONE:
             break
         if memory[FRESH] == 1.0:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         memory[HAS_JACOBIAN] = 0.0
     for m in range(n):
         in_q = 0.0
@@ -373,14 +380,17 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             in_v += b[k] * trial[k, m]
         q1[m] = q[m] + h * v[m] + h * h * in_q
         v1[m] = v[m] + h * in_v
-    code = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
+    code, off = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _estimate(f, w, options, memory, h, tolerances, state, new_state, trial)
-        error = max(error, w.notes[DEPARTURE])
+        error = max(error, off)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[HAS_TRIAL] = 1.0
     memory[H_TRIAL] = h
-    return code, error
+    return Attempt(code, error, 0.0)
+
+
+NEWTON = Step(newton_step, settle_newton)

@@ -25,7 +25,6 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
 
 # places in `memory`: scalars, two series of q (ORDER + 1, n_q), then scratch, see arrays_of
 (
-    LAST_ACCEPTED,  # set by advance() after every attempt
     KNOWN,  # 1: there is a series about the state
     WHICH,  # of the two it is
     UNIT,  # of time, of the two series, s
@@ -40,7 +39,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     SUSPECTED,  # 1: a step was refused for the defect at the time SUSPECT, which no step has passed since
     SUSPECT,
     N_MEMORY_SCALARS,
-) = range(15)
+) = range(14)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:

@@ -22,16 +22,17 @@ from twoloop.kernels.control.defect import excess
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.common import (
     ATOL,
+    ATTEMPT,
     DEFECT,
-    DEPARTURE,
     DONE,
     ESTIMATE,
     GAP,
     N_OUTER,
     NEARLY_SINGULAR,
     RTOL,
-    STEP,
-    STEP_FACTOR,
+    SETTLE,
+    Attempt,
+    Step,
     compiled,
     kernel,
     merged,
@@ -42,7 +43,6 @@ from twoloop.kernels.steps.recurrences import (
     ATTEMPTS,
     KEEP,
     KNOWN,
-    LAST_ACCEPTED,
     LENGTH,
     NEXT_LENGTH,
     NEXT_UNIT,
@@ -66,15 +66,16 @@ ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a st
 LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
 NEAR_BEGIN = 1e-5  # of the step: no force changes within it
 GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly between 0 and 1
+BEYOND = 1e300  # in place of an infinite defect, where a function has no value within the step
 MOST_SHORTENED = 0.1  # a step that is refused for its defect
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
     """The linear solution of one order, for code made for a mechanism where its own factors do not serve."""
     solve_for_order(f, w, r, c, a, lam)
-    return DONE, 0.0
+    return Attempt(DONE, 0.0, 0.0)
 
 
 @merged
@@ -82,7 +83,7 @@ def _find_series(f, w, options, memory, t, state, unit, which, by_code):
     """The series about a state, into one of the two places; by f.own, code made for the mechanism, if there is."""
     memory[TARGET] = which
     if by_code:
-        code, _ = f.own(f, w, options, memory, t, unit, state, state, state)
+        code, _, _ = f.own(f, w, options, memory, t, unit, state, state, state)
         return code
     return expand(f, w, options, memory, t, state, unit)
 
@@ -192,6 +193,15 @@ def _shortened(defect, order):
     return max(MOST_SHORTENED, 0.9 * defect ** (-1.0 / order))
 
 
+@kernel(SETTLE)
+def settle_taylor(f, w, options, memory, tolerances, accepted):
+    """The series about the end of an accepted step is that about the beginning of the next."""
+    if accepted and memory[TRIED] == 1.0:
+        memory[WHICH] = 1.0 - memory[WHICH]
+        memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
+    memory[TRIED] = 0.0
+
+
 @merged
 def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
@@ -199,17 +209,13 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     w.counters[N_OUTER] += 1
-    if memory[TRIED] == 1.0 and memory[LAST_ACCEPTED] == 1.0:
-        memory[WHICH] = 1.0 - memory[WHICH]
-        memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
-    memory[TRIED] = 0.0
     if memory[KNOWN] == 0.0:
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
         if code == DONE:
             code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH], by_code)
         if code != DONE:
-            return code, np.inf
+            return Attempt(code, np.inf, 0.0)
         memory[KNOWN], memory[UNIT] = 1.0, h
         if estimated:
             memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
@@ -218,14 +224,12 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
         error = x / memory[LENGTH]  # larger than the estimate of the error, which is a power of it
-        if x > memory[LENGTH] * (1.0 + ROUNDING):
-            w.notes[STEP_FACTOR] = memory[LENGTH] / x
-            return DONE, max(error, 1.0 + ROUNDING)
+        if error > 1.0 + ROUNDING:
+            return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         checked = w.notes[NEARLY_SINGULAR] == 0.0
         if not checked and h > tolerances[GAP] * (1.0 + ROUNDING):
-            w.notes[STEP_FACTOR] = tolerances[GAP] / h
-            return DONE, 1.0 + ROUNDING
+            return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
         if checked:
             memory[ATTEMPTS] += 1.0
             if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
@@ -233,54 +237,56 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
             w.notes[DEFECT] = 0.0
             defect = _refused_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
-                w.notes[STEP_FACTOR] = _shortened(defect, order)
-                return DONE, 1.0 + ROUNDING
+                return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
     _evaluate(series, unit, order, x, q1, v1, found)
     keep_predicted(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     if options[KEEP] == 1.0:
         memory[PASSED] += h
-        return DONE, 0.0
-    w.notes[DEPARTURE] = departure(w, tolerances, h, q, v, q1)
-    if w.notes[DEPARTURE] > 0.0:
-        memory[SHORTER] = min(1.0, x / memory[LENGTH] * (ALLOWED / w.notes[DEPARTURE]) ** (1.0 / order))
-    if w.notes[DEPARTURE] > 1.0:
-        w.notes[STEP_FACTOR] = memory[SHORTER] * memory[LENGTH] / x
-        return DONE, w.notes[DEPARTURE]
+        return Attempt(DONE, 0.0, 0.0)
+    off = departure(w, tolerances, h, q, v, q1)
+    if off > 0.0:
+        memory[SHORTER] = min(1.0, x / memory[LENGTH] * (ALLOWED / off) ** (1.0 / order))
+    if off > 1.0:
+        return Attempt(DONE, off, memory[SHORTER] * memory[LENGTH] / x)
     if checked:
         defect = excess(tolerances, h, order, found, a1, q1, v1)
         if defect > 1.0:
             noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
             if not noise:
-                w.notes[STEP_FACTOR] = _shortened(defect, order)
-                return DONE, 1.0 + ROUNDING
+                return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
             _evaluate(series, unit, order, x, q1, v1, found)
             code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
             if code != DONE:
-                return code, np.inf
+                return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     series = series_of(memory, order, n, 1.0 - memory[WHICH])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
     code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH], by_code)
     if code != DONE:
-        return code, np.inf
+        return Attempt(code, np.inf, 0.0)
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
+    factor = 0.0
     if estimated:
         memory[NEXT_LENGTH] = _length(tolerances, series, unit, order, n)
         shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
-        w.notes[STEP_FACTOR] = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
-    return DONE, max(error, w.notes[DEPARTURE])
+        factor = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
+    return Attempt(DONE, max(error, off), factor)
 
 
-@kernel(STEP)
+@kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """The step with series found by their program."""
     return _step(f, w, options, memory, t, h, tolerances, state, new_state, False)
 
 
-@kernel(STEP, vectorized=True)
+@kernel(ATTEMPT, vectorized=True)
 def compiled_taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """The step with series found by f.own, code made for the mechanism; f.instead solves where its factors cannot."""
     return _step(f, w, options, memory, t, h, tolerances, state, new_state, True)
+
+
+TAYLOR = Step(taylor_step, settle_taylor)
+COMPILED_TAYLOR = Step(compiled_taylor_step, settle_taylor)
