@@ -16,7 +16,6 @@ from twoloop import ConstrainedSystem, Result, callback, mechanisms
 from twoloop.mechanisms import Problem
 from twoloop.methods import presets as methods
 from twoloop.methods import tableaux
-from twoloop.methods.bdf import BDF
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
 
