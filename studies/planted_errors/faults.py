@@ -254,7 +254,7 @@ def in_options() -> Iterator[Fault]:
     """The plan of a method: what its compiled step and the step-size control read."""
     from twoloop.kernels.steps import newmark_step as newmark
 
-    sound, double, pendulum = mechanisms.andrews(), mechanisms.double_pendulum(), mechanisms.projection_pendulum()
+    sound, pendulum = mechanisms.andrews(), mechanisms.projection_pendulum()
 
     def planned(owner: Any, **changed: Any) -> Callable[[], AbstractContextManager[Any]]:
         return _changed(owner, "plan", lambda plan: replace(plan, **changed))

@@ -8,7 +8,8 @@ this sign needs a prediction that is nearly exact, as short steps through a sing
 """
 
 from twoloop.kernels.algebra.factors import sign_of
-from twoloop.kernels.data.common import ATOL, DONE, ESTIMATE, ORIENTATION, ORIENTATION_NEW, RTOL, merged
+from twoloop.kernels.data.common import DONE, ESTIMATE, ORIENTATION, ORIENTATION_NEW, merged
+from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import restore
 
 SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
@@ -42,7 +43,7 @@ def departure(w, tolerances, h, q, v, q1):
     largest = 0.0
     for k in range(w.dependent.size):
         m = w.dependent[k]
-        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
+        scale = allowed(tolerances, m, q[m], q1[m])
         largest = max(largest, abs(w.predicted[k] - q1[m]) / max(min(scale, share * motion + floor * scale), LEAST))
     return largest
 

@@ -10,6 +10,7 @@ is the jump, in one of the halves, however short they are.
 import numpy as np
 
 from twoloop.kernels.data.common import ATOL, RTOL, compiled
+from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.constraints import constraint_rates
 
 PARTS = 12
@@ -69,7 +70,7 @@ def unexplained(tolerances, h, state, new_state, n):
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
-        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(v), abs(v1))
+        scale = allowed(tolerances, m, v, v1)
         largest = max(largest, abs(v1 - v - 0.5 * h * (a + a1)) / scale)
     return largest
 

@@ -12,7 +12,6 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import keep_predicted
 from twoloop.kernels.data.common import (
-    ATOL,
     ATTEMPT,
     DONE,
     ESTIMATE,
@@ -20,12 +19,12 @@ from twoloop.kernels.data.common import (
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
-    RTOL,
     SINGULAR,
     Attempt,
     Step,
     kernel,
 )
+from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, find_tangents, renew_partition
 from twoloop.kernels.steps.explicit_step import (
     COARSE,
@@ -81,7 +80,7 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     for k in range(w.dependent.size):
         m = w.dependent[k]
-        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
+        scale = allowed(tolerances, m, q[m], q1[m])
         error = max(error, abs(w.predicted[k] - q1[m]) / scale * tolerances[ESTIMATE])
     return Attempt(code, error, 0.0)
 

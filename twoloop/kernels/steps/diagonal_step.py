@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.common import (
-    ATOL,
     ATTEMPT,
     BANDWIDTH,
     DONE,
@@ -29,7 +28,6 @@ from twoloop.kernels.data.common import (
     GENERATION,
     N_OUTER,
     OUTER_DIVERGED,
-    RTOL,
     SETTLE,
     Attempt,
     Step,
@@ -38,6 +36,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
+from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, multipliers
 from twoloop.kernels.steps.iteration_matrix import factor_iteration, filter_by_iteration, solve_iteration
 from twoloop.kernels.steps.lasting import lasting_error
@@ -260,10 +259,10 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
     error = 0.0
     for i in range(count):
         j = w.independent[i]
-        scale = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
+        scale = allowed(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
         if options[PLACE + VELOCITIES] == 1.0:
-            scale = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
+            scale = allowed(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)

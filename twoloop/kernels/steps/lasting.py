@@ -7,7 +7,8 @@ matter are passed over.
 
 import numpy as np
 
-from twoloop.kernels.data.common import ATOL, RTOL, compiled
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.steps.newton_memory import LASTING
 
 # An error that turns back as slowly as the motion itself does is none of a vibration, and those of the next steps go
@@ -38,7 +39,7 @@ def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state):
     error = 0.0
     for i in range(count):
         j = w.independent[i]
-        scale_q = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))
-        scale_v = tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))
+        scale_q = allowed(tolerances, j, q[j], q1[j])
+        scale_v = allowed(tolerances, j, v[j], v1[j])
         error = max(error, abs(twice[i]) * min(lasting / scale_q, 1.0 / scale_v))
     return error

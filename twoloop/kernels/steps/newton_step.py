@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.common import (
-    ATOL,
     ATTEMPT,
     BANDWIDTH,
     DONE,
@@ -28,7 +27,6 @@ from twoloop.kernels.data.common import (
     LEAST,
     N_OUTER,
     OUTER_DIVERGED,
-    RTOL,
     SETTLE,
     Attempt,
     Step,
@@ -36,6 +34,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
+from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
 from twoloop.kernels.steps import newton_banded, newton_dense
 from twoloop.kernels.steps.lasting import lasting_error
@@ -288,9 +287,9 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     error = 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
-        error = max(error, abs(e_q[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(q[j]), abs(q1[j]))))
+        error = max(error, abs(e_q[i]) / allowed(tolerances, j, q[j], q1[j]))
         if options[place + VELOCITIES] == 1.0:
-            error = max(error, abs(e_v[i]) / (tolerances[ATOL + j] + tolerances[RTOL] * max(abs(v[j]), abs(v1[j]))))
+            error = max(error, abs(e_v[i]) / allowed(tolerances, j, v[j], v1[j]))
     if options[place + VELOCITIES] == 1.0:
         return error
     copy(e_v, once)

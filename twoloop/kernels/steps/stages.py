@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.data.common import ATOL, RTOL, compiled, inlined
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.tolerances import allowed
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 
@@ -91,8 +92,8 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
         error = h * max(width, missed)
         if missed < width:
             error *= (missed / width) ** (options[POWER] / (s - 1.0))
-        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(v[m]), abs(v1[m]))
+        scale = allowed(tolerances, m, v[m], v1[m])
         top = max(top, error / scale)
-        scale = tolerances[ATOL + m] + tolerances[RTOL] * max(abs(q[m]), abs(q1[m]))
+        scale = allowed(tolerances, m, q[m], q1[m])
         top = max(top, h * error / scale)
     return top
