@@ -6,7 +6,7 @@ accepted step.
 
 from twoloop.kernels.data.common import SETTLE, compiled, kernel, merged
 
-KEPT = 1.2  # with the trend, a factor from 1 to this leaves the step as it is: changes cost Newton's method factors
+KEPT = 1.2  # with the trend, a factor from 1 to this leaves the step as it is: new factors of Newton's matrix cost
 
 # places in a rule: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX; LEAST_ERROR is what a smaller
 # error counts as in the trend (Hairer & Wanner II, IV.8), 0: without the trend
