@@ -108,7 +108,7 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see SUDDEN
     N_CONTROL,
-) = range(N_RULE, N_RULE + 17)
+) = range(N_RULE, N_RULE + 16)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
