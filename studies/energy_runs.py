@@ -67,11 +67,9 @@ ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
 OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tight; quick: the first
     OWN_EXPLICIT: (1e-6, 1e-8, 1e-10, 1e-12),
     "Gauss12": (1e-5, 1e-7),
-    IDA_C: (1e-6, 1e-8, 1e-10),
-    **dict.fromkeys((HEYOKA, CVODE_C, DIFFRAX), (1e-6, 1e-8, 1e-10, 1e-12)),
-    IDAS: (1e-6, 1e-8, 1e-10),
-    LSODA: (1e-10,),
-    PROJECTED: (1e-7, 1e-9),
+    **dict.fromkeys((IDA_C, HEYOKA, CVODE_C, DIFFRAX, IDAS), (1e-6, 1e-8, 1e-10, 1e-12)),
+    LSODA: (1e-8, 1e-10, 1e-12),
+    PROJECTED: (1e-7, 1e-9, 1e-11),
     ALPHA: (0.01,),
     TRAPEZOIDAL: (0.02, 0.01),
 }
