@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from references.ablation import VARIANTS, solve_variant
 from studies import figures
-from studies.bench import Case, Run, Solver
+from studies.bench import REPEATS, Case, Run, Solver
 from studies.cases import beam, four_bar
 from studies.cli import StudyError
 from studies.metrics import violations
@@ -88,7 +88,7 @@ def runs(quick: bool) -> list[Run]:
                 for setting, group in (("tol", "controlled"), ("h", "fixed")):
                     one = solver(variant, tableau, setting)
                     drawn = setting == "tol" and tableau is SUN  # with their times
-                    repeats = 3 if drawn and not quick else 1
+                    repeats = REPEATS if drawn and not quick else 1
                     made += [Run(case, one, float(value), group, repeats) for value in values[setting]]
                 if name == LINKAGE:
                     short, one = replace(case, t_end=ORDER_END), solver(variant, tableau, "h")
