@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.expressions import Expressions, functions_of
+from references.nonholonomic import with_all_rows
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_size
 from twoloop.consistency import check_start
@@ -169,8 +170,9 @@ def solve_collocation(
         As `solve_idas`.
     """
     n_steps = check_size("n_steps", n_steps, 1)
-    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
+    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit, takes_velocity_rows=True)
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     ends = t0 + (t1 - t0) * np.unique(np.linspace(0, n_steps, min(OUTPUTS, n_steps) + 1).astype(int)) / n_steps
     options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps, "collocation_scheme": "legendre"}
     return _solved(system, "collocation", t0, ends[1:], ends, q0, v0, options, time_limit)
@@ -190,9 +192,10 @@ def _by_sundials(
     more: dict[str, str] | None = None,
 ) -> Result:
     check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     most_steps = check_size("most_steps", most_steps, 1)
     options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps}
     options |= more or {}

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.index1 import RightHandSide
+from references.nonholonomic import with_all_rows
 from references.ode import ADVICE, ode_result, output_times, states_at
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
@@ -72,9 +73,10 @@ def solve_cvode(
     """
     check_choice("method", method, METHODS)
     check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     try:
         from sksundae.cvode import CVODE
     except ImportError as error:

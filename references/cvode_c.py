@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.cvode_projection import projection_for_cvode
 from references.driver import TimeLimit, UserCall, check_choice, check_run, check_tolerances, longest_step, user_call
+from references.nonholonomic import with_all_rows
 from references.ode import ADVICE, ode_result, output_times
 from references.straight_line import straight_line, straight_line_jacobian
 from references.sundials import REAL, check, context, counted, flag_name, library, made
@@ -104,9 +105,10 @@ def solve_cvode_c(
     if projected and method != "BDF":
         raise ValueError(f"projected needs method 'BDF', with which alone CVODE projects; given {method!r}")
     check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     at, start = (system, t0, q0.tobytes(), v0.tobytes()), np.concatenate([q0, v0])
     jacobian = _jacobian(*at) if method == "BDF" else None
     functions = Functions(_right_hand_side(*at), jacobian, *_projection(system, projected, rtol, atol))

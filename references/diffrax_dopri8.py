@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, check_run, check_tolerances, user_call
 from references.expressions import Expressions, NotSymbolic, functions_of
+from references.nonholonomic import with_all_rows
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_size
 from twoloop.consistency import check_start
@@ -77,13 +78,14 @@ def solve_diffrax(
     """
     check_tolerances(rtol, atol)
     most_steps = check_size("most_steps", most_steps, 1)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = output_times(times, t0, t1)
     if system.n_q > LARGEST:
         raise NotSymbolic(
             f"system must have at most {LARGEST} coordinates for diffrax; {system.name!r} has {system.n_q}"
         )
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     solve = _compiled(system, t0, q0.tobytes(), v0.tobytes(), most_steps)
     start = np.concatenate([q0, v0])
 

@@ -141,13 +141,14 @@ def check_run(
     t_eval: ArrayLike | None,
     time_limit: float | None,
     step: float | None = None,
+    takes_velocity_rows: bool = False,
 ) -> tuple[float, float, Array, Array, Array | None]:
     """Return start, end, q0, v0 and output times, or say what is wrong with an argument of a run."""
     check_system(system)
-    if system.n_a > 0:
+    if system.n_a > 0 and not takes_velocity_rows:
         raise ValueError(
-            f"system must have constraints on positions only: the adapters of other solvers have no rows A v + b = 0; "
-            f"given {system.name!r} with n_a = {system.n_a}. Take solve_dae"
+            f"system must have constraints on positions only: this adapter has no rows A v + b = 0; "
+            f"given {system.name!r} with n_a = {system.n_a}. Take one of the accelerations, or solve_dae"
         )
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)

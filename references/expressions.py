@@ -10,7 +10,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from types import FunctionType, ModuleType, SimpleNamespace
+from types import CellType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -308,14 +308,16 @@ def _traced(function: Any, functions: Functions, done: dict[int, Any]) -> Callab
     plain = function.py_func
     names = inspect.getclosurevars(plain)
     scope: dict[str, Any] = {"__builtins__": builtins}
-    copy = FunctionType(plain.__code__, scope, plain.__name__, plain.__defaults__, plain.__closure__)
-    done[id(function)] = copy
-    for name, value in names.globals.items():
+
+    def on_symbols(value: Any) -> Any:
         if isinstance(value, Dispatcher):
-            value = _traced(value, functions, done)
-        elif isinstance(value, ModuleType) and value in (math, np):
-            value = _Mathematics(value, functions)
-        scope[name] = value
+            return _traced(value, functions, done)
+        return _Mathematics(value, functions) if isinstance(value, ModuleType) and value in (math, np) else value
+
+    cells = tuple(CellType(on_symbols(names.nonlocals[name])) for name in plain.__code__.co_freevars)
+    copy = FunctionType(plain.__code__, scope, plain.__name__, plain.__defaults__, cells)
+    done[id(function)] = copy
+    scope |= {name: on_symbols(value) for name, value in names.globals.items()}
     return copy
 
 

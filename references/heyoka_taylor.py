@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import TimeLimit, check_run, longest_step, user_call
 from references.expressions import Expressions, functions_of
+from references.nonholonomic import with_all_rows
 from references.ode import ADVICE, ode_result, output_times
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
@@ -77,9 +78,10 @@ def solve_heyoka(
         If heyoka is not installed.
     """
     check_positive("tol", tol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = output_times(times, t0, t1)
     check_start(system, t0, q0, v0, derivatives=False)
+    system = with_all_rows(system)
     integrator, outcomes = _integrator(system, t0, q0.tobytes(), v0.tobytes(), float(tol))
     start = np.concatenate([q0, v0])
 

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from references.accelerations import compiled_gamma
 from references.driver import TimeLimit, check_choice, check_run, check_tolerances, longest_step, user_call
 from references.ida_options import (
+    ALL,
     HIGHEST_ORDER,
     NOT_TESTED,
     check_options,
@@ -27,6 +28,7 @@ from references.ida_options import (
     own_tangent,
     tolerances,
 )
+from references.nonholonomic import with_all_rows
 from references.ode import states_at
 from twoloop.callbacks import stand_in
 from twoloop.consistency import check_start
@@ -85,7 +87,8 @@ def solve_ida(
         "index1": unknowns q, v, lam; q' = v, M v' + C_q^T lam = Q, C_q v' = Q_d. Drifts off the constraints.
 
         "stabilised": Gear, Gupta and Leimkuhler (1985) with the multipliers as time derivatives of further unknowns
-        Lam, Mu; q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0.
+        Lam, Mu; q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. Rows A v + b = 0 stand below
+        C_q v + C_t = 0; their Mu is zero.
     rtol, atol : float
         IDA's tolerances for q, v (and Lam, Mu in the stabilised form). At a given tolerance the error at the end
         scatters by a factor of 2 to 24 (15 runs) with rounding alone, which changes IDA's choice of steps and orders.
@@ -121,8 +124,9 @@ def solve_ida(
     check_choice("form", form, FORMS)
     check_tolerances(rtol, atol)
     max_order = check_options(max_order, error_test)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     check_start(system, t0, q0, v0)
+    positions, system = system.n_c if system.n_a else ALL, with_all_rows(system)
 
     size = 2 * system.n_q + _n_multipliers(system, form)
     absolute = tolerances(system, size, error_test, float(atol))
@@ -138,7 +142,7 @@ def solve_ida(
         "max_step": longest_step(max_step, t1 - t0),
         "max_num_steps": 10**9,  # per output time
     }
-    compiled = compiled_residual(system, form)
+    compiled = compiled_residual(system, form, positions)
     solver = _solver(system, compiled, options, limit)
     with redirect_stdout(said), user_call as clock:
         if times is None:
@@ -163,9 +167,14 @@ def _solver(
     return sksundae.ida.IDA(residual, jacfn=jacobian, **options)
 
 
-def compiled_residual(system: ConstrainedSystem, form: str) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Residual (t, y, y', res, n_q, n_c, p) and dF/dy + cj dF/dy' (t, y, y', cj, JJ, n_q, n_c, p) of a form."""
-    return _compiled(form, *system.functions[:5], compiled_gamma(system), own_tangent(system))
+def compiled_residual(
+    system: ConstrainedSystem, form: str, positions: int = ALL
+) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Residual (t, y, y', res, n_q, n_c, p) and dF/dy + cj dF/dy' (t, y, y', cj, JJ, n_q, n_c, p) of a form.
+
+    `positions`: how many rows are of C; those below are of A v + b = 0, and Mu of these is zero.
+    """
+    return _compiled(form, positions, *system.functions[:5], compiled_gamma(system), own_tangent(system))
 
 
 def compiled_rates(system: ConstrainedSystem) -> Callable[..., None]:
@@ -282,6 +291,7 @@ def _result(
 @lru_cache(maxsize=64)
 def _compiled(
     form: str,
+    positions: int,
     mass: Dispatcher,
     force: Dispatcher,
     constraint: Dispatcher,
@@ -299,11 +309,11 @@ def _compiled(
     def with_force(force: Dispatcher) -> Callable[..., None]:
         if form == "index1":
             return _index1_residual(mass, force, jacobian, gamma)
-        return _stabilised_residual(mass, force, constraint, jacobian, constraint_rate)
+        return _stabilised_residual(positions, mass, force, constraint, jacobian, constraint_rate)
 
     residual = with_force(force)
     differenced = residual if tangent is None else with_force(no_force)
-    return residual, _iteration_matrix(differenced, mass, jacobian, tangent, form == "index1")
+    return residual, _iteration_matrix(positions, differenced, mass, jacobian, tangent, form == "index1")
 
 
 def _index1_residual(
@@ -334,7 +344,12 @@ def _index1_residual(
 
 
 def _stabilised_residual(
-    mass: Dispatcher, force: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
+    positions: int,
+    mass: Dispatcher,
+    force: Dispatcher,
+    constraint: Dispatcher,
+    jacobian: Dispatcher,
+    constraint_rate: Dispatcher,
 ) -> Callable[..., None]:
     """Residual of the form "stabilised" at y = [q, v, Lam, Mu]."""
 
@@ -353,7 +368,7 @@ def _stabilised_residual(
             for j in range(n):
                 res[n + i] += M[i, j] * a[j]
         for k in range(m):
-            res[2 * n + k] = C[k]
+            res[2 * n + k] = C[k] if k < positions else y[2 * n + m + k]
             res[2 * n + m + k] = Ct[k]
             for i in range(n):
                 res[2 * n + m + k] += Cq[k, i] * v[i]
@@ -364,6 +379,7 @@ def _stabilised_residual(
 
 
 def _iteration_matrix(
+    positions: int,
     differenced: Callable[..., None],
     mass: Dispatcher,
     jacobian: Dispatcher,
@@ -409,5 +425,7 @@ def _iteration_matrix(
                 else:
                     JJ[n + i, 2 * n + k] = cj * Cq[k, i]
                     JJ[i, 2 * n + m + k] = cj * Cq[k, i]
+        for k in range(positions, m if not index1 else 0):
+            JJ[2 * n + k, 2 * n + m + k] = 1.0
 
     return iteration_matrix  # type: ignore[no-any-return]

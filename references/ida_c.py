@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from references.accelerations import accelerations
 from references.driver import TimeLimit, check_run, check_system, check_tolerances, longest_step, user_call
 from references.ida_compiled import compiled_for_ida
-from references.ida_options import HIGHEST_ORDER, check_options, own_tangent, tolerances
+from references.ida_options import ALL, HIGHEST_ORDER, check_options, own_tangent, tolerances
+from references.nonholonomic import with_all_rows
 from references.sundials import REAL, check, context, counted, flag_name, library, made
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -112,14 +113,16 @@ def solve_ida_c(
         )
     check_tolerances(rtol, atol)
     max_order = check_options(max_order, error_test)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     times = np.linspace(t0, t1, OUTPUTS) if times is None else times
     check_start(system, t0, q0, v0)
+    positions, system = system.n_c if system.n_a else ALL, with_all_rows(system)
 
     sundials, state = library(), _start(system, t0, q0, v0)
     absolute = tolerances(system, state.size // 2, error_test, float(atol))
     start, longest = state.copy(), longest_step(max_step, t1 - t0)
-    with _integrator(sundials, system, t0, t1, state, float(rtol), absolute, max_order, longest) as solver:
+    span = t0, t1
+    with _integrator(sundials, system, positions, span, state, float(rtol), absolute, max_order, longest) as solver:
         limit = TimeLimit(time_limit)
         with user_call as clock:  # of one who keeps the memory
             check("IDAReInit", sundials.IDAReInit(solver[0], t0, *solver[1:]))
@@ -153,8 +156,8 @@ def _start(system: ConstrainedSystem, t0: float, q: Array, v: Array) -> Array:
 def _integrator(
     sundials: SimpleNamespace,
     system: ConstrainedSystem,
-    t0: float,
-    t1: float,
+    positions: int,
+    span: tuple[float, float],
     state: Array,
     rtol: float,
     atol: Array,
@@ -162,9 +165,9 @@ def _integrator(
     longest: float,
 ) -> Iterator[tuple[Any, Any, Any]]:
     """IDA's memory and its vectors y and y', which are the halves of `state`; all is freed at the end."""
-    f, n = system.functions, state.size // 2
-    sizes = system.n_q, system.n_c, f.p.size
-    residual, jacobian, size = compiled_for_ida(*f[:5], *sizes, system.constant_mass, own_tangent(system))
+    (t0, t1), f, n = span, system.functions, state.size // 2
+    sizes, tangent = (system.n_q, system.n_c, f.p.size), own_tangent(system)
+    residual, jacobian, size = compiled_for_ida(*f[:5], *sizes, system.constant_mass, tangent, positions)
     data = np.zeros(size)
     data[: f.p.size] = f.p
     data[f.p.size : f.p.size + system.n_q**2] = system.mass(t0, state[: system.n_q]).ravel()

@@ -8,7 +8,7 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
 
-from references.ida_options import no_force
+from references.ida_options import ALL, no_force
 from references.sundials import library
 from twoloop.callbacks import stand_in
 
@@ -31,6 +31,7 @@ def compiled_for_ida(
     n_p: int,
     constant_mass: bool,
     tangent: Dispatcher | None,
+    positions: int,
 ) -> tuple[Any, Any, int]:
     """IDA's residual and Jacobian functions, and the number of floats that their user data must hold.
 
@@ -43,8 +44,8 @@ def compiled_for_ida(
     array_of = library().N_VGetArrayPointer
     matrix_of = library().SUNDenseMatrix_Data
     functions = mass, force, constraint, jacobian, constraint_rate
-    residual = residual_at(*functions, n, m, constant_mass)
-    iteration_matrix = iteration_matrix_at(*functions, n, m, constant_mass, tangent)
+    residual = residual_at(*functions, n, m, constant_mass, positions)
+    iteration_matrix = iteration_matrix_at(*functions, n, m, constant_mass, tangent, positions)
 
     @njit(**_OPTIONS)
     def vector(pointer):  # type: ignore[no-untyped-def]
@@ -90,8 +91,12 @@ def residual_at(
     n: int,
     m: int,
     constant_mass: bool,
+    positions: int = ALL,
 ) -> Callable[..., None]:
-    """(t, y, y', p, M, Cq, res) -> None: the residual at y = [q, v, Lam, Mu]; M and C_q are left as they are at q."""
+    """(t, y, y', p, M, Cq, res) -> None: the residual at y = [q, v, Lam, Mu]; M and C_q are left as they are at q.
+
+    `positions`: how many rows are of C; those below are of A v + b = 0, and Mu of these is zero.
+    """
 
     @njit(**_OPTIONS)
     def residual(t, y, yp, p, M, Cq, res):  # type: ignore[no-untyped-def]
@@ -118,6 +123,8 @@ def residual_at(
                 res[n + i] += Cq[k, i] * lam
                 rate += Cq[k, i] * v[i]
             res[2 * n + m + k] = rate
+        for k in range(positions, m):
+            res[2 * n + k] = y[2 * n + m + k]
 
     return residual  # type: ignore[no-any-return]
 
@@ -132,6 +139,7 @@ def iteration_matrix_at(
     m: int,
     constant_mass: bool,
     tangent: Dispatcher | None,
+    positions: int = ALL,
 ) -> Callable[..., None]:
     """(t, cj, y, y', p, M, Cq, K, moved, here, there, J) -> None: dF/dy + cj dF/dy', J[j] its column j.
 
@@ -140,7 +148,7 @@ def iteration_matrix_at(
     exact = tangent is not None
     add_tangent = stand_in("force_by_q") if tangent is None else tangent
     differenced = residual_at(
-        mass, no_force if exact else force, constraint, jacobian, constraint_rate, n, m, constant_mass
+        mass, no_force if exact else force, constraint, jacobian, constraint_rate, n, m, constant_mass, positions
     )
 
     @njit(**_OPTIONS)
@@ -160,7 +168,9 @@ def iteration_matrix_at(
                 J[n + j, 2 * n + m + k] = Cq[k, j]
                 J[2 * n + k, n + j] = cj * Cq[k, j]
                 J[2 * n + m + k, j] = cj * Cq[k, j]
-                J[j, 2 * n + k] = Cq[k, j]
+                J[j, 2 * n + k] = Cq[k, j] if k < positions else 0.0
+        for k in range(positions, m):
+            J[2 * n + m + k, 2 * n + k] = 1.0
         if not exact:
             here_Q[:] = 0.0
             force(t, q, v, p, here_Q)

@@ -27,6 +27,7 @@ ERROR_TESTS = {
     "states": "coordinates and velocities, not the integrals of the multipliers",
     "positions": "coordinates only",
 }
+ALL = 10**9  # rows that are of C: there are none of A v + b = 0 below
 HIGHEST_ORDER = 5  # of IDA
 
 # keyword arguments of both drivers, by name: IDA as it comes, and as it is cheapest on stiff beams

@@ -26,6 +26,7 @@ from references.driver import (
     user_call,
 )
 from references.expressions import NotSymbolic
+from references.nonholonomic import with_all_rows
 from references.straight_line import straight_line_jacobian
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
@@ -128,8 +129,9 @@ def solve_index1(
     """
     _check_choices(method, stabilisation, alpha)
     check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit)
+    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
     check_start(system, t0, q0, v0)
+    system = with_all_rows(system)
     solver_type = METHODS[method] if method in METHODS else _pair(method)
 
     strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0

@@ -2,10 +2,10 @@
 
 A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit at two settings
 running (a loose one may take longer than the next), has failed at two tolerances running after one that ended, or has
-taken more than `FAR` times as long as the fastest so far for no smaller an error, at two settings running. Where two of
-its errors lie more than a decade apart it is asked between them, so that nothing need be interpolated over more, and
-beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes `OUTCLASSED`
-times as long as another of its side is not repeated. A part of `studies.work_precision`.
+taken more than `FAR` times as long as the fastest of its side, ours or others', so far for no smaller an error, at two
+settings running. Where two of its errors lie more than a decade apart it is asked between them, so that nothing need be
+interpolated over more, and beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes
+`OUTCLASSED` times as long as another of its side is not repeated. A part of `studies.work_precision`.
 """
 
 import itertools
@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from studies import headline
 from studies.bench import NOTHING_RUN, Run
 from studies.store import KeptRows, Row
 from studies.tables import DECADE, LOOSEST, NEAR, TIGHTEST
@@ -23,12 +24,15 @@ FAR = 20.0
 RUNNING = 2
 ROUNDS = 4  # of asking between settings
 OUTCLASSED = 10.0  # times the least time of its side: such a run decides nothing, and is made once
-CLOSE = 5.0  # times the time of the fastest: what costs more is not asked between its settings
+CLOSE = 5.0  # times the time of the fastest of its side: what costs more is not asked between its settings
 ENDING = (*NOTHING_RUN, "RAISED")
 FEWEST_STEPS, MOST_STEPS = 10, 10**6  # of a solver of fixed steps, beyond its grid
 COARSER = 10.0**0.5  # of steps where a tolerance changes by a decade
 
+ALWAYS = (headline.DEFAULT, headline.OWN_CODE)  # what a user gets is asked for all accuracies
+
 Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
+Side = tuple[str, bool]  # a mechanism, and whether the solver is ours
 
 
 class _Progress:
@@ -38,7 +42,7 @@ class _Progress:
         self.ended, self.reached, self.failed, self.far, self.stopped = False, False, 0, 0, 0
 
     def judge(self, row: Row, fastest: float | None, all_asked: bool, tolerances: bool) -> None:
-        """Take a first repetition into account; `fastest`: the least time so far for no larger an error."""
+        """Take a first repetition into account; `fastest`: the least time of its side so far for no larger an error."""
         self.reached = self.reached or row["error_q"] is not None
         self.failed = self.failed + 1 if row["error_q"] is None and self.reached else 0
         self.stopped = self.stopped + 1 if row["status"] == "TIME_LIMIT" else 0
@@ -54,6 +58,7 @@ def collect(
     make: Callable[[Run, int, Built], Row],
     all_asked: Callable[[Run], bool] = lambda run: False,
     errors: Sequence[float] = (),
+    always_repeated: Callable[[Run], bool] = lambda run: False,
 ) -> pd.DataFrame:
     """Rows of all runs that are of use, the repetitions interleaved.
 
@@ -67,7 +72,10 @@ def collect(
     all_asked : callable, optional
         all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
     errors : sequence of float, optional
-        The accuracies that are compared, for which solvers that are not far behind are asked between their settings.
+        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, and
+        those of ALWAYS, are asked between their settings.
+    always_repeated : callable, optional
+        always_repeated(run): repeated, however far behind, as its time is compared with that of another such run.
 
     Returns
     -------
@@ -76,13 +84,13 @@ def collect(
     """
     built: Built = set()
     progress: dict[tuple[str, str], _Progress] = {}
-    reached: dict[str, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
+    reached: dict[Side, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
     todo = list(todo)
 
     def first(run: Run) -> None:
         if run.key(0) not in kept:
             kept.add(run.key(0), make(run, 0, built))
-        row, runs = kept[run.key(0)], reached.setdefault(run.case.name, [])
+        row, runs = kept[run.key(0)], reached.setdefault(_side(run), [])
         good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
         who = progress.setdefault((run.case.name, run.solver.name), _Progress())
         who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
@@ -98,13 +106,17 @@ def collect(
         for run in more:
             first(run)
         todo += more
-    again = _repeated(todo, kept)
+    again = _repeated(todo, kept, always_repeated)
     for repeat in range(1, max((run.repeats for run in todo), default=0)):
         for run in again:
             if repeat < run.repeats and run.key(repeat) not in kept:
                 kept.add(run.key(repeat), make(run, repeat, built))
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
+
+
+def _side(run: Run) -> Side:
+    return run.case.name, run.solver.family == "two-loop"
 
 
 def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
@@ -115,7 +127,7 @@ def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
 
 
 def between(
-    own: Sequence[Run], kept: KeptRows, reached: Mapping[str, Sequence[tuple[float, float]]], errors: Sequence[float]
+    own: Sequence[Run], kept: KeptRows, reached: Mapping[Side, Sequence[tuple[float, float]]], errors: Sequence[float]
 ) -> list[Run]:
     """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
     rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
@@ -124,9 +136,10 @@ def between(
         return []
     error = {value: max(float(rows[value]["error_q"]), float(rows[value].get("floor") or 0.0)) for value in made}
     fastest = [
-        min((cpu for each, cpu in reached[own[0].case.name] if each <= error[value]), default=np.inf) for value in made
+        min((cpu for each, cpu in reached[_side(own[0])] if each <= error[value]), default=np.inf) for value in made
     ]
-    close = {value: rows[value]["call_s"] <= CLOSE * least for value, least in zip(made, fastest, strict=True)}
+    limit = np.inf if own[0].solver.name in ALWAYS else CLOSE
+    close = {value: rows[value]["call_s"] <= limit * least for value, least in zip(made, fastest, strict=True)}
     asked = []
     for loose, tight in itertools.pairwise(made):
         apart, inside = error[loose] / error[tight], any(error[tight] < each < error[loose] for each in errors)
@@ -139,7 +152,7 @@ def between(
 
 def _tidy(run: Run, value: float) -> float:
     """The nearest tolerance of two digits, or the nearest step of which the motion takes a whole number."""
-    return float(f"{value:.2g}") if run.solver.setting == "tol" else run.case.t_end / round(run.case.t_end / value)
+    return run.case.t_end / round(run.case.t_end / value) if run.solver.setting == "h" else float(f"{value:.2g}")
 
 
 def _beyond(
@@ -156,34 +169,33 @@ def _beyond(
     """
     first, last, asked = made[0], made[-1], []
     loosest, tightest, decade = LOOSEST, TIGHTEST, DECADE
-    if run.solver.setting != "tol":
+    if run.solver.setting == "h":
         loosest, tightest, decade = run.case.t_end / FEWEST_STEPS, run.case.t_end / MOST_STEPS, COARSER
     if error[first] < max(errors) / DECADE and close[first]:
         failed = [value for value in tried if value > first]
         if not failed and first < loosest:
             asked.append(min(loosest, decade * first))
-        elif run.solver.setting != "tol" and failed and failed[0] / first > NEAR:
+        elif run.solver.setting == "h" and failed and failed[0] / first > NEAR:
             asked.append(float(np.sqrt(first * failed[0])))
     if last == tried[0] and error[last] > min(errors) and last > tightest and close[last]:
         asked.append(max(tightest, last / decade))
     return asked
 
 
-def _repeated(todo: Sequence[Run], kept: KeptRows) -> list[Run]:
+def _repeated(todo: Sequence[Run], kept: KeptRows, always: Callable[[Run], bool]) -> list[Run]:
     """The runs that are repeated: those that were made and ended, and whose times may decide who is the fastest.
 
     These are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error.
     """
-    sides: dict[tuple[str, bool], list[tuple[float, float, Run]]] = {}
+    sides: dict[Side, list[tuple[float, float, Run]]] = {}
     for run in todo:
         if run.key(0) in kept and (row := kept[run.key(0)])["error_q"] is not None:
-            side = run.case.name, run.solver.family == "two-loop"
-            sides.setdefault(side, []).append((row["error_q"], row["call_s"] or 0.0, run))
+            sides.setdefault(_side(run), []).append((row["error_q"], row["call_s"] or 0.0, run))
     found = set()
     for ended in sides.values():
         least = np.inf
         for _, seconds, run in sorted(ended, key=lambda each: each[:2]):
             least = min(least, seconds)
-            if seconds <= OUTCLASSED * least:
+            if seconds <= OUTCLASSED * least or always(run):
                 found.add(run.key(0))
     return [run for run in todo if run.key(0) in found]

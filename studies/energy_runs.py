@@ -185,7 +185,8 @@ def runs(quick: bool) -> Iterator[Run]:
 def measure(run: Run, result: Result) -> dict[str, Any]:
     """What the energy of a run does: slope and swing, and the windows that a figure shows."""
     case, problem = run.case, run.case.problem
-    row: dict[str, Any] = {"t_reached": float(result.t[-1]), "kinetic": case.scale.kinetic, "series": {}}
+    reached = float(result.t[-1]) if result.t.size else 0.0  # a run that fails at once has no output
+    row: dict[str, Any] = {"t_reached": reached, "kinetic": case.scale.kinetic, "series": {}}
     row |= dict.fromkeys(("slope", "slope_error", "swing"))
     if not result.success:
         return row

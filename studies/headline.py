@@ -88,8 +88,9 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     -------
     dict
         case, t_end, errors, first_at (tolerance of the first calls, None without them), and lines: name, first_s or
-        None, and at each error solver, call_s, keeps (the constraints) and from_python, or in their place why there is
-        none: "not run", "not reached", "not asked".
+        None, and at each error solver, call_s, inside_s (of it inside the integrator, of the cheapest run that is good
+        enough), keeps (the constraints) and from_python, or in their place why there is none: "not run", "not
+        reached", "not asked".
     """
     rows = rows[rows["case"] == case]
     if rows.empty:
@@ -111,9 +112,10 @@ def _priced(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     by_solver = [(tables.time_for(own, error), str(name)) for name, own in runs.groupby("solver")]
     best = min(((time, name) for time, name in by_solver if time == time), default=None)  # not NaN
     if best is not None:
-        line = runs[runs["solver"] == best[1]].iloc[0]
+        own = runs[runs["solver"] == best[1]]
+        line = own.loc[own["call_s"].where(own["error_q"] <= error).astype(float).idxmin()]
         told = {"keeps": bool(line["keeps_constraints"]), "from_python": bool(line["called_from"] == "Python")}
-        return {"solver": best[1], "call_s": float(best[0]), "why": None} | told
+        return {"solver": best[1], "call_s": float(best[0]), "inside_s": float(line["inside_s"]), "why": None} | told
     put = tables.put(runs)
     missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
     why = "not run" if put.empty else "not reached" if missed else "not asked"

@@ -326,15 +326,26 @@ def told(counts: dict[str, int] | None) -> str:
     return "/".join(str(counts[what]) for what in (SILENT, SAID, RIGHT)) if counts and counts["n"] else "–"
 
 
+def of_solvers(parts: Sequence[dict[str, dict[str, Any]]]) -> list[list[str]]:
+    """Lines of the table of solvers under forces, those that are always right in one."""
+    lines, always = [], []
+    for name in parts[0]:
+        counts = [part.get(name) for part in parts]
+        if all(each is None or each["n"] == each[RIGHT] for each in counts):
+            always.append(name.replace(OURS, ""))
+        else:
+            lines.append([name.replace(OURS, ""), *map(told, counts)])
+    return [*lines, [", ".join(always), *["all right"] * len(parts)]] if always else lines
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings, figure and report."""
     found = findings_of(rows)
     output.save_findings(found)
     figures.save(honesty_picture.picture(found["totals"], PARTS), output, "honesty")
     alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
-    limited = [name for name in found["solvers"] if name.endswith(LIMITED)]
-    as_they_come = [name for name in found["solvers"] if name not in limited]
-    ready = {"cells": outcomes(found, as_they_come, alike), "limited": outcomes(found, limited, alike)}
+    as_they_come = [name for name in found["solvers"] if not name.endswith(LIMITED)]
+    ready = {"cells": outcomes(found, as_they_come, alike)}
     ready["input"] = outcomes(found["input"], found["input"]["solvers"], set())
     both = found["forces"], found["held_out"]
     whose = {"ours": "ours", "others": "others", "limited": "others, max_step"}
@@ -347,8 +358,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
         ],
     )
     by_solver = [{each["solver"]: each for each in part["solvers"]} for part in both]
-    lines = [[name.replace(OURS, ""), *(told(part.get(name)) for part in by_solver)] for name in by_solver[0]]
-    ready["solvers"] = table(["solver", "first set", "held out"], lines)
+    ready["solvers"] = table(["solver", "first set", "held out"], of_solvers(by_solver))
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 

@@ -15,7 +15,6 @@ from references.minimal import MAKE
 from studies import adaptive, headline, rivals, tables
 from studies.bench import REPEATS, Run
 from studies.end_states import case_of
-from studies.render import number
 from studies.solvers import CATALOGUE, MINIMAL
 from studies.store import KeptRows
 
@@ -84,13 +83,13 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))
 
 
-def lines(found: dict[str, Any]) -> Iterator[list[str]]:
-    """Of the table: mechanism, and at each error the ratios of `auto`, compiled, our best and the fastest rival."""
+def lines(found: dict[str, Any], error: float = rivals.IN_TABLE) -> Iterator[list[str]]:
+    """Of the table: mechanism, and at an error the ratios of `auto`, compiled, our best and the fastest rival."""
     for each in found["mechanisms"]:
-        yield [each["case"], *(" · ".join(_ratio(side) for side in at["standing"].values()) for at in each["at"])]
+        standing = next(at["standing"] for at in each["at"] if at["error"] == error)
+        yield [each["case"], *(_ratio(side) for side in standing.values())]
 
 
 def _ratio(side: dict[str, Any]) -> str:
     """Bold: slower than in minimal coordinates; in brackets: undecided; a dash where one of the two is not there."""
-    text = "–" if side["ratio"] is None else number(side["ratio"])
-    return {"behind": f"**{text}**", "undecided": f"({text})"}.get(side["verdict"], text)
+    return "–" if side["ratio"] is None else rivals.cell(side)

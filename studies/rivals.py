@@ -31,7 +31,7 @@ from twoloop.mechanisms import Problem, Reference
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
 SHOWN = DECADES[::2]  # at which the four-bars are judged
-IN_TABLE = DECADES[::3]
+IN_TABLE = 1e-6  # the error in the tables of all mechanisms
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
 AHEAD = {"heyoka": 2.0, "python": 8.0, "compiled": 4.0}  # aimed at on the four-bars, by kind of rival
 HEADLINE = "four-bar"
@@ -217,21 +217,19 @@ def _goal(compared: list[dict[str, Any]], wanted: float) -> str:
     return f"{text}, missed" + ("" if len(missed) == len(ratios) else f" at {', '.join(missed)}")
 
 
-def lines(found: dict[str, Any]) -> Iterator[list[Any]]:
-    """Of the table of ratios: mechanism, ratios at each error shown; those that ours alone reach are left out."""
+def lines(found: dict[str, Any], error: float = IN_TABLE) -> Iterator[list[Any]]:
+    """Of the table of ratios: mechanism, then default, compiled default and best of ours at an error.
+
+    Mechanisms that ours alone reach are left out.
+    """
     for each in found["mechanisms"]:
         if each["case"] not in found["alone"]:
-            ratios = {at["error"]: at for at in each["at"]}
-            yield [each["case"], *(_cell(ratios[error]) for error in IN_TABLE)]
+            standing = next(at["standing"] for at in each["at"] if at["error"] == error)
+            yield [each["case"], *(cell(side) for side in standing.values())]
 
 
-def _cell(at: dict[str, Any]) -> str:
-    """Ratios of default, compiled default and best of ours; bold: behind, in brackets: undecided."""
-    cells = [_standing(at["standing"][name]) for name in at["standing"]]
-    return cells[0] if len(set(cells)) == 1 else " · ".join(cells)
-
-
-def _standing(found: dict[str, Any]) -> str:
+def cell(found: dict[str, Any]) -> str:
+    """A ratio: bold if ours is behind, in brackets where it is undecided; or who gets there."""
     if found["ratio"] is None:
         return {"alone": "ours", "unasked": "ours", "missed": "others", "none": "–"}[found["verdict"]]
     text = number(found["ratio"])

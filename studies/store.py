@@ -108,9 +108,9 @@ class Output:
         return path
 
     def write(self, name: str, content: str | bytes) -> Path:
-        """Write a file, whole or not at all."""
+        """Write a file, whole or not at all; paths that a text has within the project stand as from its folder."""
         path = self.file(name)
-        data = content.encode() if isinstance(content, str) else content
+        data = content.replace(f"{ROOT}/", "").encode() if isinstance(content, str) else content
         handle, new = tempfile.mkstemp(dir=self.path, prefix=f".{name}.")
         try:
             with os.fdopen(handle, "wb") as stream:
@@ -125,8 +125,10 @@ class Output:
         return path
 
     def save_rows(self, rows: pd.DataFrame, line: str) -> None:
-        """Write NAME.csv; its first line says study, quick or full, and the stamp `line`."""
-        self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False)}")
+        """Write NAME.csv, numbers to ten digits; its first line says study, quick or full, and the stamp `line`."""
+        self.write(
+            f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False, float_format='%.10g')}"
+        )
 
     def load_rows(self) -> tuple[pd.DataFrame, str]:
         """Read what `save_rows` wrote, and its stamp.

@@ -10,16 +10,20 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from studies import figures, study, tables
-from studies.bench import REPEATS, Case, Run, Solver, collect
+from studies import adaptive, figures, study, tables
+from studies.bench import REPEATS, Case, Run, Solver, collect, row_of
 from studies.cases import four_bar
 from studies.cli import StudyError
+from studies.headline import OWN_CODE
 from studies.metrics import ASTRAY, LOST
 from studies.render import number, power, render, table
 from studies.solvers import (
     ADAMS,
     CATALOGUE,
+    CVODE_C,
+    DEFAULT,
     ERR_IN,
+    HEYOKA,
     IDA_C,
     IDA_FORMS,
     IRK,
@@ -31,7 +35,7 @@ from studies.solvers import (
     paper_irk_at,
     paper_newmark_at,
 )
-from studies.store import Output
+from studies.store import Output, Row
 from studies.table3_causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, causes, machine, printed, reading_runs
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.tableaux import gauss
@@ -40,13 +44,14 @@ TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
 EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
 OTHERS = (
-    *("SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C, "IDA, stabilised"),
-    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+    *(DEFAULT, OWN_CODE, "SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR),
+    *(HEYOKA, CVODE_C, IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
 )
-COMPILED = ("IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")  # for seconds: no quick runs
-DRAWN = (NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, ADAMS, TAYLOR, IDA_C)
-LISTED = (*(name for name in DRAWN if name != ADAMS), "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
+# for seconds: no quick runs
+COMPILED = (OWN_CODE, HEYOKA, CVODE_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")
+DRAWN = (DEFAULT, NEWMARK, IRK_LINE, "SunRadau5", OWN_EXPLICIT, TAYLOR, HEYOKA, CVODE_C, IDA_C)
+LISTED = (*DRAWN, "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
@@ -87,9 +92,19 @@ def make(output: Output) -> pd.DataFrame:
     def highest(run: Run, result: Result) -> dict[str, float]:
         return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
 
-    first, second = four_bar.cases(output.call.quick)
+    def row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+        return row_of(run, repeat, highest, built)
+
+    def ours(run: Run) -> bool:
+        return run.solver.family == "two-loop"
+
+    quick = output.call.quick
+    todo = runs(*four_bar.cases(quick), quick)
+    compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
-        return collect(runs(first, second, output.call.quick), kept, highest)
+        rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
+        more = adaptive.collect(compared, kept, row, lambda run: True, () if quick else TARGETS, ours)
+    return pd.concat([rows, more], ignore_index=True)
 
 
 def grid(rows: pd.DataFrame, group: str) -> str:

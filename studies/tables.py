@@ -72,8 +72,8 @@ def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, 
     """How many of the runs of one solver, by error, are good enough, and where between them and the next the target is.
 
     `rows` are all of the solver, `runs` those that have an error and the cost. None: no run is so good, or none was
-    asked for about this: within a decade below the target, at the loosest setting that the solver can run, or next to a
-    run that is not good enough at nearly the same setting (the solver leaps over the target). The place between two
+    asked for about this: within a decade below the target, at the loosest setting that the solver can run, or at nearly
+    the same setting as a looser one that is not good enough (the solver leaps over the target). The place between two
     runs, on the log-log line through them, is None where they are more than a decade apart or of different methods.
     """
     errors = _errors(runs)
@@ -82,7 +82,8 @@ def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, 
         return None
     below, settings, end = errors[n_good - 1], setting_of(runs), n_good == len(errors)
     joined = not end and 0.0 < errors[n_good] <= DECADE * below
-    near = not end and 1.0 / NEAR <= settings[n_good] / settings[n_good - 1] <= NEAR
+    looser = settings[n_good:, None] / settings[:n_good]
+    near = ((looser >= 1.0) & (looser <= NEAR)).any()
     if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
         return None
     if not joined or used(runs.iloc[n_good - 1]) != used(runs.iloc[n_good]):
@@ -110,12 +111,12 @@ def _errors(runs: pd.DataFrame) -> Array:
 def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
     """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
     n_good, share = place
-    best = costs[:n_good].min(axis=0)
+    best = np.fmin.reduce(costs[:n_good])  # NaN are the draws of runs that were made once, as others are far cheaper
     if share is None:
         return np.asarray(best)
     with np.errstate(invalid="ignore"):
         between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
-    return np.minimum(best, between)
+    return np.fmin(best, between)
 
 
 def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
@@ -152,8 +153,20 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
             n_good = int((_errors(runs) <= target).sum())
             place = None if n_good == 0 else (min(n_good + 1, len(runs)), None)
         if place is not None:
-            found[str(solver)] = float(_cost(runs["call_s"].to_numpy(float), place)), _cost(resampled(runs), place)
+            costs, drawn = runs["call_s"].to_numpy(float), resampled(runs)
+            if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest the scatter is not known
+                drawn[:] = np.nan
+            found[str(solver)] = float(_cost(costs, place)), _cost(drawn, place)
     return found
+
+
+def _least(side: Costs) -> tuple[float, Array]:
+    """The time of the cheapest, and the least of each draw; NaN if the cheapest was run too few times to be drawn.
+
+    Others that were run too few times, as they are far behind, say nothing of the scatter.
+    """
+    best, drawn = min(side.values(), key=lambda each: each[0])
+    return best, np.fmin.reduce([each for _, each in side.values()]) if np.isfinite(drawn).all() else drawn
 
 
 def compared(own: Costs, others: Costs) -> dict[str, Any]:
@@ -170,13 +183,7 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
     if not own or not others:
         verdict = "alone" if own else "missed" if others else "none"
         return {"ratio": None, "interval": None, "verdict": verdict}
-    least, drawn = zip(
-        *(
-            (min(time for time, _ in side.values()), np.min([each for _, each in side.values()], axis=0))
-            for side in (own, others)
-        ),
-        strict=True,
-    )
+    least, drawn = zip(*(_least(side) for side in (own, others)), strict=True)
     low, high = (float(x) for x in np.percentile(drawn[1] / drawn[0], INTERVAL))
     verdict = "ahead" if low > LEAST else "behind" if high < 1.0 / LEAST else "undecided"
     return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}

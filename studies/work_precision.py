@@ -33,7 +33,7 @@ from studies import (
 from studies.bench import Case, Run, row_of
 from studies.cli import StudyError
 from studies.compare import runs_of
-from studies.render import number, power, render, table
+from studies.render import number, render, table
 from studies.solvers import (
     COMPARED,
     COMPARED_OWN,
@@ -214,7 +214,11 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings["behind"] = behind.findings_of(found, everywhere, operations.to_dict(), operation_ns)
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    findings |= {"fitted": scaling.FITTED, "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
+    findings |= {
+        "in_table": rivals.IN_TABLE,
+        "fitted": scaling.FITTED,
+        "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP)),
+    }
     in_angles = part(rows, minimal.GROUP)
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
@@ -227,12 +231,14 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 
 
 def asked(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many pairs of solver and mechanism were not asked for all accuracies, and the rule."""
-    made = rows[rows["repeat"] == 0].groupby(["solver", "case"]).size()
-    fewer = int((made < made.groupby("solver").transform("max")).sum())
+    """How many pairs of rival and mechanism were refused, or not asked for all accuracies, and the rule."""
+    others = rows[rows["family"] != "two-loop"]
+    pairs = others.groupby(["solver", "case"]).ngroups
+    put = [own for _, own in tables.put(others).groupby(["solver", "case"])]
     return {
-        "n": len(made),
-        "fewer": fewer,
+        "n": pairs,
+        "refused": pairs - len(put),
+        "fewer": sum(not tables.missed(own, 0.0) for own in put),
         "far": adaptive.FAR,
         "running": adaptive.RUNNING,
         "outclassed": adaptive.OUTCLASSED,
@@ -253,17 +259,18 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 
 def ready(findings: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
+    ours = ["`auto`", "`auto, compiled`", "best of ours"]
     geometries = [geometry["case"] for geometry in findings["rivals"]["four_bar"]]
     first = ["solver", "built by", "first call (s)", "least", "most", "later call (ms)", "pays from run"]
     profile = ["worst", "ours", "steps × ns", "rival", "steps × ns", "evaluation (ns)", "without", "in the way"]
     return {
         "goals": table(["rival", "wanted", *geometries], rivals.goal_lines(findings["rivals"])),
-        "ratios": table(["mechanism", *(power(e) for e in rivals.IN_TABLE)], rivals.lines(findings["rivals"])),
+        "ratios": table(["mechanism", *ours], rivals.lines(findings["rivals"])),
         "behind": table(profile, behind.lines(findings["behind"])),
         "scaling": scaling.pivot(findings["scaling"]),
         "evaluations": scaling.evaluations(findings["scaling"]),
         "first": table(first, first_calls.lines(findings["first_calls"])),
-        "minimal": table(["mechanism", *(power(e) for e in minimal.ERRORS)], minimal.lines(findings["minimal"])),
+        "minimal": table(["mechanism", *ours, "fastest rival"], minimal.lines(findings["minimal"])),
     }
 
 

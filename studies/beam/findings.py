@@ -7,14 +7,13 @@ import pandas as pd
 
 from studies import tables
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI
-from studies.beam.runs import DIFFERENCES, EXUDYN, PAPER, by_tip
+from studies.beam.runs import DIFFERENCES, EXUDYN, PAPER, TARGETS, by_tip
 from studies.beam.sensitivity import MESH
 from studies.cases.beam import SOFT, STIFF
 from studies.cli import StudyError
 from studies.render import number
 from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, PAPER_TOL, QUARTER
 
-TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
 PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
 PAPER_STEPS = {SOFT: 1e-3, STIFF: 1e-5}  # s, its step sizes by order of magnitude
 STEPS_OVER = 10.0  # h w_max from which a step does not follow the fastest vibration: more than one and a half periods

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies.bench import REPEATS, Array, Case, Run, Solver
+from studies import adaptive
+from studies.bench import REPEATS, Array, Case, Run, Solver, row_of
 from studies.cases import beam
 from studies.cases.beam import SOFT, STIFF
 from studies.metrics import ASTRAY, deviation
 from studies.solvers import (
     CATALOGUE,
-    IDA_C,
-    IDA_C_ORDER_2,
     IRK,
     IRK_LINE,
     NEWMARK,
@@ -23,26 +22,26 @@ from studies.solvers import (
     PAPER_TOL,
     QUARTER,
     RADAU,
+    RIVALS,
 )
+from studies.store import KeptRows, Row
 from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.ancf_beam import tip_height
 
 PAPER = IRK
 NEWTON, DIFFERENCES = "RadauIIA5", "RadauIIA5, by differences"
-EXPLICIT = "DOP853, projected"  # SciPy's
 EXUDYN = "Exudyn, GeneralizedAlpha, its own cable"
-OURS = ("auto", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", OWN_EXPLICIT)
-INDEX_1, PEERS = ("Radau, index 1", "BDF, index 1"), ("Radau, solve_dae", "BDF, solve_dae")
-OTHERS = (IDA_C, IDA_C_ORDER_2, "IDA, stabilised", EXPLICIT, *INDEX_1, *PEERS)
+OURS = ("auto", "auto, compiled", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", "Adams", OWN_EXPLICIT)
+OTHERS = tuple(name for name in RIVALS if not name.startswith("Exudyn"))  # whose cable is another
 
-TIGHTEST = 1e-6  # of all but IDA, whose errors then are far below all that is asked
-OWN_VALUES = {  # of those that do not take the tolerances of the case
+TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
+LOOSE = (1e-1, 1e-3, 1e-5)  # tolerances, between and beyond which `adaptive` asks
+OWN_VALUES = {  # of those that do not take these
     PAPER: (1e-1, PAPER_TOL),  # its error is that of rounding from the loosest on
     **dict.fromkeys((NEWMARK, QUARTER), (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)),
-    **dict.fromkeys(INDEX_1, (1e-1, 1e-2, 1e-3)),  # a tenth of a second a run and more
-    **dict.fromkeys(PEERS, (1e-2, 1e-4)),  # all Python
 }
+LIMIT = 3.0  # s of CPU of a run of others, as in `work_precision`
 EXUDYN_STEPS = (1000, 2000, 5000, 10_000, 20_000, 50_000)
 EXUDYN_FINE = (100_000, 200_000)  # of the motion against which Exudyn is judged: its own
 INSTANTS = 1000
@@ -94,13 +93,31 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
         for name, solver in solvers().items():
             if quick and name not in QUICK:
                 continue
-            least = 0.0 if solver.family == "SUNDIALS" else TIGHTEST
-            values = steps if name == EXUDYN else tuple(tol for tol in solver.grid(case) if tol >= least)
+            values = steps if name == EXUDYN else case.steps() if solver.setting == "h" else LOOSE
             values = OWN_VALUES.get(name, values)
             if quick:
                 values = (PAPER_TOL,) if name == PAPER else QUICK_TOLERANCES
-            repeats = 1 if quick else REPEATS
-            yield from (Run(case, solver, value, "run", repeats) for value in values)
+            repeats = 1 if quick or name == EXUDYN else REPEATS
+            at = case if solver.family in ("two-loop", "Exudyn") else replace(case, time_limit=LIMIT)
+            yield from (Run(at, solver, value, "run", repeats) for value in values)
+
+
+def collected(todo: Iterator[Run], kept: KeptRows, quick: bool) -> pd.DataFrame:
+    """Rows of these runs and of those that leave no decade of the tip's error out; ours are asked however slow."""
+
+    def make(run: Run, repeat: int, built: adaptive.Built) -> Row:
+        row = row_of(run, repeat, measure, built)
+        return row | {"error_all": row.get("error_q"), "error_q": row.get("error_tip")}
+
+    chosen = list(todo)
+    asked = [run for run in chosen if run.solver.name != EXUDYN]
+
+    def ours(run: Run) -> bool:
+        return run.solver.family == "two-loop"
+
+    rows = adaptive.collect(asked, kept, make, ours, () if quick else TARGETS, ours)
+    own = adaptive.collect([run for run in chosen if run.solver.name == EXUDYN], kept, make, lambda run: True)
+    return pd.concat([rows, own], ignore_index=True)
 
 
 @lru_cache
@@ -131,6 +148,5 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 
 def by_tip(rows: pd.DataFrame) -> pd.DataFrame:
-    """The runs among the rows, with the tip's error as the error by which `tables` and `figures` go."""
-    found = rows[rows["group"] == "run"]
-    return found.assign(error_q=found["error_tip"])
+    """The runs among the rows, whose error is that of the tip."""
+    return rows[rows["group"] == "run"]

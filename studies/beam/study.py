@@ -9,11 +9,10 @@ import pandas as pd
 import studies.beam as package
 from studies import figures, tables
 from studies import study as common
-from studies.beam.findings import TARGETS, findings_of
+from studies.beam.findings import findings_of
 from studies.beam.limits import along_rows, limit_rows
-from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, by_tip, cases, measure, runs
+from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
 from studies.beam.sensitivity import CHANGES, sensitivity_rows
-from studies.bench import collect
 from studies.render import number, render, table
 from studies.solvers import IDA_C, IDA_C_ORDER_2, OWN_EXPLICIT, QUARTER
 from studies.store import Output
@@ -29,7 +28,7 @@ def make(output: Output) -> pd.DataFrame:
     quick = output.call.quick
     known = cases(quick)
     with output.kept() as kept:
-        rows = collect(runs(known, quick), kept, measure)
+        rows = collected(runs(known, quick), kept, quick)
         more = [*limit_rows(), *along_rows(known, quick), *sensitivity_rows(known)]
     return pd.concat([rows, pd.DataFrame(more)], ignore_index=True)
 
@@ -57,7 +56,6 @@ def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report; the findings."""
     rows = tables.medians(rows)
-    rows = rows.assign(error_q=rows["error_q"].where(rows["group"] != "run", rows["error_tip"]))
     findings = findings_of(rows)
     output.save_findings(findings)
     names = [case["name"] for case in findings["cases"]]

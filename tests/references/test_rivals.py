@@ -10,7 +10,7 @@ from references.diffrax_dopri8 import solve_diffrax
 from references.heyoka_taylor import solve_heyoka
 from references.index1 import solve_index1
 from twoloop import ConstrainedSystem, callback
-from twoloop.mechanisms import four_bar, rolling_disc
+from twoloop.mechanisms import four_bar
 from twoloop.result import Status
 
 PROBLEM = four_bar()
@@ -89,9 +89,6 @@ def test_systems_without_expressions_are_refused():
     )
     with pytest.raises(ValueError, match="are Python functions, not compiled ones"):
         solve_cvode_c(plain, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
-    disc = rolling_disc()
-    with pytest.raises(ValueError, match="constraints on positions only"):
-        solve_cvode_c(disc.system, (0.0, 1.0), disc.q0, disc.v0)
 
 
 def test_wrong_arguments_are_named():

@@ -129,6 +129,28 @@ def test_what_is_far_behind_is_not_asked_between_its_settings():
     assert len(slow) == 3
 
 
+def test_ours_are_far_behind_by_the_fastest_of_ours_and_the_default_is_asked_in_any_case():
+    """The call of ours may cost what others' does not: beside these all of ours would be asked for next to nothing."""
+    fast, slow = (lambda value, time=time: ("REACHED_END", 1e-3 * value, time) for time in (1e-3, 0.1))
+    slower = lambda value: ("REACHED_END", value, 1.0)  # noqa: E731
+    families = {"fast": "theirs", "slow": "two-loop", "slower": "two-loop", "auto": "two-loop"}
+    case, made = Case("crane", None, 1.0), {"fast": fast, "slow": slow, "slower": slower, "auto": slower}
+    todo = [
+        Run(case, Solver(name, family, "compiled", True, "tol", None, VALUES), value)
+        for name, family in families.items()
+        for value in VALUES[:3]
+    ]
+
+    def row(run, repeat, built):
+        status, error, seconds = made[run.solver.name](run.value)
+        line = {"solver": run.solver.name, "case": "crane", "tol": run.value, "repeat": repeat, "status": status}
+        return line | {"error_q": error, "call_s": seconds}
+
+    rows = adaptive.collect(todo, Kept(), row, errors=(1e-2, 1e-4, 1e-6, 1e-8))
+    asked = rows[rows["repeat"] == 0].groupby("solver").size()
+    assert asked["slow"] > 3 and asked["slower"] == 3 and asked["auto"] > 3
+
+
 def limited(values):
     return lambda value: ("TIME_LIMIT", None, 1.0) if value in values else good(0.1)(value)
 

@@ -126,3 +126,18 @@ def test_how_many_rivals_could_be_put_is_counted():
     )
     assert text.endswith("Ahead and behind are by 5 % at least\n")
     assert render("against", {}, {}, put=rivals.put(every), names="heyoka").startswith("all 5 rivals")
+
+
+def test_pairs_that_were_refused_or_not_asked_for_all_are_counted_apart():
+    """One that fails by itself, or gets to the tightest tolerance, was asked for all."""
+    pairs = {
+        "to the end": ((1e-3, 1e-3, END), (tables.TIGHTEST, 1e-12, END)),
+        "failed": ((1e-3, 1e-3, END), (1e-5, 1e-5, END), (1e-7, None, FAILED)),
+        "stopped": ((1e-3, 1e-3, END), (1e-5, None, LIMIT)),
+        "loose": ((1e-3, 1e-3, END),),
+        "refused": ((1e-3, None, "NOT_APPLICABLE"),),
+    }
+    made = [runs(*lines).assign(solver=name, case="hoist") for name, lines in pairs.items()]
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=1e-3, case="hoist")
+    found = work_precision.asked(pd.concat([ours, *made], ignore_index=True))
+    assert (found["n"], found["refused"], found["fewer"]) == (5, 1, 2)

@@ -48,5 +48,7 @@ def test_a_long_run_may_take_as_many_steps_as_it_needs():
     span = (0.0, case.t_end)
     few = solve_idas(case.problem.system, span, *start(case), 1e-4, 1e-4, most_steps=100)
     assert not few.success and few.t.size == 0
+    run = next(run for run in runs(False) if run.solver.name == IDAS)
+    assert measure(type(run)(case, run.solver, 1e-4, "other", 1), few)["t_reached"] == 0.0  # a row, all the same
     with pytest.raises(ValueError, match="most_steps"):
         solve_idas(case.problem.system, span, *start(case), most_steps=0)

@@ -132,7 +132,7 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
+        tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
     assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
@@ -174,7 +174,7 @@ def rows_of_forces(wrong=()):
 
 def told_of_forces(rows):
     found = honesty.findings_of(rows)
-    tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
+    tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
     return found, render("honesty", found, tables, stamp="stamp", quick=False)
 
 
@@ -287,3 +287,17 @@ def test_forces_are_on_three_mechanisms():
     assert len({name for name, _ in made}) >= 15
     for bodies in ("pendulum", "bars", "slider_in_space"):
         assert ("gust of 3 ms", bodies) in made
+
+
+def test_solvers_that_are_always_right_share_a_line():
+    right = {"n": 4, honesty.SILENT: 0, honesty.SAID: 0, honesty.RIGHT: 4}
+    wrong = {"n": 4, honesty.SILENT: 1, honesty.SAID: 0, honesty.RIGHT: 3}
+    parts = [
+        {"a (two-loop)": right, "b": wrong, "c": right, "d": right},
+        {"a (two-loop)": right, "b": right, "d": wrong},
+    ]
+    assert honesty.of_solvers(parts) == [
+        ["b", "1/0/3", "0/0/4"],
+        ["d", "0/0/4", "1/0/3"],
+        ["a, c", "all right", "all right"],
+    ]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -205,3 +206,14 @@ def test_a_study_pins_its_threads_whoever_starts_it():
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("['1', '1', '1', '--xla_cpu_multi_thread_eigen=false intra_op")
+
+
+def test_no_text_tells_where_the_project_lies(tmp_path):
+    with Output(call(tmp_path)) as output:
+        output.save_rows(pd.DataFrame({"message": [f"refused ({ROOT / 'studies' / 'traps.py'}, line 56)"]}), STAMP)
+    assert "refused (studies/traps.py, line 56)" in (tmp_path / "x.csv").read_text()
+
+
+def test_no_committed_report_tells_where_it_was_made():
+    paths = (ROOT / "reports").glob("*.[cjm]*")
+    assert [path.name for path in paths if re.search(r"(?<![\w.])/\w[^ ]*/(studies|twoloop)/", path.read_text())] == []

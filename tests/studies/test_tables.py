@@ -47,6 +47,10 @@ def test_nothing_is_interpolated_over_more_than_a_decade_or_between_methods():
     assert tables.time_for(made, 1e-6) == 4.0 and tables.why_not(made, 1e-4) == "not asked"
     near = made.assign(tol=[1e-4, 6e-5])  # asked on both sides: the solver leaps, and its price is that of the leap
     assert tables.time_for(near, 1e-4) == 4.0
+    # errors need not fall with the setting: next to the target by error stands a run of quite another setting
+    back = rows(("a", 1.1e-2, 1.0), ("a", 1.2e-2, 2.0), ("a", 1.8e-7, 4.0), ("a", 3e-7, 5.0))
+    assert tables.time_for(back.assign(tol=[1e-2, 1e-4, 6e-5, 1e-6]), 1e-4) == 4.0
+    assert np.isnan(tables.time_for(back.assign(tol=[1e-2, 1e-4, 1e-6, 1e-8]), 1e-4))
     changed = rows(("a", 1e-2, 1.0), ("a", 2e-3, 4.0)).assign(used=["Newton", "explicit"])
     assert tables.time_for(changed, 5e-3) == 4.0 > tables.time_for(changed.assign(used=""), 5e-3)
     assert tables.time_for(changed.assign(used=np.nan), 5e-3) < 4.0  # as a file has it where nothing is chosen
@@ -121,6 +125,19 @@ def test_a_pair_is_decided_where_all_of_the_range_of_the_ratio_is_a_least_effect
         assert found["interval"] is None
     again = tables.compared({"auto": costs["auto"]}, {"heyoka": costs["heyoka"]})
     assert again == found  # the draws are the same
+
+
+def test_runs_made_once_as_they_are_far_behind_undo_no_verdict():
+    """Of another solver of ours, and of the same one at a finer setting; where the cheapest was run once, they do."""
+    times = [1.0, 1.1, 0.9, 1.0, 1.05]
+    far = rows(("slow", 1e-4, 30.0), ("auto", 1e-6, 40.0)).assign(times=[(30.0,), (40.0,)])
+    for factor, verdict in ((5.0, "ahead"), (0.2, "behind")):
+        made = repeated(times, [factor * time for time in times])
+        theirs = tables.costs_at(made[made["solver"] == "heyoka"], 1e-3)
+        ours = tables.costs_at(pd.concat([made[made["solver"] == "auto"], far], ignore_index=True), 1e-3)
+        assert set(ours) == {"auto", "slow"} and tables.compared(ours, theirs)["verdict"] == verdict
+    once = made[made["solver"] == "auto"].assign(times=[(1.0,)])
+    assert tables.compared(tables.costs_at(once, 1e-3), theirs)["verdict"] == "undecided"
 
 
 def test_nobody_is_ahead_of_a_solver_for_want_of_a_run():
