@@ -34,7 +34,7 @@ OUTPUTS = 1001  # instants of the default t_eval
 SMALLEST_STEP = (
     1e-12  # of the length of t_span; without a smallest step IDA shrinks its steps towards a NaN without end
 )
-MOST_STEPS = 10**7
+MOST_STEPS = 10**9  # the clock is looked at before
 STEPS_A_CALL = 100  # between two looks at the clock
 
 IDA_NORMAL, IDA_ONE_STEP, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 2, 1, -1

@@ -33,7 +33,7 @@ GEOMETRIES: dict[str, dict[str, Any]] = {
 LONG, QUICK = 10_000.0, 75.0  # s
 FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
 TIME_LIMIT = 300.0  # CPU s
-MOST_STEPS = 10_000_000  # of solvers that count them and do not look at the clock
+MOST_STEPS = 30_000_000  # of solvers that count them and do not look at the clock
 NOT_QUICK = (DIFFRAX, IDAS)  # compile for seconds
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 

@@ -125,10 +125,8 @@ class Output:
         return path
 
     def save_rows(self, rows: pd.DataFrame, line: str) -> None:
-        """Write NAME.csv, numbers to ten digits; its first line says study, quick or full, and the stamp `line`."""
-        self.write(
-            f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False, float_format='%.10g')}"
-        )
+        """Write NAME.csv; its first line says study, quick or full, and the stamp `line`."""
+        self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False)}")
 
     def load_rows(self) -> tuple[pd.DataFrame, str]:
         """Read what `save_rows` wrote, and its stamp.

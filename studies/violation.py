@@ -14,7 +14,21 @@ from studies.cases import four_bar
 from studies.cli import StudyError
 from studies.metrics import CHECKED, violations
 from studies.render import number
-from studies.solvers import ALPHAS, CATALOGUE, IDA_C, IRK, LINE_UP, OWN_EXPLICIT, baumgarte, gear, paper_irk_at
+from studies.solvers import (
+    ALPHAS,
+    CATALOGUE,
+    CVODE_C,
+    CVODE_C_PROJECTED,
+    DEFAULT,
+    HEYOKA,
+    IDA_C,
+    IRK,
+    LINE_UP,
+    OWN_EXPLICIT,
+    baumgarte,
+    gear,
+    paper_irk_at,
+)
 from studies.study import Series, Study, key
 from twoloop import Result
 
@@ -29,25 +43,31 @@ WINDOWS = 10  # equal parts of the run, to whose largest violations the growth i
 CURVE = 50  # equal parts of the run, whose largest violations are drawn
 ZERO = 1e-17  # what counts as a violation of zero where a logarithm is taken
 
-PAIRS = (("DOP853, projected", "DOP853, index 1"), ("IDA, stabilised", "IDA, index1"))  # kept, not kept
-OWN = ("SunRadau5", "Gauss12", OWN_EXPLICIT)
-ALONG = (*PAIRS[0], *PAIRS[1], "LSODA, index 1", IDA_C, *OWN)
+PAIRS = (  # kept, not kept
+    ("DOP853, projected", "DOP853, index 1"),
+    (CVODE_C_PROJECTED, "CVODE from C, BDF"),
+    ("IDA, stabilised", "IDA, index1"),
+)
+OWN = (DEFAULT, "SunRadau5", "Gauss12", OWN_EXPLICIT)
+ALONG = (*(name for pair in PAIRS for name in pair), "LSODA, index 1", IDA_C, HEYOKA, CVODE_C, *OWN)
+MORE = dict.fromkeys((HEYOKA, CVODE_C, CVODE_C_PROJECTED), 1e-8)  # tolerances, in the line-up of this study
 STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
 QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *OWN)
-DRAWN = (*PAIRS[0], "LSODA, index 1", "IDA, stabilised", IDA_C, "Gauss12", OWN_EXPLICIT)  # cost over error
+DRAWN = (*PAIRS[0], *PAIRS[1], HEYOKA, CVODE_C, IDA_C, DEFAULT, OWN_EXPLICIT)  # cost over error
 EXUDYN = ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2")
 OVER_TIME = ("LSODA, index 1", "DOP853, index 1", baumgarte("DOP853", 10.0), "IDA, stabilised", gear(2), *EXUDYN)
-LISTED = (*OVER_TIME, "IDA, index1", IDA_C, "DOP853, projected", gear(5))
+LISTED = (*OVER_TIME, HEYOKA, CVODE_C, CVODE_C_PROJECTED, "IDA, index1", IDA_C, "DOP853, projected", gear(5))
 TARGETS = (1e-2, 1e-4, 1e-6)
 
 
 def runs(quick: bool) -> list[Run]:
     """Every solver at one setting; PaperIRK with loose loops; solvers along their tolerances."""
     case = four_bar.cases(quick)[0]
-    line_up = [CATALOGUE[name] for name in LINE_UP]
+    settings = LINE_UP | MORE
+    line_up = [CATALOGUE[name] for name in settings]
     if quick:
         line_up = [s for s in line_up if s.family == "two-loop" or s.name.startswith(("Exudyn", "GSTIFF", "DOP853"))]
-    made = [Run(case, solver, LINE_UP[solver.name], "line-up", 1) for solver in line_up]
+    made = [Run(case, solver, settings[solver.name], "line-up", 1) for solver in line_up]
     made += [Run(case, paper_irk_at(LOOSE), err_out, "loops", 1) for err_out in (LOOSE, TIGHT)]
     for name in QUICK_ALONG if quick else (*ALONG, *STABILISED):
         values = (1e-5, 1e-7) if quick else CATALOGUE[name].grid(case)

@@ -8,10 +8,10 @@ import pytest
 
 from studies import violation
 from studies.cli import Call
-from studies.solvers import CATALOGUE, IDA_C, IRK, baumgarte, gear
+from studies.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C, IRK, baumgarte, gear
 from studies.store import Output
 from studies.study import key
-from studies.violation import ALONG, LOOSE, TIGHT, grows, kind
+from studies.violation import ALONG, LOOSE, PAIRS, TIGHT, grows, kind
 
 DRIFTS = {"violation_q": 1e-7, "violation_v": 1e-8, "growth_q": 2.0, "growth_v": 1.0, "early_q": 1e-9, "late_q": 1e-7}
 BAUMGARTE = baumgarte("DOP853", 10.0)
@@ -41,6 +41,7 @@ def rows():
     for err_out, size in ((LOOSE, 3e-7), (TIGHT, 9e-16)):
         add("loops", IRK, err_in=LOOSE, err_out=err_out, violation_q=size, tol=np.nan)
     cost = {"IDA, stabilised": 4.0, "IDA, index1": 2.0, "DOP853, projected": 0.6, "Gauss12": 0.3}
+    cost[CVODE_C_PROJECTED] = 0.7
     for name in (*ALONG, BAUMGARTE):
         drifts = {} if CATALOGUE[name].keeps_constraints else {"violation_q": 1e-6}
         for k, tol in enumerate((1e-3, 1e-5, 1e-7, 1e-9)):
@@ -65,7 +66,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     assert found["others_growing"] == ["LSODA, index 1", "DOP853, index 1"] and found["growing_to"] == 1e-7
     assert (found["baumgarte_n"], found["baumgarte_kept"]) == (4, 0) and found["n_kept_first"] == found["n_ranked"]
     assert found["inner_alone_kept"] and not found["both_kept"]
-    assert [pair["dearer"] for pair in found["pairs"]] == [True, True]
+    assert [pair["dearer"] for pair in found["pairs"]] == [True, True, True]
 
     made = rows()
     line_up, along = made["group"] == "line-up", made["group"] == "tolerances"
@@ -73,9 +74,9 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[line_up & made["solver"].isin(("LSODA, index 1", "DOP853, index 1")), ["growth_q", "late_q"]] = [0.0, 1e-9]
     made.loc[along & (made["solver"] == BAUMGARTE), "violation_q"] = 1e-14
     made.loc[made["group"] == "loops", "violation_q"] = 1e-9
-    made.loc[along & made["solver"].isin(("IDA, stabilised", "DOP853, projected")), "call_s"] /= 10.0
+    made.loc[along & made["solver"].isin([kept for kept, _ in PAIRS]), "call_s"] /= 10.0
     made.loc[along & ~made["keeps_constraints"], "call_s"] /= 100.0
-    made.loc[along & made["solver"].isin(("IDA, index1", "DOP853, index 1")), "call_s"] *= 200.0
+    made.loc[along & made["solver"].isin([drifting for _, drifting in PAIRS]), "call_s"] *= 200.0
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
     found = found_of(tmp_path, made)
     assert found["irk_grows"] and not found["ours_keep"] and found["ours_growing"] == [IRK]
