@@ -13,6 +13,7 @@ from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run
 from references.index1 import RightHandSide
 from references.nonholonomic import with_all_rows
 from references.ode import ADVICE, ode_result, output_times, states_at
+from references.redundant_rows import on_independent_rows
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics
 from twoloop.system import ConstrainedSystem
@@ -23,6 +24,7 @@ METHODS = ("Adams", "BDF")
 MOST_STEPS = 10**7  # between two output times; its own 500 are soon used up
 
 
+@on_independent_rows
 def solve_cvode(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.ida import compiled_rates, compiled_residual, start_of
+from references.redundant_rows import on_independent_rows
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
 from twoloop.system import ConstrainedSystem
@@ -26,6 +27,7 @@ METHODS: dict[str, dict[str, int]] = {
 }
 
 
+@on_independent_rows
 def solve_fully_implicit(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

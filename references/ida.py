@@ -30,6 +30,7 @@ from references.ida_options import (
 )
 from references.nonholonomic import with_all_rows
 from references.ode import states_at
+from references.redundant_rows import on_independent_rows
 from twoloop.callbacks import stand_in
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -55,6 +56,7 @@ _RESIDUAL = types.void(types.float64, _READ, _READ, _VECTOR, *_SIZES, _VECTOR)
 _JACOBIAN = types.void(types.float64, _READ, _READ, types.float64, _MATRIX, *_SIZES, _VECTOR)
 
 
+@on_independent_rows
 def solve_ida(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -21,6 +21,7 @@ from references.driver import TimeLimit, check_run, check_system, check_toleranc
 from references.ida_compiled import compiled_for_ida
 from references.ida_options import ALL, HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.nonholonomic import with_all_rows
+from references.redundant_rows import on_independent_rows
 from references.sundials import REAL, check, context, counted, flag_name, library, made
 from twoloop.consistency import check_start
 from twoloop.result import Result, Statistics, Status
@@ -40,6 +41,7 @@ STEPS_A_CALL = 100  # between two looks at the clock
 IDA_NORMAL, IDA_ONE_STEP, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 2, 1, -1
 
 
+@on_independent_rows
 def solve_ida_c(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -27,6 +27,7 @@ from references.driver import (
 )
 from references.expressions import NotSymbolic
 from references.nonholonomic import with_all_rows
+from references.redundant_rows import on_independent_rows
 from references.straight_line import straight_line_jacobian
 from twoloop.checks import check_positive
 from twoloop.consistency import check_start
@@ -52,6 +53,7 @@ MAX_PROJECTIONS = 10  # Newton iterations of a projection
 SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
 
 
+@on_independent_rows
 def solve_index1(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -99,7 +99,8 @@ def make(output: Output) -> pd.DataFrame:
         return run.solver.family == "two-loop"
 
     quick = output.call.quick
-    todo = runs(*four_bar.cases(quick), quick)
+    first, second = four_bar.cases(quick)
+    todo = runs(first, second, quick)
     compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
         rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
