@@ -256,7 +256,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "steps_at": list(DECEIVED_AT),
         "first_deceived": [line["solver"] for line in stepped if line["first"]],
     }
-    found |= {"n_runs": len(rows), "ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
+    found |= {"ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
     found["wrong"] = [
         {key: row[key] for key in ("case", "solver", "family", "tol", "error_q")} for _, row in wrong.iterrows()
     ]
@@ -266,6 +266,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     asked = [line["case"] for line in alone if line["others_put"] and not line["others_stopped"]]
     found["only_ours"] = [{"case": line["case"], "put": line["others_put"]} for line in alone if line["case"] in asked]
     found["not_put"] = [line["case"] for line in alone if line["case"] not in asked]
+    found["refused"] = bool((rows["outcome"] == "not run").any())
     found["n_others"] = int(rows[rows["family"] != "two-loop"]["solver"].nunique())
     singular = [problem.name for problem in (make() for make in MAKE) if "singular" in problem.tags]
     found["none_right_singular"] = all(
@@ -330,12 +331,12 @@ def picture(rows: pd.DataFrame) -> Figure:
 def lines(found: Sequence[dict[str, Any]], steps: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
     """Of the table of solvers, by their runs and by their steps."""
     stepped = {line["solver"]: percent(line["deceived"]) for line in steps if line["n"]}
-    keys = ("right", "inexact", "wrong", "said so", "ratio", "digits_q", "digits_v", "digits_lam")
+    keys = ("right", "inexact", "wrong", "said so", "ratio", "digits_q")
     for line in found:
         yield [line["solver"], *(line[key] for key in keys), stepped.get(line["solver"], "–")]
 
 
-HEADER = ("solver", "right", "inexact", "wrong", "said so", "error/tol", "q", "v", "λ", "deceived")
+HEADER = ("solver", "right", "inexact", "wrong", "said so", "error/tol", "decimals", "deceived")
 
 
 def _of_exudyn(line: dict[str, Any] | None) -> str:
