@@ -68,11 +68,12 @@ ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
 OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tight; quick: the first
     **dict.fromkeys((DEFAULT, OWN_CODE, OWN_EXPLICIT), (1e-6, 1e-8, 1e-10, 1e-12)),
     "Gauss12": (1e-5, 1e-7),
-    **dict.fromkeys((IDA_C, HEYOKA, CVODE_C, DIFFRAX, IDAS), (1e-6, 1e-8, 1e-10, 1e-12)),
+    **dict.fromkeys((IDA_C, CVODE_C, DIFFRAX, IDAS), (1e-6, 1e-8, 1e-10, 1e-12)),
+    HEYOKA: (1e-6, 1e-8, 1e-10, 1e-12, 1e-14),
     LSODA: (1e-8, 1e-10, 1e-12),
     PROJECTED: (1e-7, 1e-9, 1e-11),
     ALPHA: (0.01,),
-    TRAPEZOIDAL: (0.02, 0.01),
+    TRAPEZOIDAL: (0.02, 0.01, 0.005),
 }
 
 
