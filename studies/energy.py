@@ -25,14 +25,14 @@ from studies.energy_runs import (
     Variant,
 )
 from studies.render import number
-from studies.solvers import CVODE_C, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
+from studies.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.study import Series, Study, key
 from studies.tables import setting, unfinished
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
-DRAWN = (OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
+DRAWN = (DEFAULT, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:

@@ -129,7 +129,9 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
         if not ratios:
             return None
         found[what] = [min(ratios), max(ratios)]
-    return found | {"dearer": found["call_s"][0] > 1.0, "cheaper": found["call_s"][1] < 1.0}
+    least, most = found["call_s"]
+    same = least >= 1.0 / tables.LEAST and most <= tables.LEAST
+    return found | {"same": same, "dearer": least > tables.LEAST, "cheaper": most < 1.0 / tables.LEAST}
 
 
 def _told(row: pd.Series) -> dict[str, Any]:
@@ -148,6 +150,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     irk, known = irk.iloc[0], line_up[line_up["growth_q"].notna()]
     own = known["family"] == "two-loop"
     others = [row for _, row in known[~own].iterrows() if kind(row, "q") == "grows"]
+    sizes = [float(row["violation_q"]) for row in others]
     listed = line_up[line_up["violation_q"].notna()].set_index("solver", drop=False)
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
     ranked = [ranking for target in TARGETS if len(ranking := tables.ranking(along, target))]
@@ -166,7 +169,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "ours_keep": bool((ours[["violation_q", "violation_v"]].max(axis=1) <= KEPT).all()),
         "ours_growing": [row["solver"] for _, row in known[own].iterrows() if grows(row, "q")],
         "others_growing": [row["solver"] for row in others],
-        "growing_to": max((row["violation_q"] for row in others), default=0.0),
+        "growing_to": [min(sizes, default=0.0), max(sizes, default=0.0)],
         "inner_loose": float(loose[TIGHT]),
         "both_loose": float(loose[LOOSE]),
         "inner_alone_kept": bool(loose[TIGHT] <= KEPT),

@@ -34,7 +34,7 @@ from studies.energy_runs import (
     runs,
 )
 from studies.render import render
-from studies.solvers import CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.solvers import CVODE_C, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
 from studies.store import Output
 
 RIVALS = (HEYOKA, CVODE_C, IDAS, DIFFRAX)
@@ -113,7 +113,7 @@ def test_the_full_report_is_short_with_all_rivals(rows):
 
 def test_other_solvers_have_rows_near_the_true_motion(rows):
     others = rows[rows["group"] == "other"]
-    assert set(others["solver"]) >= {OWN_EXPLICIT, IDA_C, "LSODA, index 1", "DOP853, projected"}
+    assert set(others["solver"]) >= {DEFAULT, OWN_EXPLICIT, IDA_C, "LSODA, index 1", "DOP853, projected"}
     assert others[others["tol"] < 1e-6]["error_q"].max() < 0.1
 
 

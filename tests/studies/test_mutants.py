@@ -87,7 +87,7 @@ def text_of(seen_by, why=""):
     found = mutants.findings_of(pd.DataFrame([line]))
     for survivor in found["survivors"]:
         survivor["why"] = why
-    whole = {"n": 1, "missed": [], "places": {}, "tolerance": 1e-10, "mutants": found}
+    whole = {"n": 1, "missed": [], "places": {}, "tolerance": 1e-10, "mutants": found | {"made": "stamp"}}
     return render("planted_errors", whole, {"faults": ""}, stamp="stamp", quick=False)
 
 
