@@ -24,6 +24,7 @@ from studies.energy_runs import (
     VARIANTS,
     Variant,
 )
+from studies.headline import OWN_CODE
 from studies.render import number
 from studies.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.study import Series, Study, key
@@ -86,6 +87,8 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         level: dict[str, Any] = {"share": share, "energy": share * kinetic}
         for name, which in (("no_drift", good & calm), ("drift", good & ~calm)):
             level[name] = {"ours": cheapest(reached[which & own]), "others": cheapest(reached[which & ~own])}
+        plain = {name: reached[good & (reached["solver"] == name)]["call_s"] for name in (DEFAULT, OWN_CODE)}
+        level["plain"] = {name: float(times.min()) for name, times in plain.items() if len(times)}
         free, other = cheapest(reached[good & calm]), cheapest(reached[good & ~calm])
         over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0

@@ -96,6 +96,7 @@ def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
     These are made once: times that differ by less than a share `equal` are not told apart.
     """
     line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
+    line["plain"] = at.get("plain", {})
     for which in WHOSE:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:

@@ -126,7 +126,7 @@ def test_sentences_turn_with_the_rows():
     assert (
         "Of 1 runs of 1 random mechanisms under sharp forces, half of them friction, none is wrong and silent." in good
     )
-    assert "All methods are right from 1e-6 to 1e3 m" in good
+    assert "All methods are right at least from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
     assert "Wrong and silent: 2 runs" in bad
