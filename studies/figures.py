@@ -25,7 +25,7 @@ MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
 MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA"), ("SciPy", ""))  # family, how names begin
 ERROR = "largest position error over the run (m, rad)"
-LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: failed, or over a decade apart"
+LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: failed, or > a decade"
 
 mpl.rcParams.update(
     {
