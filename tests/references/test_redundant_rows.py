@@ -11,6 +11,7 @@ from references.ida import solve_ida
 from references.ida_c import solve_ida_c
 from references.index1 import solve_index1
 from references.redundant_rows import independent_rows
+from twoloop import ConstrainedSystem
 from twoloop.mechanisms import bricard, four_bar, redundant_slider_crank
 
 ADAPTERS = {
@@ -56,3 +57,49 @@ def test_a_mechanism_without_such_rows_is_left_alone_and_wrong_input_is_named():
         solve_index1(replace(problem), (0.0, 0.1), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
     with pytest.raises(ValueError, match="q0"):
         solve_index1(problem.system, (0.0, 0.1), problem.q0[:3], problem.v0, "DOP853", 1e-6, 1e-6)
+
+
+def pendulum(constraint, rate=None):
+    """A point on a circle, held by two rows of C with the same gradient."""
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=2,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=constraint,
+        jacobian=lambda t, q: np.array([q, q]),
+        constraint_rate=rate,
+        name="held twice",
+    )
+
+
+@pytest.mark.parametrize("name", ["DOP853", "IDA"])
+def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
+    package, solve = ADAPTERS[name]
+    pytest.importorskip(package)
+    start = (0.0, 1.0), [1.0, 0.0], [0.0, 0.0]
+    now = pendulum(lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.1)]))
+    with pytest.raises(ValueError, match=r"q0 must satisfy all constraints of 'held twice': row\(s\) \[1\]"):
+        solve(now, *start)
+    later = pendulum(
+        lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.0 - 0.1 * t * t)]),
+        lambda t, q: np.array([0.0, -0.1 * t]),
+    )
+    result = solve(later, *start)
+    assert not result.success and "Row(s) [1] of C_q follow from others at t = 0, were left out" in result.message
+    assert result.t[-1] == 1.0 and result.lam.shape == (2, result.t.size)  # what it has is kept
+
+
+def test_rows_that_part_at_a_position_where_rank_is_lost_only_for_a_moment_are_no_success():
+    # the second row holds y at 0, where its gradient is that of the first
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=2,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -1.0]),
+        constraint=lambda t, q: np.array([q[0] - 1.0, (q[0] - 1.0) + q[1] ** 2]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0], [1.0, 2.0 * q[1]]]),
+        name="held at y = 0",
+    )
+    result = solve_index1(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "DOP853", 1e-8, 1e-8)
+    assert not result.success and "do not hold at the end" in result.message
