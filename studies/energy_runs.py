@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from references.casadi_integrators import solve_idas
+from references.casadi_integrators import solve_cvodes
 from references.diffrax_dopri8 import solve_diffrax
 from references.four_bar_minimal import MinimalFourBar
 from references.index1 import solve_index1
@@ -17,7 +17,7 @@ from studies.bench import Case, Run, Solver
 from studies.energy_drift import drift, windows
 from studies.headline import OWN_CODE
 from studies.reference_motion import ReferenceMotion
-from studies.solvers import CATALOGUE, CVODE_C, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.solvers import CATALOGUE, CVODE_C, CVODES, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_BDF, OWN_EXPLICIT
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.plan import Method
@@ -35,7 +35,7 @@ LONG, QUICK = 10_000.0, 75.0  # s
 FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
 TIME_LIMIT = 300.0  # CPU s
 MOST_STEPS = 30_000_000  # of solvers that count them and do not look at the clock
-NOT_QUICK = (DIFFRAX, IDAS)  # compile for seconds
+NOT_QUICK = (DIFFRAX, CVODES)  # compile for seconds
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 SUN, GAUSS, RADAU, MIDPOINT = "Sun Radau IIB(3)", "Gauss(3)", "Radau IIA(3)", "implicit midpoint"
@@ -68,7 +68,7 @@ ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
 OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tight; quick: the first
     **dict.fromkeys((DEFAULT, OWN_CODE, OWN_EXPLICIT), (1e-6, 1e-8, 1e-10, 1e-12)),
     "Gauss12": (1e-5, 1e-7),
-    **dict.fromkeys((IDA_C, CVODE_C, DIFFRAX, IDAS), (1e-6, 1e-8, 1e-10, 1e-12)),
+    **dict.fromkeys((IDA_C, CVODE_C, DIFFRAX, CVODES), (1e-6, 1e-8, 1e-10, 1e-12)),
     HEYOKA: (1e-6, 1e-8, 1e-10, 1e-12, 1e-14),
     LSODA: (1e-8, 1e-10, 1e-12),
     PROJECTED: (1e-7, 1e-9, 1e-11),
@@ -147,7 +147,7 @@ ADAPTERS: dict[str, Callable[[Case, float, int], Result]] = {  # that store stat
     "Gauss12": partial(_controlled, "Gauss12"),
     **{name: CATALOGUE[name].run for name in (IDA_C, HEYOKA, CVODE_C)},
     DIFFRAX: partial(_long, solve_diffrax),
-    IDAS: partial(_long, solve_idas),
+    CVODES: partial(_long, solve_cvodes),
     LSODA: partial(_index1, "LSODA", "none"),
     PROJECTED: partial(_index1, "DOP853", "projection"),
     ALPHA: partial(_exudyn, "GeneralizedAlpha"),

@@ -182,9 +182,6 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     found = findings_of(rows)
     mutants = output.path / "mutants.json"
     found["mutants"] = json.loads(mutants.read_text()) if mutants.is_file() else None
-    if found["mutants"]:
-        first = mutants.with_suffix(".csv").read_text().split("\n", 1)[0]
-        found["mutants"]["made"] = first.removeprefix("# full mutants; ")
     output.save_findings(found)
     cells = [
         [str(place), "; ".join(own["fault"]), str(by)]

@@ -20,11 +20,11 @@ from studies.solvers import (
     CATALOGUE,
     CVODE_C,
     CVODE_C_PROJECTED,
+    CVODES,
     DEFAULT,
     EXUDYN,
     HEYOKA,
     IDA_C,
-    IDAS,
     OWN_BDF,
     OWN_EXPLICIT,
     TAYLOR,
@@ -59,7 +59,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
-    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, "IDAS, CasADi"),
+    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES),
     *("LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)
@@ -80,7 +80,7 @@ REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (DEFAULT, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
 # their adapters tell states at given instants, between steps by interpolants: not where a step ends
-UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, IDAS)
+UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
 SHORT = {
@@ -243,7 +243,6 @@ def _holds(name: str, level: str) -> float:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
-    steps = steps[~steps["solver"].isin(UNTOLD)]
     models = rows[rows["group"] == MODELLED]
     rows = rows[~rows["group"].isin(APART)]
     solvers = [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]
