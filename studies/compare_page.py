@@ -56,6 +56,7 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
             first, rest = path.read_text().split("\n", 1)
             rows = pd.read_csv(StringIO(rest), low_memory=False)
             rows = tables.medians(rows) if "repeat" in rows else rows
+            rows = rows[rows["t_end"].notna()]  # not those of a first call, which are times alone
             # a study may run one mechanism for several lengths of time, whose costs cannot be compared
             parts.append(
                 rows.assign(

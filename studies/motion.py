@@ -18,7 +18,18 @@ from studies.bench.cli import StudyError
 from studies.bench.collector import Run
 from studies.bench.metrics import deviation
 from studies.bench.render import number
-from studies.bench.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IDA_C, IRK, LINE_UP, NEWMARK, OWN_EXPLICIT, gear
+from studies.bench.solvers import (
+    CANONICAL,
+    CATALOGUE,
+    DEFAULT,
+    GEAR_ORDERS,
+    IDA_C,
+    IRK,
+    LINE_UP,
+    NEWMARK,
+    OWN_EXPLICIT,
+    gear,
+)
 from studies.bench.study import Series, Study, key
 from studies.bench.tables import setting
 from twoloop import Result
@@ -34,7 +45,10 @@ SHORT, LAST = 2.0, 5.0  # s: Fig. 2 of the paper, and what is drawn of the end o
 GRIDS = {"short": np.linspace(0.0, SHORT, 201), "last": np.linspace(-LAST, 0.0, 501), "log": np.geomspace(1e-3, 1, 80)}
 EXUDYN = "Exudyn, GeneralizedAlpha"
 SMALLEST = 1e-11  # m, of the reference
-LISTED = (IRK, NEWMARK, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "DOP853, projected", "LSODA, index 1", EXUDYN)
+LISTED = (
+    *(IRK, NEWMARK, DEFAULT, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "DOP853, projected"),
+    *("LSODA, index 1", EXUDYN),
+)
 
 
 def runs(quick: bool) -> list[Run]:
@@ -122,7 +136,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         procedures.append(found | {"holds": bool(run["top"] < PASSES and run["top_late"] > -PASSES)})
     told = ("solver", "called_from", "error_y3_short", "error_y3", "growth", "energy", "n_evaluations")
     listed = [find(rows, name) for name in LISTED]
-    grown = rows[(rows["group"] == "line-up") & (rows["family"] == "two-loop")].set_index("solver")["growth"].dropna()
+    grown, exudyn = (
+        rows[(rows["group"] == "line-up") & (rows["family"] == family)].set_index("solver")["growth"].dropna()
+        for family in ("two-loop", "Exudyn")
+    )
     return {
         "t_end": float(rows["t_end"].iloc[0]),
         "problem": rows["problem"].iloc[0],
@@ -137,6 +154,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "stand_in": [[str(n), *_cells(rows, n)] for n in GEAR_ORDERS if find(rows, gear(n), COARSE) is not None],
         "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None],
         "canonical_growth": grown.get(CANONICAL),
+        "exudyn_growth": [exudyn.min(), exudyn.max()] if len(exudyn) else None,
         "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()],
     }
 
@@ -175,7 +193,7 @@ def error_figure(rows: pd.DataFrame, series: Series) -> Figure:
     """Largest error of y3 so far over time."""
     figure, panels = plt.subplots(1, 2, figsize=(9.2, 4.4), sharex=True, sharey=True, layout="constrained")
     sides = {
-        "one setting each, see the table": [find(rows, name) for name in LISTED[:7]],
+        "one setting each, see the table": [find(rows, name) for name in LISTED[:8]],
         f"GSTIFF stand-in, h = {MIDDLE:g} s": [find(rows, gear(order), MIDDLE) for order in GEAR_ORDERS],
     }
     for panel, (title, entries) in zip(panels, sides.items(), strict=True):

@@ -107,6 +107,7 @@ def solve_cvodes(
     method: str = "BDF",
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
+    most_steps: int = STEPS_A_RUN,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODES of CasADi.
 
@@ -120,7 +121,7 @@ def solve_cvodes(
         CVODES' tolerances.
     method : {"BDF", "Adams"}
         Orders up to 5, or up to 12.
-    t_eval, time_limit : see `solve_idas`
+    t_eval, time_limit, most_steps : see `solve_idas`
 
     Returns
     -------
@@ -134,7 +135,7 @@ def solve_cvodes(
     """
     check_choice("method", method, METHODS)
     more = METHODS[method]
-    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, STEPS_A_RUN, more)
+    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps, more)
 
 
 def solve_collocation(

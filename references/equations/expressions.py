@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from references.driver import check_system
 from references.equations.duals import Dual, functions_on_duals
+from references.equations.redundant_rows import independent_rows
 from twoloop.generate.series import on_symbols
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Graph, Untraceable
@@ -32,7 +33,6 @@ FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "sinh", "cosh", "tanh", 
 
 SAMPLES = 4  # states, displaced from the start, at which an entry that is zero is zero by its structure
 DISPLACED = 0.3
-RANK = 1e-9  # a pivot below this, of the largest, is zero
 
 
 class NotSymbolic(ValueError):
@@ -66,7 +66,7 @@ class Expressions:
         self.system = system
         self._check(t0, q0, v0)
         samples = _samples(system, t0, q0)
-        self.rows = _independent_rows(samples[0][1])
+        self.rows = list(independent_rows(samples[0][1]))
         self.mass_pattern = np.any([M != 0.0 for M, _ in samples], axis=0)
         self.jacobian_pattern = np.any([C[self.rows] != 0.0 for _, C in samples], axis=0)
         self.added = _rows_for_mass(samples[0][0], samples[0][1][self.rows])
@@ -216,19 +216,6 @@ def _samples(system: ConstrainedSystem, t0: float, q0: Array) -> list[tuple[Arra
     rng = np.random.default_rng(0)
     states = [q0, *(q0 + DISPLACED * rng.standard_normal(q0.size) for _ in range(SAMPLES))]
     return [(system.mass(t0, q), system.jacobian(t0, q)) for q in states]
-
-
-def _independent_rows(jacobian: Array) -> list[int]:
-    """Rows of C_q, the first ones, that do not follow from those before."""
-    rows: list[int] = []
-    basis = np.zeros((0, jacobian.shape[1]))
-    for k, row in enumerate(jacobian):
-        left = row - basis.T @ (basis @ row)
-        left -= basis.T @ (basis @ left)
-        if np.linalg.norm(left) > RANK * np.linalg.norm(row):
-            rows.append(k)
-            basis = np.vstack([basis, left / np.linalg.norm(left)])
-    return rows
 
 
 def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:

@@ -1,6 +1,7 @@
 """Rows A v + b = 0 for solvers of the accelerations: to eq. (6) they are further rows of C_q a = Q_d."""
 
 from functools import lru_cache
+from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
@@ -54,7 +55,7 @@ def _stacked(
     nonholonomic: Dispatcher,
     nonholonomic_rate: Dispatcher,
     nonholonomic_gamma: Dispatcher,
-) -> dict[str, Dispatcher]:
+) -> dict[str, Any]:
     """The callbacks of m rows of C and those of A below."""
 
     @callback("constraint")

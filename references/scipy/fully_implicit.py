@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
+from references.equations.redundant_rows import on_independent_rows
 from references.sundials.ida import compiled_rates, compiled_residual, start_of
 from twoloop.checks.consistency import check_start
 from twoloop.problem.system import ConstrainedSystem
@@ -27,6 +28,7 @@ METHODS: dict[str, dict[str, int]] = {
 }
 
 
+@on_independent_rows
 def solve_fully_implicit(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -27,6 +27,7 @@ from references.driver import (
 from references.equations.accelerations import OPTIONS, Equations, matrix_of, saddle_solve, schur_factors, times_inverse
 from references.equations.expressions import NotSymbolic
 from references.equations.nonholonomic import with_all_rows
+from references.equations.redundant_rows import on_independent_rows
 from references.equations.straight_line import straight_line_jacobian
 from twoloop.checks.arguments import check_positive
 from twoloop.checks.consistency import check_start
@@ -53,6 +54,7 @@ MAX_PROJECTIONS = 10  # Newton iterations of a projection
 SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
 
 
+@on_independent_rows
 def solve_index1(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
 from references.equations.nonholonomic import with_all_rows
 from references.equations.ode import ADVICE, ode_result, output_times, states_at
+from references.equations.redundant_rows import on_independent_rows
 from references.scipy.index1 import RightHandSide
 from twoloop.checks.consistency import check_start
 from twoloop.problem.system import ConstrainedSystem
@@ -24,6 +25,7 @@ METHODS = ("Adams", "BDF")
 MOST_STEPS = 10**7  # between two output times; its own 500 are soon used up
 
 
+@on_independent_rows
 def solve_cvode(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -21,6 +21,7 @@ from references.driver import TimeLimit, check_choice, check_run, check_toleranc
 from references.equations.accelerations import compiled_gamma
 from references.equations.nonholonomic import with_all_rows
 from references.equations.ode import states_at
+from references.equations.redundant_rows import on_independent_rows
 from references.sundials.ida_options import (
     ALL,
     HIGHEST_ORDER,
@@ -56,6 +57,7 @@ _RESIDUAL = types.void(types.float64, _READ, _READ, _VECTOR, *_SIZES, _VECTOR)
 _JACOBIAN = types.void(types.float64, _READ, _READ, types.float64, _MATRIX, *_SIZES, _VECTOR)
 
 
+@on_independent_rows
 def solve_ida(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from references.driver import TimeLimit, check_run, check_system, check_tolerances, longest_step, user_call
 from references.equations.accelerations import accelerations
 from references.equations.nonholonomic import with_all_rows
+from references.equations.redundant_rows import on_independent_rows
 from references.sundials.ida_compiled import compiled_for_ida
 from references.sundials.ida_options import ALL, HIGHEST_ORDER, check_options, own_tangent, tolerances
 from references.sundials.library import REAL, check, context, counted, flag_name, library, made
@@ -41,6 +42,7 @@ STEPS_A_CALL = 100  # between two looks at the clock
 IDA_NORMAL, IDA_ONE_STEP, IDA_TSTOP_RETURN, IDA_TOO_MUCH_WORK = 1, 2, 1, -1
 
 
+@on_independent_rows
 def solve_ida_c(
     system: ConstrainedSystem,
     t_span: tuple[float, float],

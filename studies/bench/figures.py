@@ -25,7 +25,7 @@ MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
 MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA"), ("SciPy", ""))  # family, how names begin
 ERROR = "largest position error over the run (m, rad)"
-LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: not run, or failed"
+LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: failed, or > a decade"
 
 mpl.rcParams.update(
     {
@@ -62,13 +62,13 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "TRBDF2": (SKY, "v"),
     "ESDIRK4": (GREY, "v"),
     "Gauss12": (BLUE, "s"),
-    "Gauss6": (SKY, "D"),
+    "Gauss6": (VIOLET, "D"),
     "SunRadau5": (PINK, "v"),
     "RadauIIA5": (ORANGE, "^"),
     "RadauIIA9": (BROWN, "^"),
     "RadauIIA13": (MAGENTA, "^"),
     "RadauIIA5, by differences": (GREY, "^"),
-    "Gauss6, Newton": (SKY, "X"),
+    "Gauss6, Newton": (VIOLET, "X"),
     "BDF": (GREEN, "P"),
     "Newmark": (GREY, "h"),
     "PaperIRK": (YELLOW, "H"),
@@ -133,7 +133,7 @@ def _pairs() -> list[tuple[str, str]]:
 
 
 def _look_of(solver: str) -> tuple[str, str]:
-    """That of a solver; of one that nobody knows, by its name, one that nobody has."""
+    """That of a solver; of an unknown one, by its name, one that no other solver has."""
     known = looks()
     if (name := SAME.get(solver, solver)) in known:
         return known[name]

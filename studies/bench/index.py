@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from studies.bench import tables
 from studies.bench.cli import StudyError
 from studies.bench.headline import BEST
 from studies.bench.render import number, power, render
@@ -81,13 +82,23 @@ def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[s
 
 
 def _at_error(at: dict[str, Any]) -> dict[str, Any]:
-    """The line of a largest position error."""
+    """The line of a largest position error.
+
+    times: of the default, the compiled default and the best of ours. neighbour: a rival that has no run within a
+    decade of the error, and has one beside it that is cheaper than the cheapest of others.
+    """
     told = {key: at[key] for key in ("ida", "ida_missed", "ida_tightest", "standing")}
     line: dict[str, Any] = {"accuracy": power(at["error"]), **told, **dict.fromkeys(WHOSE)}
-    line["undecided"] = at["standing"] is not None and at["standing"][BEST]["verdict"] == "undecided"
+    standing = at["standing"] or {}
+    line["times"] = {who: stands["call_s"] for who, stands in standing.items()}
+    line["undecided"] = bool(standing) and standing[BEST]["verdict"] == "undecided"
     for which in (which for which in WHOSE if at[which]):
         line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
-    return line
+    rival = standing.get(BEST, {}).get("rival") or {}
+    cheaper = bool(rival.get("solver")) and (
+        line["others"] is None or tables.LEAST * rival["call_s"] < line["others"]["call_s"]
+    )
+    return line | {"neighbour": rival if cheaper else None}
 
 
 def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
@@ -96,6 +107,7 @@ def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
     These are made once: times that differ by less than a share `equal` are not told apart.
     """
     line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
+    line |= {"times": at["times"], "neighbour": None}
     for which in WHOSE:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:
@@ -139,7 +151,7 @@ def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 def overall(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Solvers that are the cheapest of all at any error of any entry, and at how many; the most frequent first.
 
-    Errors at which ours and others are not told apart count for nobody.
+    Errors at which ours and others are not told apart count for neither.
     """
     chosen: Counter[str] = Counter()
     for pick in (pick for entry in entries for pick in entry["picks"]):

@@ -143,7 +143,7 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     """Of the solvers of one case that get to an error and were asked for about so much, what they take.
 
     `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
-    either side, so that nobody is ahead of a solver for want of a run.
+    either side, so that no solver is ahead of another for want of a run.
     """
     found = {}
     for solver, own in rows.groupby("solver", sort=False):

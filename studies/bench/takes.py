@@ -49,9 +49,9 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
 
 
 def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
-    """Who is the cheapest at more than half of the errors that any solver reaches on one mechanism; else nobody.
+    """The cheapest solver at more than half of the errors that any reaches on one mechanism; "" where there is none.
 
-    Nobody is where ours and others are not told apart, nor where others were not asked.
+    Errors at which ours and others are not told apart, or others were not asked, count for no solver.
     """
     won: Counter[str] = Counter()
     for line in at:

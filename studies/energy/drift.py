@@ -12,7 +12,7 @@ EPS = float(np.finfo(float).eps)
 RESOLVED = 3.0  # standard errors from which a slope counts as one
 DRIFTS, SLOWLY, ROUNDS, IRREGULAR = "drifts", "drifts within the swing", "drifts within rounding", "changes irregularly"
 NO_DRIFT, IS_LOST = "no drift", "lost"
-CALM = (NO_DRIFT, ROUNDS)  # verdicts under which a method may be called free of drift
+DRIFTING = (DRIFTS, SLOWLY, ROUNDS)  # verdicts of runs with a slope; irregular changes have none, nor are they calm
 WINDOWS = 100  # at most, in which the energy error is averaged
 BLOCKS = 10  # of windows; the scatter of their slopes is the uncertainty of the slope
 

@@ -9,13 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from references.casadi.integrators import solve_idas
+from references.casadi.integrators import solve_cvodes
 from references.diffrax.dopri8 import solve_diffrax
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.index1 import solve_index1
 from studies.bench.collector import Case, Run, Solver
+from studies.bench.headline import OWN_CODE
 from studies.bench.reference_motion import ReferenceMotion
-from studies.bench.solvers import CATALOGUE, CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.bench.solvers import (
+    CATALOGUE,
+    CVODE_C,
+    CVODES,
+    DEFAULT,
+    DIFFRAX,
+    HEYOKA,
+    IDA_C,
+    IRK,
+    OWN_BDF,
+    OWN_EXPLICIT,
+)
 from studies.energy.drift import drift, windows
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar
@@ -34,7 +46,7 @@ LONG, QUICK = 10_000.0, 75.0  # s
 FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
 TIME_LIMIT = 300.0  # CPU s
 MOST_STEPS = 30_000_000  # of solvers that count them and do not look at the clock
-NOT_QUICK = (DIFFRAX, IDAS)  # compile for seconds
+NOT_QUICK = (DIFFRAX, CVODES)  # compile for seconds
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 SUN, GAUSS, RADAU, MIDPOINT = "Sun Radau IIB(3)", "Gauss(3)", "Radau IIA(3)", "implicit midpoint"
@@ -65,13 +77,14 @@ TOL = 1e-5  # Rtol = Atol
 LSODA, PROJECTED = "LSODA, index 1", "DOP853, projected"
 ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
 OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tight; quick: the first
-    OWN_EXPLICIT: (1e-6, 1e-8, 1e-10, 1e-12),
+    **dict.fromkeys((DEFAULT, OWN_CODE, OWN_EXPLICIT), (1e-6, 1e-8, 1e-10, 1e-12)),
     "Gauss12": (1e-5, 1e-7),
-    **dict.fromkeys((IDA_C, HEYOKA, CVODE_C, DIFFRAX, IDAS), (1e-6, 1e-8, 1e-10, 1e-12)),
+    **dict.fromkeys((IDA_C, CVODE_C, DIFFRAX, CVODES), (1e-6, 1e-8, 1e-10, 1e-12)),
+    HEYOKA: (1e-6, 1e-8, 1e-10, 1e-12, 1e-14),
     LSODA: (1e-8, 1e-10, 1e-12),
     PROJECTED: (1e-7, 1e-9, 1e-11),
     ALPHA: (0.01,),
-    TRAPEZOIDAL: (0.02, 0.01),
+    TRAPEZOIDAL: (0.02, 0.01, 0.005),
 }
 
 
@@ -112,10 +125,10 @@ def _fixed(method: Method, case: Case, h: float, repeat: int) -> Result:
     return _solve(method, case, step_size=h, t_eval=instants(case, h))
 
 
-def _controlled(method: str | Method, case: Case, tol: float, repeat: int) -> Result:
+def _controlled(method: str | Method, case: Case, tol: float, repeat: int, compiled: bool = False) -> Result:
     """Every step is stored, except where steps are much shorter than the intervals of the sampling instants."""
     short = (method == "DOP853" and tol < 1e-9) or isinstance(method, BDF)
-    return _solve(method, case, rtol=tol, atol=tol, t_eval=case.instants if short else None)
+    return _solve(method, case, rtol=tol, atol=tol, t_eval=case.instants if short else None, compiled=compiled)
 
 
 def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int) -> Result:
@@ -139,11 +152,13 @@ def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
 
 
 ADAPTERS: dict[str, Callable[[Case, float, int], Result]] = {  # that store states at the case's instants
+    DEFAULT: partial(_controlled, "auto"),
+    OWN_CODE: partial(_controlled, "auto", compiled=True),
     OWN_EXPLICIT: partial(_controlled, "DOP853"),
     "Gauss12": partial(_controlled, "Gauss12"),
     **{name: CATALOGUE[name].run for name in (IDA_C, HEYOKA, CVODE_C)},
     DIFFRAX: partial(_long, solve_diffrax),
-    IDAS: partial(_long, solve_idas),
+    CVODES: partial(_long, solve_cvodes),
     LSODA: partial(_index1, "LSODA", "none"),
     PROJECTED: partial(_index1, "DOP853", "projection"),
     ALPHA: partial(_exudyn, "GeneralizedAlpha"),

@@ -1,5 +1,6 @@
 """Energy over long times: which methods let it drift, what a run without drift costs, and why."""
 
+from collections import Counter
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -9,12 +10,13 @@ from matplotlib.figure import Figure
 
 from studies.bench import figures
 from studies.bench.cli import StudyError
+from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
-from studies.bench.solvers import CVODE_C, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
+from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Series, Study, key
 from studies.bench.tables import setting, unfinished
 from studies.energy import runs as energy_runs
-from studies.energy.drift import CALM, DRIFTS, SLOWLY, bound, verdict
+from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,
     EVEN,
@@ -33,7 +35,7 @@ from studies.energy.runs import (
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
-DRAWN = (OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
+DRAWN = (DEFAULT, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
@@ -67,8 +69,13 @@ def told(row: pd.Series) -> dict[str, Any]:
     found |= {name: row[name] for name in ("verdict", "status")}
     found["label"] = f"{row['name']}, {setting(row)}"
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
-    found |= {"calm": row["verdict"] in CALM, "drifts": row["verdict"] in (DRIFTS, SLOWLY)}
+    found |= {"calm": row["verdict"] == NO_DRIFT, "drifts": row["verdict"] in DRIFTING}
     return found | {"keeps": bool(row["keeps_constraints"])}
+
+
+def _fate(verdict: str) -> str:
+    """What became of the energy in one word, of a verdict."""
+    return "drift" if verdict in DRIFTING else verdict if verdict in (NO_DRIFT, IS_LOST, IRREGULAR) else "fail"
 
 
 def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
@@ -79,7 +86,7 @@ def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
     reached = rows[(rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
-    calm, own = reached["verdict"].isin(CALM), reached["family"] == "two-loop"
+    calm, own = reached["verdict"] == NO_DRIFT, reached["family"] == "two-loop"
     kinetic = float(reached["kinetic"].iloc[0])
     at = []
     for share in (np.inf, *SHARES):
@@ -87,6 +94,8 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         level: dict[str, Any] = {"share": share, "energy": share * kinetic}
         for name, which in (("no_drift", good & calm), ("drift", good & ~calm)):
             level[name] = {"ours": cheapest(reached[which & own]), "others": cheapest(reached[which & ~own])}
+        times = {name: reached[good & (reached["solver"] == name)]["call_s"] for name in (DEFAULT, OWN_CODE)}
+        level["times"] = {name: float(each.min()) for name, each in times.items() if len(each)}
         free, other = cheapest(reached[good & calm]), cheapest(reached[good & ~calm])
         over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
@@ -124,8 +133,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     fixed = rows[(rows["group"] == "fixed") & (rows["case"] == SWITCHING)]
     even = fixed["partition"] == "symmetric"
     kinds = {"lasting": ~even, "even": even & (fixed["solver"] != SUN), "uneven": even & (fixed["solver"] == SUN)}
-    calm = {name: fixed[which]["verdict"].isin(CALM) for name, which in kinds.items()}
-    controlled = rows[(rows["group"] == "controlled")]["verdict"].isin((DRIFTS, SLOWLY))
+    calm = {name: fixed[which]["verdict"] == NO_DRIFT for name, which in kinds.items()}
+    controlled = rows[rows["group"] == "controlled"]
+    steady = controlled[~controlled["verdict"].isin(DRIFTING)]
     sun, gauss, canonical = (told(pick(rows, ONE, *which)) for which in ((SUN,), (GAUSS,), (SUN, MOMENTA)))
     both = {"one": ONE, "switching": SWITCHING}
     return {
@@ -140,7 +150,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "n": {name: len(each) for name, each in calm.items()},
         "n_calm": {name: int(each.sum()) for name, each in calm.items()},
         "n_controlled": len(controlled),
-        "n_controlled_drift": int(controlled.sum()),
+        "controlled_steady": [told(run) | {"case": run["case"]} for _, run in steady.iterrows()],
+        "lasting": dict(Counter(fixed[kinds["lasting"]]["verdict"].map(_fate))),
         "newmark": {name: told(pick(rows, motion, NEWMARK)) for name, motion in both.items()},
         "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
         "failed": unfinished(rows),
@@ -161,7 +172,7 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
     title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps"
     figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")
-    calm = long[long["verdict"].isin(CALM)]
+    calm = long[long["verdict"] == NO_DRIFT]
     for axes, what in zip(figure.axes, ("call_s", "n_evaluations"), strict=True):
         ring: dict[str, Any] = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 0.8}
         axes.plot(calm["error_q"], calm[what], "o", color="black", **ring)

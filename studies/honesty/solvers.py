@@ -93,8 +93,11 @@ def why_not(name: str, trap: Trap) -> str:
         return "its adapter takes neither first nor constant steps"
     if name.endswith(LIMITED) and trap.steps:
         return "the trap sets max_step itself"
-    if theirs and trap.impulse and not solver.startswith("IDA"):
-        return "our form of index 1 lacks the impulse: its solvers are given other equations"
+    if theirs and not solver.startswith("IDA"):  # its equations are the accelerations, which we derive for it
+        if trap.group == INPUT:
+            return "it is given accelerations: it has no constraints to check"
+        if trap.impulse or trap.singular:
+            return "the accelerations are not defined throughout: of an impulse, or where C_q loses rank"
     if solver == HEYOKA and find_spec("heyoka") is None:
         return "heyoka is not installed"
     return "it takes compiled functions only" if solver in COMPILED_ONLY and trap.system.called_in_python else ""

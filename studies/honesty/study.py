@@ -222,7 +222,7 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says: of mistakes and forces, how far ours can be trusted on both, and what was held out."""
     rows, forces, inputs, held = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT, HELD_OUT))
     both = pd.concat([rows, forces])
-    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(both), "totals": totals(both)}
+    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(both)}
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
@@ -308,12 +308,15 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     ]
     found["counts"] = {name: counts_of(rows[rows["solver"] == name]) for name in names}
     found["unasked"] = int(unasked(rows).sum())
-    return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
+    found |= {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
+    for whose in ("ours", "limited"):
+        found[f"{whose}_traps"] = list(dict.fromkeys(line["trap"] for line in found[f"{whose}_bad"]))
+    return found
 
 
 def outcomes(found: dict[str, Any], names: Sequence[str], without: set[str]) -> str:
     """A line for each trap, a column for each solver."""
-    short = [name.replace(OURS, "") for name in names]
+    short = [name.removesuffix(OURS).removesuffix(LIMITED) for name in names]
     lines = [
         [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in names)]
         for each in found["cells"]
@@ -343,23 +346,27 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write findings, figure and report."""
     found = findings_of(rows)
     output.save_findings(found)
-    figures.save(honesty_picture.picture(found["totals"], PARTS), output, "honesty")
+    figures.save(honesty_picture.picture(found["held_out"]["solvers"], PARTS), output, "honesty")
     alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
     as_they_come = [name for name in found["solvers"] if not name.endswith(LIMITED)]
     ready = {"cells": outcomes(found, as_they_come, alike)}
-    ready["input"] = outcomes(found["input"], found["input"]["solvers"], set())
+    with_max_step = [name for name in found["solvers"] if name.endswith(LIMITED)]
+    calm = {each["trap"] for each in found["cells"]} - set(found["limited_traps"])
+    ready["limited"] = outcomes(found, with_max_step, calm) if found["limited_traps"] else ""
+    asked = [name for name, counts in found["input"]["counts"].items() if counts[NOT_RUN] < counts["n"]]
+    ready["input"] = outcomes(found["input"], asked, set())
     both = found["forces"], found["held_out"]
     whose = {"ours": "ours", "others": "others", "limited": "others, max_step"}
     held = {each["family"]: each for each in both[1]["families"]}
     ready["forces"] = table(
-        ["force", *whose.values(), *(f"held out: {words}" for words in whose.values())],
+        ["force", *(f"{part}: {words}" for part in ("held out", "first") for words in whose.values())],
         [
-            [each["family"], *(told(part.get(who)) for part in (each, held.get(each["family"], {})) for who in whose)]
+            [each["family"], *(told(part.get(who)) for part in (held.get(each["family"], {}), each) for who in whose)]
             for each in both[0]["families"]
         ],
     )
-    by_solver = [{each["solver"]: each for each in part["solvers"]} for part in both]
-    ready["solvers"] = table(["solver", "first set", "held out"], of_solvers(by_solver))
+    by_solver = [{each["solver"]: each for each in part["solvers"]} for part in reversed(both)]
+    ready["solvers"] = table(["solver", "held out", "first set"], of_solvers(by_solver))
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 

@@ -5,7 +5,7 @@ One set of compiled callbacks serves those on chains of point masses: what makes
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -171,8 +171,8 @@ class Trap:
         `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
     unnoticed : ConstrainedSystem or None
         The system as it is for a solver that never evaluates it where the trap lies.
-    impulse : bool
-        Whether velocities jump.
+    impulse, singular : bool
+        Whether velocities jump, or C_q loses rank on the way.
     n_drawn : int
         How many forces were drawn until the motion under one was known.
     """
@@ -192,6 +192,7 @@ class Trap:
     unnoticed: ConstrainedSystem | None = None
     group: str = MISTAKE
     impulse: bool = False
+    singular: bool = False
     n_drawn: int = 1
 
 
@@ -213,7 +214,8 @@ def of_linkages() -> Iterator[Trap]:
     """Singular positions, dead points, and positions where the two assemblies of a linkage nearly meet."""
     for n in (1, 2):
         problem = n_four_bar(n)
-        yield of_motion("singular position crossed", problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
+        trap = of_motion("singular position crossed", problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
+        yield replace(trap, singular=True)
     for ground in (2.0, 1.9):  # bars 1 and 2 come into line: the angle of bar 3 does not determine theirs
         problem = four_bar((0.8, 1.2, 1.0), ground)
         yield of_motion("dead point", problem, partial(end_of, problem))

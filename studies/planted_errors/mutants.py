@@ -238,7 +238,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     """Write the findings; planted_errors.md shows them."""
-    output.save_findings(findings_of(rows))
+    output.save_findings(findings_of(rows) | {"made": line})
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -1,5 +1,6 @@
 """Runs of random mechanisms under sharp forces, judged by their motion in independent coordinates, and their counts."""
 
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -8,6 +9,7 @@ import pandas as pd
 from studies.bench.sharp_forces import FRICTION, families
 from studies.bench.sharp_motion import RIGHT, SAID, SILENT, Mechanism, Motion, case, judged
 from studies.bench.store import Row
+from studies.honesty.study import REFUSALS
 
 METHODS = (  # all presets but the paper's, and code made for the mechanism
     *("auto", "auto, compiled", "Taylor", "Taylor, compiled", "Adams", "DOP853", "Gauss4", "Gauss6", "Gauss8"),
@@ -72,11 +74,14 @@ def features(quick: bool) -> Iterator[Part]:
 
 
 def counts(rows: pd.DataFrame) -> dict[str, Any]:
-    """Outcomes, and those of each method; every run that is wrong and silent by its name."""
+    """Outcomes, and those of each method; every run that is wrong and silent by its name. What is refused is no run."""
+    refused = rows["message"].fillna("").str.contains("|".join(map(re.escape, REFUSALS)))
     silent = rows[rows["outcome"] == SILENT]
 
     def of(own: pd.DataFrame) -> dict[str, int]:
-        return {"n": len(own)} | {what: int((own["outcome"] == what).sum()) for what in (RIGHT, SAID, SILENT)}
+        ran = own[~refused[own.index]]
+        line = {what: int((ran["outcome"] == what).sum()) for what in (RIGHT, SAID, SILENT)}
+        return {"n": len(ran), "refused": len(own) - len(ran)} | line
 
     found: dict[str, Any] = of(rows) | {"n_mechanisms": len(rows.groupby(["what", "name", "value"], dropna=False))}
     found["methods"] = [{"method": str(name)} | of(own) for name, own in rows.groupby("method", sort=False)]

@@ -34,7 +34,6 @@ N_LINKAGES, N_QUICK = 100, 2  # of each kind
 SIZES = tuple(10.0**k for k in (-15, -12, -9, -6, -3, 0, 3, 6, 9, 12, 15))
 DENSITIES = tuple(10.0**k for k in (-15, -10, -5, 0, 5, 10, 15))  # kg/m, of all bars
 RATIOS = tuple(10.0**k for k in (-10, -8, -5, 5, 8, 10))  # of bar 2 to the others
-WANTED_SIZES, WANTED_DECADES = (1e-6, 1e3), 10  # what we aim at
 LONG_STEP, LONG_STEPS, LONG_QUICK = 1e-3, (100_000, 1_000_000), (2_000, 10_000)  # s, largest step; their numbers
 STATES = 1000  # states of a long run that are stored
 GROWS = 10.0  # times, from the first tenth of a run to the last: then the violation grows
@@ -214,9 +213,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["long_grow"] = [line["method"] for line in found["long"] if line["grows"]]
     found["most_bytes"] = max(line["bytes"] for line in found["long"])
     sizes = [line for line in found["scales"] if line["group"] == "size"]
-    reach = [line["low"] is not None and line["low"] <= WANTED_SIZES[0] for line in sizes]
-    reach += [line["high"] is not None and line["high"] >= WANTED_SIZES[1] for line in sizes]
-    found |= {"sizes_reached": all(reach), "wanted_sizes": list(WANTED_SIZES), "wanted_decades": WANTED_DECADES}
+    ends = [(line["low"], line["high"]) for line in sizes if line["low"] is not None and line["high"] is not None]
+    lows, highs = zip(*ends, strict=True) if len(ends) == len(sizes) else ((np.inf,), (0.0,))
+    found["sizes"] = [max(lows), min(highs)] if max(lows) <= min(highs) else None
     return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
 
 
@@ -253,13 +252,13 @@ def tables_of(found: dict[str, Any]) -> dict[str, str]:
         ]
         for line in found["long"]
     ]
-    always = [line for line in found["sharp"]["methods"] if not line[SAID] and not line[SILENT]]
+    always = [line for line in found["sharp"]["methods"] if line["n"] == line[RIGHT] and not line["refused"]]
     others = [line for line in found["sharp"]["methods"] if line not in always]
-    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT))] for line in others]
+    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT, "refused"))] for line in others]
     if always:
-        sharp.append([", ".join(line["method"] for line in always), f"all {always[0][RIGHT]}", 0, 0])
+        sharp.append([", ".join(line["method"] for line in always), f"all {always[0][RIGHT]}", 0, 0, 0])
     return {
-        "sharp": table(("method", RIGHT, SAID, SILENT), sharp),
+        "sharp": table(("method", RIGHT, SAID, SILENT, "no run"), sharp),
         "linkages": table(("method", *kinds, "median error", "worst / allowed"), drawn),
         "scales": table(("method", "size, m", "density, kg/m", "density of bar 2 over the others"), reached),
         "long": table(("method", "steps", "max abs C", "max abs C_q v", "energy (J)", "bytes a step"), lasting),

@@ -121,7 +121,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any] | None:
     for error in ERRORS:
         ours, others = tables.costs_at(medians[own], error), tables.costs_at(medians[~own], error, doubt=True)
         cheapest = [min(side, key=lambda name: side[name][0], default=None) for side in (ours, others)]
-        at.append({"error": error, "ours": cheapest[0], "rival": cheapest[1], **tables.compared(ours, others)})
+        line = {"error": error, "ours": cheapest[0], "rival": cheapest[1], **tables.compared(ours, others)}
+        at.append(line | {"run_s": {name: cost for name, (cost, _) in (ours | others).items()}})
     order = {way: k for k, way in enumerate((SWEEP, SINGLE, HEYOKA, DIFFRAX))}
     lines = sorted(medians[list(names)].to_dict("records"), key=lambda line: (order[line["way"]], -line["tol"]))
-    return {"lines": lines, "n": int(made["n_runs"].iloc[0]), "repeats": int(medians["repeats"].max()), "at": at}
+    over = [line["run_s"][SWEEP] / line["run_s"][SINGLE] for line in at if {SWEEP, SINGLE} <= line["run_s"].keys()]
+    found = {"lines": lines, "n": int(made["n_runs"].iloc[0]), "repeats": int(medians["repeats"].max()), "at": at}
+    return found | {"ways": list(order), "sweep_over_single": [min(over), max(over)] if over else None}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from studies.bench import figures, study
 from studies.bench.cli import StudyError
-from studies.bench.render import render, table
+from studies.bench.render import number, power, render, table
 from studies.bench.store import Output, sources
 from studies.sweep_linkages import many_runs
 from twoloop import Result, sweep
@@ -173,10 +173,12 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     scaling = rows[rows["group"] == "scaling"]
     cells = [(row["parallel"], int(row["workers"]), row["wall"]) for _, row in scaling.iterrows()]
     ready = {"scaling": table(["workers are", "number", "wall-clock time (s)"], cells)}
-    many = found["many"]["lines"] if found["many"] else []
-    lines = [(e["way"], e["tol"], 1e3 * e["call_s"], e["first_s"], e["error_median"], e["error_worst"]) for e in many]
-    names = ["way", "tolerance", "CPU time a run (ms)", "first call (s)", "median error", "largest error"]
-    ready["many"] = table(names, lines)
+    many = found["many"] or {"at": [], "ways": []}
+    lines = [
+        (way, *(number(1e3 * at["run_s"][way]) if way in at["run_s"] else "–" for at in many["at"]))
+        for way in many["ways"]
+    ]
+    ready["many"] = table(["way", *(power(at["error"]) for at in many["at"])], lines)
     text = render("sweep_linkages", found, ready, stamp=line, quick=output.call.quick)
     output.write("sweep_linkages.md", text)
 

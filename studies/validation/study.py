@@ -20,6 +20,7 @@ from studies.bench.solvers import (
     CATALOGUE,
     CVODE_C,
     CVODE_C_PROJECTED,
+    CVODES,
     DEFAULT,
     EXUDYN,
     HEYOKA,
@@ -59,7 +60,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
-    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, "IDAS, CasADi"),
+    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES),
     *("LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)
@@ -79,6 +80,8 @@ COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a proble
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (DEFAULT, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
+# their adapters tell states at given instants, between steps by interpolants: not where a step ends
+UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
 SHORT = {
@@ -106,7 +109,7 @@ def runs(quick: bool) -> list[Run]:
             case = case_of(problem, judged=True)
             found += [Run(case, CATALOGUE[name], tol, JUDGED, repeats=1) for name in solvers for tol in JUDGED_AT]
         if problem.system.n_a == 0 and not {"singular", "redundant"} & set(problem.tags):
-            steps = [name for name in solvers if name != IDA_C]  # whose adapter keeps none
+            steps = [name for name in solvers if name not in UNTOLD]
             at = DECEIVED_AT[-1:] if quick else DECEIVED_AT
             group = deceived.DECEIVED
             found += [Run(case_of(problem), CATALOGUE[name], tol, group, repeats=1) for name in steps for tol in at]
@@ -153,6 +156,8 @@ def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
     tight = own[own["tol"] == TIGHT]
     found: dict[str, Any] = {"solver": name, "family": str(own["family"].iloc[0])}
     found |= {what: int((own["outcome"] == what).sum()) for what in OUTCOMES}
+    found["limit"] = int(((own["outcome"] == "said so") & (own["status"] == "TIME_LIMIT")).sum())
+    found["said so"] -= found["limit"]
     slopes = [p for _, each in own.groupby("case", sort=False) if (p := slope(each)) is not None]
     found["slope"] = [float(x) for x in np.percentile(slopes, [25, 50, 75])] if slopes else None
     ratios = (own["error_q"] / own["tol"])[own["error_q"].notna()].astype(float)
@@ -257,7 +262,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "steps_at": list(DECEIVED_AT),
         "first_deceived": [line["solver"] for line in stepped if line["first"]],
     }
-    found |= {"n_runs": len(rows), "ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
+    found |= {"ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
     found["wrong"] = [
         {key: row[key] for key in ("case", "solver", "family", "tol", "error_q")} for _, row in wrong.iterrows()
     ]
@@ -267,6 +272,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     asked = [line["case"] for line in alone if line["others_put"] and not line["others_stopped"]]
     found["only_ours"] = [{"case": line["case"], "put": line["others_put"]} for line in alone if line["case"] in asked]
     found["not_put"] = [line["case"] for line in alone if line["case"] not in asked]
+    found["refused"] = bool((rows["outcome"] == "not run").any())
     found["n_others"] = int(rows[rows["family"] != "two-loop"]["solver"].nunique())
     singular = [problem.name for problem in (make() for make in MAKE) if "singular" in problem.tags]
     found["none_right_singular"] = all(
@@ -289,6 +295,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         if pd.notna(best["condition"]):
             line |= {"error": float(best["condition"]), "best": best["solver"], "tol": float(best["tol"])}
         passed = own[own["outcome"] == "right"]["solver"]
+        line["default"] = [float(tol) for tol in own[(own["solver"] == DEFAULT) & (own["outcome"] == "right")]["tol"]]
         found["judged"].append(line | {"passed": list(dict.fromkeys(passed))})
     ours = [line for line in found["wrong"] if line["family"] == "two-loop"]
     found["ours_wrong_tight"] = [line for line in ours if line["tol"] == TIGHT]
@@ -296,6 +303,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["n_inexact"] = {"ours": int(inexact.sum()), "others": int((~inexact).sum())}
     found["exact"] = EXACT
     found["n_wrong"] = {"ours": len(ours), "others": len(found["wrong"]) - len(ours)}
+    found["n_singular"] = sum(line["case"] in singular for line in found["wrong"] if line["family"] != "two-loop")
     ended = rows[rows["outcome"].isin(("right", "inexact", "wrong"))]["family"] == "two-loop"
     found["n_ended"] = {"ours": int(ended.sum()), "others": int((~ended).sum())}  # runs that report success
     return found | {"time_limit": TIME_LIMIT}
@@ -331,12 +339,12 @@ def picture(rows: pd.DataFrame) -> Figure:
 def lines(found: Sequence[dict[str, Any]], steps: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
     """Of the table of solvers, by their runs and by their steps."""
     stepped = {line["solver"]: percent(line["deceived"]) for line in steps if line["n"]}
-    keys = ("right", "inexact", "wrong", "said so", "ratio", "digits_q", "digits_v", "digits_lam")
+    keys = ("right", "inexact", "wrong", "said so", "limit", "ratio", "digits_q")
     for line in found:
         yield [line["solver"], *(line[key] for key in keys), stepped.get(line["solver"], "–")]
 
 
-HEADER = ("solver", "right", "inexact", "wrong", "said so", "error/tol", "q", "v", "λ", "deceived")
+HEADER = ("solver", "right", "inexact", "wrong", "said so", "our limit", "error/tol", "decimals", "deceived")
 
 
 def _of_exudyn(line: dict[str, Any] | None) -> str:

@@ -121,7 +121,7 @@ def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name, solvers):
         assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
 
 
-# --- output is nobody's in the time of a call
+# --- the time of a call has no output in it
 
 TIMES = np.linspace(0.0, 2.0, 201)
 WITH_OUTPUT = {

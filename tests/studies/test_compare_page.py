@@ -253,9 +253,13 @@ def test_what_the_library_does_in_a_browser(folder):
     reason="the reports are not made again since the whole call is timed",
 )
 def test_the_saved_rows_of_the_reports_can_be_shown(tmp_path):
+    kept: dict[str, float] = {}
     for name in compare_page.SOURCES:
         stamp, rest = (REPORTS / f"{name}.csv").read_text().split("\n", 1)
         rows = pd.read_csv(StringIO(rest), low_memory=False)
+        in_phase = rows[rows["error_q"].notna() & ~rows.get("astray", pd.Series(False, rows.index)).isin((True,))]
+        for case, error in in_phase.groupby("case")["error_q"].max().items():
+            kept[str(case)] = max(error, kept.get(str(case), 0.0))
         some = ["four-bar", "very flexible beam", *rows["case"].unique()[::9]]  # all take twenty seconds
         (tmp_path / f"{name}.csv").write_text(f"{stamp}\n{rows[rows['case'].isin(some)].to_csv(index=False)}")
     path = made(tmp_path)
@@ -268,7 +272,7 @@ def test_the_saved_rows_of_the_reports_can_be_shown(tmp_path):
     for name, shown in zip(names, in_node(path, acts)[1:], strict=True):
         assert shown["lines"], name
         errors = [error for line in shown["lines"] for error, _ in line["points"]]
-        assert "beam" not in name or max(errors) < 1.0  # m; runs that lost the motion are not drawn
+        assert "beam" not in name or max(errors) <= 1.01 * kept[name.rsplit(",", 1)[0]]  # without lost motions
         cells = re.sub(r'<td class="words">.*?</td>', "", shown["runs"])  # messages may speak of a NaN
         assert not re.search(r"NaN|Infinity|undefined", json.dumps(shown["lines"]) + cells), name
     assert math.isfinite(sum(each["floor"] for each in data["mechanisms"]))

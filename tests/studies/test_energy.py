@@ -10,7 +10,7 @@ import pytest
 from studies.bench.cli import Call
 from studies.bench.collector import attempt
 from studies.bench.render import render
-from studies.bench.solvers import CVODE_C, DIFFRAX, HEYOKA, IDA_C, IDAS, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.bench.solvers import CVODE_C, CVODES, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_BDF, OWN_EXPLICIT
 from studies.bench.store import Output
 from studies.energy import study as energy
 from studies.energy.drift import DRIFTS, IRREGULAR, IS_LOST, NO_DRIFT, ROUNDS, SLOWLY, drift, verdict, windows
@@ -37,7 +37,7 @@ from studies.energy.runs import (
 )
 from studies.energy.study import pick
 
-RIVALS = (HEYOKA, CVODE_C, IDAS, DIFFRAX)
+RIVALS = (HEYOKA, CVODE_C, CVODES, DIFFRAX)
 PERIOD = 2.2489859198
 
 
@@ -103,17 +103,17 @@ def test_findings_answer_the_first_screen(quick):
 def test_the_full_report_is_short_with_all_rivals(rows):
     """The words of the longest verdict in each line of a rival; the quick rows lack those that are slow to compile."""
     wordy = {"slope": -1e-13, "slope_error": 1e-15, "swing": 1e-6, "n_steps": 10**6, "energy": 1.1e-9, "t_end": 1e4}
-    more = rows[rows["solver"] == HEYOKA].assign(**wordy)
+    more = rows[rows["solver"] == IDA_C].assign(**wordy)
     rows = pd.concat([rows, *(more.assign(solver=name, name=name) for name in RIVALS)], ignore_index=True)
     found = energy.findings_of(rows)
     text = render("energy", found, {"failed": ""}, stamp="stamp; of a commit; of a processor, 2 cores", quick=False)
-    assert all(f"`{name}, tol" in text for name in RIVALS) and "within rounding" in text
+    assert all(f"`{name}, tol" in text for name in RIVALS) and "(rounding)" in text
     assert len(text.split()) < 1000
 
 
 def test_other_solvers_have_rows_near_the_true_motion(rows):
     others = rows[rows["group"] == "other"]
-    assert set(others["solver"]) >= {OWN_EXPLICIT, IDA_C, "LSODA, index 1", "DOP853, projected"}
+    assert set(others["solver"]) >= {DEFAULT, OWN_EXPLICIT, IDA_C, "LSODA, index 1", "DOP853, projected"}
     assert others[others["tol"] < 1e-6]["error_q"].max() < 0.1
 
 
@@ -180,9 +180,10 @@ def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of, quic
 
 def test_all_controlled_runs_drift_or_not(rows, found_of):
     found = found_of(changed(rows.copy(), "group == 'controlled'", slope=1.0, slope_error=0.0))
-    assert found["n_controlled_drift"] == found["n_controlled"] > 0
+    assert found["controlled_steady"] == [] and found["n_controlled"] > 0
     found = found_of(changed(rows, "group == 'controlled'", slope=0.0))
-    assert found["n_controlled_drift"] == 0 and found["paper"]["one"]["calm"] and found["paper"]["switching"]["calm"]
+    assert len(found["controlled_steady"]) == found["n_controlled"]
+    assert found["paper"]["one"]["calm"] and found["paper"]["switching"]["calm"]
 
 
 def test_freedom_from_drift_pays_where_it_is_cheaper(rows, found_of):
@@ -199,6 +200,7 @@ def test_freedom_from_drift_pays_where_it_is_cheaper(rows, found_of):
 
 
 def test_failed_and_lost_runs_are_found(rows, found_of):
+    rows = rows[rows["solver"] != HEYOKA]  # which is not installed everywhere
     gone = {"status": "NOT_CONVERGED", "t_reached": 0.1, "slope": math.nan, "slope_error": math.nan}
     rows = changed(rows, f"{ON_ONE}'{RADAU}'", energy=math.nan, swing=math.nan, **gone)
     found = found_of(changed(rows, "solver == 'LSODA, index 1'", lost=True))
@@ -292,5 +294,5 @@ def test_short_runs_are_seen_at_every_step():
 
 def test_every_run_of_the_full_study_has_a_key_of_its_own():
     listed = list(runs(False))
-    assert len({run.key(0) for run in listed}) == len(listed) < 70
+    assert len({run.key(0) for run in listed}) == len(listed) < 75
     assert {run.case.t_end for run in listed} == {LONG}

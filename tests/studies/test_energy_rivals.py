@@ -2,13 +2,13 @@
 
 import pytest
 
-from references.casadi.integrators import solve_idas
+from references.casadi.integrators import solve_cvodes
 from studies.bench.collector import attempt
 from studies.bench.figures import STYLES
-from studies.bench.solvers import CVODE_C, DIFFRAX, HEYOKA, IDAS
+from studies.bench.solvers import CVODE_C, CVODES, DIFFRAX, HEYOKA
 from studies.energy.runs import ADAPTERS, NOT_QUICK, OTHERS, QUICK, SWITCHING, case_of, measure, runs
 
-PACKAGES = {HEYOKA: "heyoka", CVODE_C: "sksundae", IDAS: "casadi", DIFFRAX: "diffrax"}
+PACKAGES = {HEYOKA: "heyoka", CVODE_C: "sksundae", CVODES: "casadi", DIFFRAX: "diffrax"}
 
 
 def test_the_rivals_are_among_the_runs():
@@ -44,11 +44,11 @@ def test_a_long_run_may_take_as_many_steps_as_it_needs():
     """The limit of the other studies, which have no clock in it, would end a long run."""
     pytest.importorskip("casadi")
     case = case_of(SWITCHING, QUICK)
-    assert ADAPTERS[IDAS](case, 1e-4, 0).stats.n_accepted > 1000
+    assert ADAPTERS[CVODES](case, 1e-4, 0).stats.n_accepted > 1000
     span = (0.0, case.t_end)
-    few = solve_idas(case.problem.system, span, *start(case), 1e-4, 1e-4, most_steps=100)
+    few = solve_cvodes(case.problem.system, span, *start(case), 1e-4, 1e-4, most_steps=100)
     assert not few.success and few.t.size == 0
-    run = next(run for run in runs(False) if run.solver.name == IDAS)
+    run = next(run for run in runs(False) if run.solver.name == CVODES)
     assert measure(type(run)(case, run.solver, 1e-4, "other", 1), few)["t_reached"] == 0.0  # a row, all the same
     with pytest.raises(ValueError, match="most_steps"):
-        solve_idas(case.problem.system, span, *start(case), most_steps=0)
+        solve_cvodes(case.problem.system, span, *start(case), most_steps=0)

@@ -133,17 +133,17 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
+        tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
-    assert "None of ours is wrong and silent" in text(rows) and "All that are run are right: a; b." in text(rows)
+    assert "None of ours is silent" in text(rows) and "All that are run are right: a; b." in text(rows)
     assert "run but one are right" not in text(rows)
     rows.loc[3, "outcome"] = honesty.SAID
     told = text(rows)
     assert "All that are run but one are right, and it says so: b (LSODA, index 1)." in told and "are right: a." in told
     rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
     told = text(rows)
-    assert "or hang: 1. BDF (two-loop) on *b*, chain of 2: wrong and silent, error 1e-9 m." in told
+    assert "- Of ours 1 run is silent or hangs: b." in told
     assert "run but one are right" not in told
     assert "All that are run are right: a." in told and "All that are run say so" not in told
     assert "No solver notices: b" in told
@@ -175,21 +175,19 @@ def rows_of_forces(wrong=()):
 
 def told_of_forces(rows):
     found = honesty.findings_of(rows)
-    tables = dict.fromkeys(("cells", "input", "forces", "solvers"), "")
+    tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
     return found, render("honesty", found, tables, stamp="stamp", quick=False)
 
 
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces())
     assert found["trust"]["default"] == {"n": 2, "wrong": 0, "unasked": 0, "n_mistakes": 1, "n_forces": 1, "refused": 0}
-    assert "None of ours is wrong and silent on the first set." in text
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
     wrong = {"default": 0, "compiled": 1, "ours": 1, "others": 1, "limited": 0}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
-    assert "| the default, compiled | 1 | 1 | 1 of 2 | 0 | 0 |" in text
-    assert "| other projects' solvers as they come | 1 | 1 | 1 of 2 |" in text
-    assert "| the same with max_step | 1 | 1 | 0 of 2 |" in text
-    assert "gust (BDF, auto, compiled)." in text
+    assert "| the default, compiled | 0 of 0 | 1 of 2 | 0 | 0 |" in text
+    assert "| other projects' solvers as they come | 0 of 0 | 1 of 2 | 0 |" in text
+    assert "| the same with max_step | 0 of 0 | 0 of 2 | 0 |" in text
     line = found["forces"]["families"][0]
     assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == line["limited"][honesty.RIGHT] == 1
 
@@ -201,7 +199,7 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["cells"][0][OURS] == [honesty.UNASKED] and found["unasked"] == 2
-    assert "or hang: 1. auto (two-loop) on *a*" in text and "None of ours is wrong and silent, and" not in text
+    assert "- Of ours 1 run is silent or hangs: a." in text and "None of ours is silent, and" not in text
 
 
 @pytest.mark.parametrize(
@@ -222,7 +220,7 @@ def test_a_refusal_is_no_run(message):
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert "| the default, compiled | 0 | 1 | 0 of 1 | 0 | 1 |" in text
+    assert "| the default, compiled | 0 of 0 | 0 of 1 | 0 | 1 |" in text
 
 
 def test_what_a_refusal_says_is_what_is_said():
@@ -262,8 +260,7 @@ def test_forces_held_out_are_others_and_counted_apart():
     apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
     found, text = told_of_forces(pd.concat([rows_of_forces(), apart], ignore_index=True))
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "On the one held out: auto under gust on pendulum, error 1e-9." in text
-    assert "repaired on the first set of forces; they were not on the one held out" in text
+    assert "| auto | gust | pendulum | 1e-9 |" in text and "were drawn after the repairs" in text
 
 
 def test_checks_of_the_input_are_counted_apart():

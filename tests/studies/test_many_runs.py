@@ -65,6 +65,7 @@ def said(times, **more):
 def test_sentences_follow_the_rows():
     text = said({SWEEP: 0.02, SINGLE: 0.01, HEYOKA: 0.0005})
     assert f"For a largest error of 1e-6 {HEYOKA} takes least: {SINGLE} takes 20 times as long a run." in text
+    assert "`twoloop.sweep` takes 2.0 to 2.0 times as long a run as `solve_dae` in a loop" in text
     text = said({SWEEP: 0.02, SINGLE: 0.01, HEYOKA: 0.5})
     assert f"For a largest error of 1e-6 ours takes least: {HEYOKA} takes 50 times as long a run as {SINGLE}." in text
     assert "are not told apart" in said({SINGLE: 0.01, SWEEP: 0.02, HEYOKA: 0.0102})

@@ -112,6 +112,7 @@ def rows_of(outcome, last=1e-16):
     long = {"group": "long", "what": "long", "method": "BDF", "outcome": "right", "n_steps": 10, "bytes_a_step": 50.0}
     long |= {"first_q": 1e-16, "last_q": last, "first_v": 1e-16, "last_v": 1e-16, "energy": 1e-9}
     sharp = {"group": "sharp", "what": "drag", "name": "pendulum", "method": "auto", "outcome": outcome, "value": 0.0}
+    sharp["message"] = "REACHED_END"
     return pd.DataFrame([*lines, long | {"value": 1.0}, long | {"value": 10.0}, sharp])
 
 
@@ -131,5 +132,5 @@ def test_sentences_turn_with_the_rows():
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
     assert "Wrong and silent: 2 runs" in bad
     assert "half of them friction, 1 are wrong and silent: drag 1." in bad
-    assert "Not all methods are right from" in bad
+    assert "All methods are right from" in bad and "from 1 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
