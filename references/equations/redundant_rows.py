@@ -1,8 +1,8 @@
 """Rows of C_q that follow from others, for solvers whose matrices they would make singular.
 
 A user of such a solver leaves them out of the mechanism. So do the adapters of IDA, CVODE, SciPy and solve_dae; those
-of solvers that take expressions do it in `references.equations.expressions`. A row that depends on others at the start may become
-independent later, so every row left out is checked at the end of the run.
+of solvers that take expressions do it in `references.equations.expressions`. A row that depends on others at the start
+may become independent later, so every row left out is checked at the end of the run.
 """
 
 from collections.abc import Callable

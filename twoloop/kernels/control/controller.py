@@ -8,8 +8,8 @@ from twoloop.kernels.data.common import SETTLE, compiled, kernel, merged
 
 KEPT = 1.2  # with the trend, a factor from 1 to this leaves the step as it is: new factors of Newton's matrix cost
 
-# places in a rule: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX; LEAST_ERROR is what a smaller
-# error counts as in the trend (Hairer & Wanner II, IV.8), 0: without the trend
+# places in a rule: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX; LEAST_ERROR is what a
+# smaller error counts as in the trend (Hairer & Wanner II, IV.8), 0: without the trend
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # places in the past: size and error of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
