@@ -9,8 +9,8 @@ from tests.general.mechanisms import mechanism
 from tests.general.runs import error
 from tests.problems import force_residual, violations, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
+from twoloop.kernels.algebra.sparse import MANY, sparse_pays
 from twoloop.kernels.data import common
-from twoloop.kernels.evaluation.augmented import MANY, augmented_pays
 from twoloop.mechanisms import n_four_bar
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
@@ -32,7 +32,7 @@ KINDS = (
 @pytest.fixture
 def choose(monkeypatch):
     """What makes every run take the form that is asked for."""
-    return lambda sparse: monkeypatch.setattr(workspace_module, "augmented_pays", lambda *sizes: sparse)
+    return lambda sparse: monkeypatch.setattr(workspace_module, "sparse_pays", lambda *sizes: sparse)
 
 
 def started(problem, method=DOP853()):  # noqa: B008
@@ -78,8 +78,8 @@ def test_a_chain_of_fourteen(choose, closed, method):
 
 
 def test_chosen_where_rows_and_degrees_of_freedom_are_many():
-    assert augmented_pays(2 * MANY, MANY, True) and augmented_pays(500, 499, False)
-    assert not augmented_pays(500, MANY - 1, True) and not augmented_pays(500, 499, True)
+    assert sparse_pays(2 * MANY, MANY, True) and sparse_pays(500, 499, False)
+    assert not sparse_pays(500, MANY - 1, True) and not sparse_pays(500, 499, True)
     assert form(started(chain(MANY, False))) == common.AUGMENTED
     assert form(started(chain(MANY - 1, False))) == common.NULL_SPACE
     assert form(started(n_four_bar(2))) == common.NULL_SPACE

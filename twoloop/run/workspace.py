@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
+from twoloop.kernels.algebra.sparse import sparse_pays
 from twoloop.kernels.data import common
-from twoloop.kernels.evaluation.augmented import augmented_pays
 from twoloop.kernels.layout import make_work
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
@@ -34,7 +34,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
     flags[common.DENSE_FORM] = flags[common.FORM]
-    sparse = augmented_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
+    sparse = sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
     functions = system.functions._replace(flags=flags)

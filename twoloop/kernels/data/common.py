@@ -30,7 +30,7 @@ Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is not banded; FORM: how accelerations
-# are found, see accelerations.py; DENSE_FORM: what it becomes where sparse factors have too many entries;
+# are found, see algebra/saddle_point.py; DENSE_FORM: what it becomes where sparse factors have too many entries;
 # STRAIGHT: 1 where the inner loop is code made for the mechanism, see straight_code.py
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED = range(3)  # forms
@@ -153,8 +153,8 @@ def _type_of_work(value: Any, context: Any) -> Any:
     CONTRADICTION,  # row that was taken for redundant and is violated
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
-    MASS_SCALE,  # s of the augmented matrix, see augmented.py
-    FACTORED,  # 1: its factors belong to w.M and w.G
+    MASS_SCALE,  # s of the augmented matrix, see algebra/sparse.py
+    FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step

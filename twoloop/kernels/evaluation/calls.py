@@ -3,6 +3,7 @@
 A step gets a `Kit`, the callbacks and this function; the helpers here name its tasks.
 """
 
+from twoloop.kernels.algebra.patterns import has_new_entries
 from twoloop.kernels.data.common import (
     DONE,
     INNER,
@@ -15,11 +16,10 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.accelerations import accelerate, acceleration_constraint, equilibrate, factor_mass
+from twoloop.kernels.evaluation.accelerations import accelerate, acceleration_constraint, equilibrate, mass_there
 from twoloop.kernels.evaluation.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
 from twoloop.kernels.evaluation.onto_constraints import accelerate_there, to_constraints
 from twoloop.kernels.evaluation.partition import (
-    has_new_entries,
     note_entries,
     partition_of_midpoint,
     renew,
@@ -67,7 +67,7 @@ def _other_task(f, w, task, t, q, v):
         w.notes[KNOWN] = 0.0
         return acceleration_constraint(f, w, t, q, v)
     if task == MASS:
-        return factor_mass(f, w, t, q)
+        return mass_there(f, w, t, q)
     if task == RENEW:
         return renew(f, w, t, q)
     if task == MIDPOINT:

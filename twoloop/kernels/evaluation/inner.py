@@ -24,6 +24,7 @@ from twoloop.kernels.data.common import (
     compiled,
     merged,
 )
+from twoloop.kernels.data.finite import CONSTRAINT, JACOBIAN, finite, not_finite
 from twoloop.kernels.evaluation.constraints import (
     clear_rows,
     constraint_rates,
@@ -32,7 +33,6 @@ from twoloop.kernels.evaluation.constraints import (
     kinematics,
     row_residual,
 )
-from twoloop.kernels.evaluation.finite import CONSTRAINT, JACOBIAN, finite, not_finite
 from twoloop.kernels.evaluation.partition import RANK_TOLERANCE, note_entries, write_programs
 
 MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5

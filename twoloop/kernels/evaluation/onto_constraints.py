@@ -8,11 +8,8 @@ accelerations to the correction itself: one that is not near rounding is followe
 
 import numpy as np
 
-from twoloop.kernels.algebra.factors import columns_of, rows_of, solve
-from twoloop.kernels.algebra.linalg import ldl_solve
+from twoloop.kernels.algebra.saddle_point import solve
 from twoloop.kernels.data.common import (
-    AUGMENTED,
-    DIAGONAL_MASS,
     DONE,
     FORM,
     INNER_DIVERGED,
@@ -24,10 +21,9 @@ from twoloop.kernels.data.common import (
     ROUNDED,
     merged,
 )
-from twoloop.kernels.evaluation.accelerations import accelerate, equilibrate, factor_for_projection
-from twoloop.kernels.evaluation.augmented import correct_augmented
-from twoloop.kernels.evaluation.constraints import constraint_rates, kinematics
-from twoloop.kernels.evaluation.finite import CONSTRAINT, not_finite
+from twoloop.kernels.data.finite import CONSTRAINT, not_finite
+from twoloop.kernels.evaluation.accelerations import accelerate, equilibrate, factor_there
+from twoloop.kernels.evaluation.constraints import constraint_rates, kinematics, row_residual
 from twoloop.kernels.evaluation.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_dependent, factor_rows, tangents
 
 ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
@@ -55,106 +51,30 @@ def accelerate_there(f, w, t, q, v, a):
 
 
 @merged
-def _nearest(f, w, columns):
-    """x with (T^T M T) x = T^T M y, over the independents of y in the first places of w.x; w.z has y's dependents."""
-    independent, x, y = w.independent_v, w.x, w.y
-    n_dof = independent.size
-    if f.flags[DIAGONAL_MASS] == 1:
-        for k in range(columns.size):
-            y[k] = w.M[columns[k], columns[k]] * w.z[k]
-        for j in range(n_dof):
-            total = w.M[independent[j], independent[j]] * x[j]
-            for k in range(columns.size):
-                total += w.D[j, k] * y[k]
-            x[j] = total
-    else:
-        for i in range(y.size):
-            total = 0.0
-            for j in range(n_dof):
-                total += w.M[i, independent[j]] * x[j]
-            for k in range(columns.size):
-                total += w.M[i, columns[k]] * w.z[k]
-            y[i] = total
-        for j in range(n_dof):
-            total = y[independent[j]]
-            for k in range(columns.size):
-                total += w.D[j, k] * y[columns[k]]
-            x[j] = total
-    ldl_solve(w.A, x[:n_dof])
-
-
-@merged
-def _to_constraints(f, w, q, v):
-    """Correct q and v by T and the factors of T^T M T; the largest correction of a position, and of a velocity."""
-    rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
-    n_dof, x = independent.size, w.x
-    for k in range(rows.size):
-        w.z[k] = w.C[rows[k]]
-    solve(w.index_v, w.values_v, w.z)
-    for k in range(rows.size):
-        if not np.isfinite(w.z[k]):
-            return np.inf, np.inf
-    for j in range(n_dof):
-        x[j] = 0.0
-    _nearest(f, w, columns)
+def _move(f, w, x):
+    """Move x by the least correction in the metric of M that takes -w.g away from G x; the largest entry of it."""
+    w.Q[:] = 0.0
+    solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
-    for j in range(n_dof):
-        q[independent[j]] += x[j]
-        largest = max(largest, abs(x[j]))
-    for k in range(rows.size):
-        change = -w.z[k]
-        for j in range(n_dof):
-            change += w.D[j, k] * x[j]
-        q[columns[k]] += change
-        largest = max(largest, abs(change))
-    for j in range(n_dof):
-        x[j] = v[independent[j]]
-    for k in range(rows.size):
-        w.z[k] = v[columns[k]] - w.D[n_dof, k]
-    _nearest(f, w, columns)
-    faster = 0.0
-    for j in range(n_dof):
-        faster = max(faster, abs(v[independent[j]] - x[j]))
-        v[independent[j]] = x[j]
-    for k in range(rows.size):
-        total = w.D[n_dof, k]
-        for j in range(n_dof):
-            total += w.D[j, k] * x[j]
-        faster = max(faster, abs(v[columns[k]] - total))
-        v[columns[k]] = total
-    return largest, faster
+    for j in range(x.size):
+        if not np.isfinite(w.y[j]):
+            return np.inf
+        x[j] += w.y[j]
+        largest = max(largest, abs(w.y[j]))
+    return largest
 
 
 @merged
-def _by_multipliers(w, q, v):
-    """The same by the factors of G M^-1 G^T."""
-    rows, solved, g = w.rows_v, w.W, w.g[: w.rows_v.size]
+def _move_both(f, w, q, v):
+    """Correct q and v by the factors at q; the largest correction of a position, and of a velocity."""
+    rows = w.rows_v
     for i in range(rows.size):
-        g[i] = w.C[rows[i]]
-    ldl_solve(w.S, g)
-    largest, faster = 0.0, 0.0
+        w.g[rows[i]] = -w.C[rows[i]]
+    moved = _move(f, w, q)
+    row_residual(w, v, rows)
     for i in range(rows.size):
-        if not np.isfinite(g[i]):
-            return np.inf, np.inf
-    for j in range(q.size):
-        change = 0.0
-        for i in range(rows.size):
-            change += solved[i, j] * g[i]
-        q[j] -= change
-        largest = max(largest, abs(change))
-    for i in range(rows.size):
-        total = w.Rate[rows[i]]
-        for j in range(v.size):
-            total += w.G[rows[i], j] * v[j]
-        g[i] = total
-    ldl_solve(w.S, g)
-    for j in range(v.size):
-        change = 0.0
-        for i in range(rows.size):
-            change += solved[i, j] * g[i]
-        v[j] -= change
-        faster = max(faster, abs(change))
-    return largest, faster
+        w.g[rows[i]] = -w.z[i]
+    return moved, _move(f, w, v)
 
 
 @merged
@@ -177,22 +97,16 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
     for _ in range(MAX_INNER):
         code = _look(f, w, t, q, v)
         if code == DONE:
-            code = factor_for_projection(f, w, t, q)
+            code = factor_there(f, w, t, q)
         if code != DONE:
             return code
         if f.flags[KINEMATICS_GIVEN] == 0:
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
-        if f.flags[FORM] == NULL_SPACE:
-            moved, faster = _to_constraints(f, w, q, v)
-        else:
-            if f.flags[KINEMATICS_GIVEN] == 0:
-                constraint_rates(f, w, t, q, w.Rate)
-            if f.flags[FORM] == AUGMENTED:
-                moved, faster = correct_augmented(w, q, v)
-            else:
-                moved, faster = _by_multipliers(w, q, v)
+        if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:  # whose tangents needed them
+            constraint_rates(f, w, t, q, w.Rate)
+        moved, faster = _move_both(f, w, q, v)
         if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
         if moved <= theta and faster <= theta * max(1.0, _largest(v)):

@@ -5,8 +5,10 @@ import numpy as np
 from twoloop.kernels.algebra.elimination import SIZE
 from twoloop.kernels.algebra.factors import factor, make_program, rows_of, sign_of
 from twoloop.kernels.algebra.linalg import copy_matrix
+from twoloop.kernels.algebra.patterns import note_pattern
 from twoloop.kernels.data.common import (
     DONE,
+    FACTORED,
     GENERATION,
     LEANING,
     N_FACTORIZATIONS,
@@ -155,6 +157,7 @@ def _take_order(w):
 def write_programs(w):
     """Choose the order of elimination for the numbers in w.G; False: singular."""
     _note_places(w)
+    w.notes[FACTORED] = 0.0
     done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
     if done and w.Rate.size > w.C.size:
         done = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v)
@@ -173,30 +176,6 @@ def _note_places(w):
                 w.places[place] = j
                 place += 1
     w.places[n_rows] = place
-
-
-@merged
-def has_new_entries(G, pattern):
-    """Whether an entry of G is not zero for the first time."""
-    entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
-    unseen = 0.0  # a sum without a branch: there is nothing new at nearly every look
-    for i in range(seen.size):
-        unseen += abs(entries[i]) * (1.0 - seen[i])
-    return unseen != 0.0  # also true for NaN
-
-
-@compiled
-def note_pattern(G, pattern):
-    """Note the entries of G that are not zero; whether there are new ones."""
-    if not has_new_entries(G, pattern):
-        return False
-    new = False
-    for i in range(pattern.shape[0]):
-        for j in range(pattern.shape[1]):
-            if G[i, j] != 0.0 and pattern[i, j] == 0.0:
-                pattern[i, j] = 1.0
-                new = True
-    return new
 
 
 @compiled

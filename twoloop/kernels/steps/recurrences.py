@@ -5,8 +5,8 @@ See the head of taylor.py.
 
 import numpy as np
 
+from twoloop.kernels.algebra.saddle_point import solve_both
 from twoloop.kernels.data.common import DONE, N_EVALUATIONS, NOT_FINITE, compiled, inlined, merged
-from twoloop.kernels.evaluation.accelerations import solve_for_order
 
 # kinds of operation, as twoloop.generate.tracing has them; PENDING: products whose second factors wait for the solution
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING = range(9)
@@ -296,7 +296,7 @@ def expand(f, w, options, memory, t, state, unit):
         a, lam = N[k, A : A + n], N[k, LAM : LAM + n_rows]
         if w.rows_v.size < n_rows:
             lam[:] = 0.0
-        solve_for_order(f, w, r, c, a, lam)
+        solve_both(f, w, r, c, a, lam)
         take_order(w, K, unit, N, series, a)
         _complete(options, EARLY, N[K], Y1[K])
         _complete(options, LATE, N[k], Y2[k])

@@ -18,6 +18,7 @@ before, so that no power of a short time underflows. The end of the step is move
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.algebra.saddle_point import solve_both
 from twoloop.kernels.control.defect import excess
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.common import (
@@ -37,7 +38,6 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.accelerations import solve_for_order
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 from twoloop.kernels.steps.recurrences import (
     ATTEMPTS,
@@ -74,7 +74,7 @@ GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong t
 @kernel(ATTEMPT)
 def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
     """The linear solution of one order, for code made for a mechanism where its own factors do not serve."""
-    solve_for_order(f, w, r, c, a, lam)
+    solve_both(f, w, r, c, a, lam)
     return Attempt(DONE, 0.0, 0.0)
 
 

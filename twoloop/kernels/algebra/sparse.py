@@ -1,12 +1,12 @@
-"""Accelerations, multipliers and projection from one sparse matrix, where degrees of freedom and constraints are many.
+"""The linear problem by one sparse matrix, where degrees of freedom and constraints are many.
 
 T^T M T and G M^-1 G^T are full there. The matrix of
 
-    [s M  G^T] [a    ]   [s Q  ]
-    [G    0  ] [s lam] = [Gamma]
+    [s M  G^T] [a    ]   [s r]
+    [G    0  ] [s lam] = [c  ]
 
 is not; G has the rows that count, and the number s brings M to the size of G. Its factors are those of factors.py, by a
-program for its pattern. The same matrix gives the nearest position and velocity on the constraints, in the metric of M.
+program for its pattern.
 
 M need only be positive definite on the velocities that the constraints allow. At the start its eigenvalues tell, later
 the sign of the determinant, which then is (-1)^r. What is not sparse enough is left to the dense forms.
@@ -16,28 +16,25 @@ import numpy as np
 
 from twoloop.kernels.algebra.elimination import N_SLOTS, ORDERED, SIZE, TOO_MANY, begin, lists_of, order, put, slots
 from twoloop.kernels.algebra.factors import columns_of, rows_of, run, sign_of, solve
-from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.algebra.patterns import note_pattern
 from twoloop.kernels.data.common import (
     CONSTANT_MASS,
     DENSE_FORM,
     DONE,
-    FACTORED,
     FORM,
     MASS_NOT_DEFINITE,
     MASS_SCALE,
     N_FACTORIZATIONS,
+    NOT_FINITE,
     compiled,
-    inlined,
 )
-from twoloop.kernels.evaluation.constraints import row_residual
-from twoloop.kernels.evaluation.finite import MASS, finite, not_finite
-from twoloop.kernels.evaluation.partition import note_pattern
+from twoloop.kernels.data.finite import finite
 
 MANY = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
 LARGE = 32  # coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
 
 
-def augmented_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
+def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
     """Whether this form is faster than the dense ones, for a sparse pattern; `diagonal`: M is constant and diagonal."""
     return n_rows >= MANY and (n_q - n_rows >= MANY or (n_q >= LARGE and not diagonal))
 
@@ -86,15 +83,13 @@ def _factor(w):
 
 
 @compiled
-def factor_augmented(f, w, t, q):
+def factor_sparse(f, w):
     """Factors for the w.M and w.G that there are; f.flags[FORM] is another one on return where they are not sparse."""
-    if w.notes[FACTORED] == 1.0:
-        return DONE
     w.counters[N_FACTORIZATIONS] += 1
     new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
     if w.index_a[SIZE] == 0 or new or not _factor(w):
         if not finite(w.M):
-            return not_finite(w.notes, MASS, t, q)
+            return NOT_FINITE
         code = _make_program(w)
         if code == TOO_MANY:
             f.flags[FORM] = f.flags[DENSE_FORM]
@@ -104,82 +99,25 @@ def factor_augmented(f, w, t, q):
             return MASS_NOT_DEFINITE
     if sign_of(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
         return MASS_NOT_DEFINITE
-    w.notes[FACTORED] = 1.0
     return DONE
 
 
-@inlined
-def _right_side(w):
-    """Right-hand side, then solution: that of M first, that of the rows behind."""
-    n = w.Q.size
-    return w.right[:n], w.right[n : n + w.rows_v.size]
-
-
 @compiled
-def _solve(w):
-    """Solve for the right-hand side in w.right, overwritten."""
-    size, rows, columns = w.index_a[SIZE], rows_of(w.index_a), columns_of(w.index_a)
+def solve_sparse(w, r, c, a):
+    """a of M a + G^T lam = r and G a = c; the multipliers of the rows that count go into w.z."""
+    n, size, scale = r.size, w.index_a[SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
+    for j in range(n):
+        x[j] = scale * r[j]
+    for k in range(w.rows_v.size):
+        x[n + k] = c[w.rows_v[k]]
+    rows, columns = rows_of(w.index_a), columns_of(w.index_a)
     for k in range(size):
         y[k] = x[rows[k]]
     solve(w.index_a, w.values_a, y)
     for k in range(size):
         x[columns[k]] = y[k]
-
-
-@compiled
-def _solve_with(w, r, c, a):
-    """a of M a + G^T lam = r and G a = c; the multipliers, times the scale, stay behind the solution in w.right."""
-    x, y = _right_side(w)
-    for j in range(x.size):
-        x[j] = w.notes[MASS_SCALE] * r[j]
-    for k in range(y.size):
-        y[k] = c[w.rows_v[k]]
-    _solve(w)
-    copy(x, a)
-
-
-@compiled
-def solve_augmented(w, a):
-    """Accelerations from w.Q and w.Gamma; the multipliers stay in w.z."""
-    _solve_with(w, w.Q, w.Gamma, a)
-    _, y = _right_side(w)
-    for k in range(y.size):
-        w.z[k] = y[k] / w.notes[MASS_SCALE]
-
-
-@compiled
-def solve_augmented_for(w, r, c, a, lam):
-    """Accelerations and multipliers from other right-hand sides."""
-    _solve_with(w, r, c, a)
-    _, y = _right_side(w)
-    for k in range(y.size):
-        lam[w.rows_v[k]] = y[k] / w.notes[MASS_SCALE]
-
-
-@compiled
-def correct_augmented(w, q, v):
-    """Correct q and v by the least correction in the metric of M; the largest of a position, and of a velocity."""
-    x, y = _right_side(w)
-    x[:] = 0.0
-    for k in range(y.size):
-        y[k] = -w.C[w.rows_v[k]]
-    largest = _correct(w, q)
-    row_residual(w, v, w.rows_v)
-    x[:] = 0.0
-    for k in range(y.size):
-        y[k] = -w.z[k]
-    return largest, _correct(w, v)
-
-
-@compiled
-def _correct(w, q):
-    _solve(w)
-    largest = 0.0
-    for j in range(q.size):
-        change = w.right[j]
-        if not np.isfinite(change):
-            return np.inf
-        q[j] += change
-        largest = max(largest, abs(change))
-    return largest
+    for j in range(n):
+        a[j] = x[j]
+    for k in range(w.rows_v.size):
+        w.z[k] = x[n + k] / scale
