@@ -40,8 +40,6 @@ from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, multipliers
 from twoloop.kernels.steps.iteration_matrix import factor_iteration, filter_by_iteration, solve_iteration
 from twoloop.kernels.steps.lasting import lasting_error
-from twoloop.kernels.steps.newton_banded import filter_error as filter_banded
-from twoloop.kernels.steps.newton_dense import filter_error as filter_dense
 from twoloop.kernels.steps.newton_memory import (
     A_MID,
     A_NEW,
@@ -65,7 +63,8 @@ from twoloop.kernels.steps.newton_memory import (
     memory_size,
     vector,
 )
-from twoloop.kernels.steps.newton_step import correct, derivatives_at, factor_systems
+from twoloop.kernels.steps.newton_operator import derivatives_at, factor_systems, filter_error
+from twoloop.kernels.steps.newton_step import correct
 from twoloop.kernels.steps.stages import INNER_TOL, N_SCALARS, OUTER_TOL, STAGES, options_array
 
 MAX_ITERATIONS = 8
@@ -227,10 +226,8 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     count = w.independent.size
     if _dense_tangents(f, w):
         filter_by_iteration(w, memory, z, e_q[:count], e_v[:count])
-    elif f.flags[BANDWIDTH] >= 0:
-        filter_banded(f, w, options, memory, _one(options), h, e_q, e_v)
     else:
-        filter_dense(w, options, memory, _one(options), h, e_q[:count], e_v[:count])
+        filter_error(f, w, options, memory, _one(options), h, e_q, e_v)
     for i in range(count):
         e_q[i] += z * e_v[i]
 

@@ -20,7 +20,6 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.common import (
     ATTEMPT,
-    BANDWIDTH,
     DONE,
     ESTIMATE,
     GENERATION,
@@ -36,7 +35,6 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
-from twoloop.kernels.steps import newton_banded, newton_dense
 from twoloop.kernels.steps.lasting import lasting_error
 from twoloop.kernels.steps.newton_memory import (
     A_MID,
@@ -69,6 +67,7 @@ from twoloop.kernels.steps.newton_memory import (
     eigen_place,
     vector,
 )
+from twoloop.kernels.steps.newton_operator import derivatives_at, factor_systems, filter_error, solve_system
 from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
 
 MAX_ITERATIONS = 15
@@ -122,25 +121,6 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
 
 
 @compiled
-def derivatives_at(f, w, options, memory, s, t, q, v, a):
-    """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
-    if f.flags[BANDWIDTH] >= 0:
-        return newton_banded.derivatives(f, w, memory, s, t, q, v)
-    return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
-
-
-@compiled
-def factor_systems(f, w, options, memory, s, h):
-    """Factors for steps of h, for every eigenvalue and for gamma0."""
-    if f.flags[BANDWIDTH] >= 0:
-        code = newton_banded.factor(f, w, options, memory, s, h)
-    else:
-        code = newton_dense.factor(w, options, memory, s, h)
-    memory[H_FACTORED] = h
-    return code
-
-
-@compiled
 def correct(f, w, options, memory, s, residual, A_stage):
     """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
     n = w.Q.size
@@ -161,10 +141,7 @@ def correct(f, w, options, memory, s, residual, A_stage):
             for j in range(s):
                 total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
             x[i] = total
-        if f.flags[BANDWIDTH] >= 0:
-            newton_banded.solve(f, w, options, memory, s, k, x)
-        else:
-            newton_dense.solve(w, options, memory, s, k, x[:m])
+        solve_system(f, w, options, memory, s, k, x)
         twice = 1.0 if k < n_real else 2.0
         for j in range(s):
             re, im = options[column + j], options[column + s + j]
@@ -251,10 +228,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     """(I - z J)^-1 (e_q, e_v), z = h gamma0, J being the Jacobian of (v, F); all n_dof numbers in (n_q)."""
     s = int(options[STAGES])
     m = w.independent.size
-    if f.flags[BANDWIDTH] >= 0:
-        newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
-    else:
-        newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
+    filter_error(f, w, options, memory, s, h, e_q, e_v)
     for i in range(m):
         e_q[i] += h * options[eigen_place(options, s) + GAMMA0] * e_v[i]
 

@@ -1,0 +1,47 @@
+"""The matrices of Newton's method behind one interface: I - z^2 J_q - z J_v for each eigenvalue, z = h l.
+
+J_q and J_v are the derivatives of the two-loop right-hand side by the independent positions and velocities. Two
+structures serve: newton_dense.py and, where the system has a bandwidth, newton_banded.py.
+"""
+
+from twoloop.kernels.data.common import BANDWIDTH, compiled
+from twoloop.kernels.steps import newton_banded, newton_dense
+from twoloop.kernels.steps.newton_memory import H_FACTORED
+
+
+@compiled
+def derivatives_at(f, w, options, memory, s, t, q, v, a):
+    """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
+    if f.flags[BANDWIDTH] >= 0:
+        return newton_banded.derivatives(f, w, memory, s, t, q, v)
+    return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
+
+
+@compiled
+def factor_systems(f, w, options, memory, s, h):
+    """Factors for steps of h, for every eigenvalue and for gamma0."""
+    if f.flags[BANDWIDTH] >= 0:
+        code = newton_banded.factor(f, w, options, memory, s, h)
+    else:
+        code = newton_dense.factor(w, options, memory, s, h)
+    memory[H_FACTORED] = h
+    return code
+
+
+@compiled
+def solve_system(f, w, options, memory, s, k, x):
+    """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
+    if f.flags[BANDWIDTH] >= 0:
+        newton_banded.solve(f, w, options, memory, s, k, x)
+    else:
+        newton_dense.solve(w, options, memory, s, k, x[: w.independent.size])
+
+
+@compiled
+def filter_error(f, w, options, memory, s, h, e_q, e_v):
+    """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
+    m = w.independent.size
+    if f.flags[BANDWIDTH] >= 0:
+        newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
+    else:
+        newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
