@@ -1,4 +1,4 @@
-"""The matrix of one Newton iteration from the tangents that a system gives, without a band, for diagonal.py.
+"""The matrix of one Newton iteration from the tangents that a system gives, without a band, for diagonal_step.py.
 
 With v = T v_i + u, T = [I; -Cqd^-1 Cqi], the corrections d of the independent accelerations solve
 

@@ -1,4 +1,4 @@
-"""The linear algebra of newton.py where M and the derivatives of the force have a band: cost in proportion to n_q.
+"""The linear algebra of newton_step.py where M and the derivatives of the force have a band: cost in proportion to n_q.
 
 The corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r with z = h l. Multiplied by
 T^T M T, where v = T v_i are the velocities that the constraints allow, T = [I; -Cqd^-1 Cqi], this is

@@ -1,4 +1,4 @@
-"""The linear algebra of newton.py for systems of any structure: (n_dof, n_dof) matrices.
+"""The linear algebra of newton_step.py for systems of any structure: (n_dof, n_dof) matrices.
 
 J_q and J_v come by differences of the two-loop right-hand side. Where the system gives the tangents K and D (see
 newton_tangents.py), (T^T M T) J_q = T^T K T with T = [I; -Cqd^-1 Cqi], and J_v likewise: as in newton_banded.py that

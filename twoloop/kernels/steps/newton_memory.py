@@ -22,8 +22,8 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     H_FACTORED,
     CONTRACTION,  # of the last iteration
     DAMPED,  # 0: no derivative by v
-    SYMMETRIC,  # 1: the matrix of diagonal.py was factored as a symmetric one
-    LASTING,  # s, of diagonal.py: how long an error of velocity lasts; 0: not known
+    SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
+    LASTING,  # s, of diagonal_step.py: how long an error of velocity lasts; 0: not known
     N_MEMORY_SCALARS,
 ) = range(13)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)

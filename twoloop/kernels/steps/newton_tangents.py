@@ -1,4 +1,4 @@
-"""K = dQ/dq - d(Cq^T lam)/dq, lam held, and D = dQ/dv from the tangents that a system was given, for newton.py."""
+"""K = dQ/dq - d(Cq^T lam)/dq, lam held, and D = dQ/dv from the tangents that a system was given, for newton_step.py."""
 
 import numpy as np
 
