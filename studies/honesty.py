@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from studies import figures, honesty_picture, study
 from studies.cli import StudyError
+from studies.end_states import EXACT
 from studies.honesty_solvers import DEFAULT, DEFAULT_COMPILED, LIMITED, OURS, Call, solvers, why_not
 from studies.render import render, table
 from studies.sharp_forces import T_END
@@ -38,7 +39,7 @@ UNASKED = "wrong and silent, never asked"  # shown of those that are the same, b
 SHORT = {
     HANG: "**hang**",
     SILENT: "**silent**",
-    UNASKED: "**silent** (unasked)",
+    UNASKED: "**silent** (force never seen)",
     SAID: "said",
     RIGHT: "right",
     NOT_RUN: "–",
@@ -225,7 +226,7 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
-    return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+    return found | {"silent": SILENT, "exact": EXACT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
 
 
 def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -269,6 +270,7 @@ def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
         ran = own[own["outcome"] != NOT_RUN]
         wrong = ran["outcome"].isin((SILENT, HANG))
         line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
+        line["gross"] = int((wrong & ~(ran["error"].astype(float) <= EXACT)).sum())
         line |= {"n_mistakes": int((ran["group"] == MISTAKE).sum()), "n_forces": int((ran["group"] == FORCE).sum())}
         found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
     return found

@@ -14,12 +14,12 @@ from studies.beam.limits import along_rows, limit_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
 from studies.beam.sensitivity import CHANGES, sensitivity_rows
 from studies.render import number, render, table
-from studies.solvers import IDA_C, IDA_C_ORDER_2, OWN_EXPLICIT, QUARTER
+from studies.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
 from studies.store import Output
 
 ERROR = "largest error of the tip's height over the run (m)"
 LISTED = (  # the CSV has all
-    *(PAPER, QUARTER, NEWTON, DIFFERENCES, OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2),
+    *(PAPER, NEWMARK, QUARTER, NEWTON, DIFFERENCES, OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2),
 )
 
 

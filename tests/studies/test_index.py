@@ -197,7 +197,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     )
     assert "traps: 3 of 50 (2 of them step over a force of 1 ms), 3 of 50" in text
     assert "Of 3000 runs of random mechanisms" in text
-    assert "under such forces, by every preset, 4 are wrong in this way" in text
+    assert "under such forces, by every preset but the paper's two, 4 are wrong in this way" in text
     assert "**Trust**" not in front(tmp_path, [case()])
 
 
