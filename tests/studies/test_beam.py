@@ -69,7 +69,9 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     assert found["one_best"] and found["at"][0]["best"]["solver"] == NEWTON
     assert found["at"][0]["ours"]["call_s"] == pytest.approx(0.79, abs=0.01)
     assert found["at"][0]["others"]["call_s"] == pytest.approx(1.59, abs=0.02)
-    assert [at["error"] for at in found["newmark"]] == list(TARGETS) and all(at["over"] < 1.0 for at in found["newmark"])
+    assert [at["error"] for at in found["newmark"]] == list(TARGETS) and all(
+        at["over"] < 1.0 for at in found["newmark"]
+    )
     made = rows()
     made.loc[made["solver"] == IDA_C_ORDER_2, "call_s"] /= 100.0
     made.loc[made["solver"] == PAPER, "call_s"] /= 100.0
