@@ -85,7 +85,7 @@ def of_honesty():
         outcomes += [honesty.NOT_RUN] * 5  # refused
         lines += [{"solver": solver, "outcome": outcome, "asked": True} for outcome in outcomes]
         lines += [{"solver": solver, "outcome": honesty.SILENT, "asked": False} for _ in range(6 if k == 0 else 0)]
-    rows = pd.DataFrame(lines).assign(group=FORCE, status="RAISED")
+    rows = pd.DataFrame(lines).assign(group=FORCE, status="RAISED", error=1.0)
     held_out = honesty.trust_in(rows[rows["outcome"] != honesty.SILENT])
     forces = {"n_families": 17, "mechanisms": ["a", "b", "c"]}
     made = {"n_traps": 23, "forces": forces, "forces_only": ["auto, compiled (two-loop)"] * 14}

@@ -295,7 +295,7 @@ KEPT = {"ours_keep": True, "irk_grows": False, "ours": [1e-15, 1e-15, 0.0], "t_e
 LOST = long_run("Sun", 1.0) | {"calm": False, "verdict": "lost"}
 STEPS = {"holds": True, "longer": True, "irk": {"share_time": 0.99}, "long": 0.02, "ratios": [170.0, 270.0]}
 VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a"], "only_others": [], "none_right": ["b", "c"], "not_put": ["d"]}
-VALID |= {"n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
+VALID |= {"n_singular": 0, "n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
 TRAPS = {"n_traps": 15, "ours_bad": [{}], "others_bad": [{}, {}], "missed_by_all": [], "unasked": 0}
 OPPOSITES = {
     "claims": [claims("holds"), claims("holds in part"), claims("not run")],
@@ -322,7 +322,8 @@ def test_what_can_be_trusted_is_counted(tmp_path):
     assert "1 of ours, 2 of others" in screen(tmp_path, honesty=TRAPS)
     text = screen(tmp_path, robustness={"n_linkages": 300, "long": [{}, {}], "silent": [{}]})
     assert "300 random linkages by 2 of our methods" in text and "1 runs are" in text
-    assert "73 planted faults" in screen(tmp_path, planted_errors={"n": 73, "missed": ["x"]})
+    planted = {"n": 73, "missed": ["x"], "mutants": None}
+    assert "72 of 73 planted faults are caught" in screen(tmp_path, planted_errors=planted)
 
 
 def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):

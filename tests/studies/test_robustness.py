@@ -130,5 +130,5 @@ def test_sentences_turn_with_the_rows():
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
     assert "Of linkages, sizes and masses: 2 runs" in bad
     assert "Yes: 1 of 1 runs of 1 random mechanisms under sharp forces, half of them friction: drag 1." in bad
-    assert "All methods are right from" in bad and "from 1 to 1e3 m" in bad
+    assert "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
