@@ -1,7 +1,7 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
 from collections.abc import Iterable, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,11 @@ RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, a
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
+LOOKED_AT = ("error_q", "floor", "used", "times", *SETTINGS)  # columns by which costs at an error are found
+RANKED = (
+    *("family", "called_from", "keeps_constraints", "call_s", "call_q1", "call_q3", "n_evaluations"),
+    *("violation_q", "violation_v", "energy"),
+)
 FEWEST = 3  # repetitions that an interval asks for
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
@@ -55,8 +60,13 @@ def resampled(rows: pd.DataFrame) -> Array:
     drawn = np.full((len(rows), RESAMPLES), np.nan)
     for k, times in enumerate(rows.get("times", ())):
         if len(times) >= FEWEST:
-            drawn[k] = np.median(np.array(times)[_rounds(len(times))], axis=1)
+            drawn[k] = _medians_drawn(tuple(times))
     return drawn
+
+
+@lru_cache(maxsize=20_000)
+def _medians_drawn(times: tuple[float, ...]) -> Array:
+    return np.asarray(np.median(np.array(times)[_rounds(len(times))], axis=1))
 
 
 def setting_of(rows: pd.DataFrame) -> Array:
@@ -120,8 +130,16 @@ def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
 
 
 def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
-    """The runs that have an error and this cost, by error."""
-    return rows[rows["error_q"].notna() & rows[what].notna()].sort_values("error_q", kind="stable")
+    """The runs that have an error and this cost, by error; of their columns those that are looked at."""
+    errors = rows["error_q"].to_numpy(float)
+    order = np.argsort(errors, kind="stable")  # NaN last
+    known = order[~np.isnan(errors[order]) & rows[what].notna().to_numpy()[order]]
+    return _with_columns(rows, (*LOOKED_AT, what)).iloc[known]
+
+
+def _with_columns(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Those of these columns that there are: to select and sort rows of 70 columns takes minutes."""
+    return rows[[name for name in dict.fromkeys(names) if name in rows]]
 
 
 def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
@@ -146,7 +164,7 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     either side, so that no solver is ahead of another for want of a run.
     """
     found = {}
-    for solver, own in rows.groupby("solver", sort=False):
+    for solver, own in _with_columns(rows, ("solver", "call_s", *LOOKED_AT)).groupby("solver", sort=False):
         runs = _told(own, "call_s")
         place = None if runs.empty else _place(own, runs, target)
         if place is None and doubt and not runs.empty and target >= runs["floor"].max():
@@ -199,7 +217,7 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         log-log line between two runs), and violation_q, violation_v, energy of the cheapest run that is as good.
     """
     lines = []
-    for solver, runs in rows.groupby("solver", sort=False):
+    for solver, runs in _with_columns(rows, ("solver", *RANKED, *LOOKED_AT)).groupby("solver", sort=False):
         cpu = time_for(runs, target)
         if np.isnan(cpu):
             continue

@@ -33,7 +33,7 @@ from studies.energy_runs import (
     measure,
     runs,
 )
-from studies.render import render
+from studies.render import number_of_words, render
 from studies.solvers import CVODE_C, CVODES, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_BDF, OWN_EXPLICIT
 from studies.store import Output
 
@@ -108,7 +108,7 @@ def test_the_full_report_is_short_with_all_rivals(rows):
     found = energy.findings_of(rows)
     text = render("energy", found, {"failed": ""}, stamp="stamp; of a commit; of a processor, 2 cores", quick=False)
     assert all(f"`{name}, tol" in text for name in RIVALS) and "(rounding)" in text
-    assert len(text.split()) < 1000
+    assert number_of_words(text) < 700
 
 
 def test_other_solvers_have_rows_near_the_true_motion(rows):
