@@ -31,8 +31,9 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Of each kind who is the cheapest on most mechanisms; kinds with none such are told together."""
-    rows, undecided = [], []
+    """Of each kind who is the cheapest on most mechanisms; of the others together the two that are it most often."""
+    rows, open_kinds = [], []
+    others: dict[str, Sequence[Mapping[str, Any]]] = {}
     for kind, words in KINDS.items():
         these = [each["at"] for each in mechanisms if kind in each.get("tags", ())]
         cheapest = Counter(_cheapest(at) for at in these)
@@ -41,23 +42,33 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
             said = f"{call(solver)}, the cheapest at most errors on {n} of {len(these)} such mechanisms"
             rows.append({"what": words, "take": said})
         elif these:
-            undecided.append(words)
-    if undecided:
-        said = "the default: no solver is the cheapest at most errors on most such mechanisms"
-        rows.append({"what": "; ".join(undecided), "take": said})
+            open_kinds.append(words)
+            others |= {each["case"]: each["at"] for each in mechanisms if kind in each.get("tags", ())}
+    won = sum((_won(at) for at in others.values()), Counter[str]())
+    often = [f"{call(name)} ({times})" for name, times in won.most_common() if name][:2]
+    if open_kinds:
+        told_apart = f"{' or '.join(often)}: the cheapest at that many of {won.total()} errors"
+        said = told_apart if often else "the default: no solver is told apart from the others"
+        rows.append({"what": "; ".join(open_kinds), "take": said})
     return rows
 
 
-def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
-    """The cheapest solver at more than half of the errors that any reaches on one mechanism; "" where there is none.
+def _won(at: Sequence[Mapping[str, Any]]) -> Counter[str]:
+    """At how many errors that any solver reaches on one mechanism each solver is the cheapest.
 
-    Errors at which ours and others are not told apart, or others were not asked, count for no solver.
+    Errors at which ours and others are not told apart, or others were not asked, count for "".
     """
     won: Counter[str] = Counter()
     for line in at:
         runs = [(run["call_s"], run["solver"]) for run in (line["ours"], line["others"]) if run]
         decided = line["verdict"] in ("ahead", "behind", "alone", "missed")
         won.update([min(runs)[1] if decided else ""] if runs else [])
+    return won
+
+
+def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
+    """The cheapest solver at more than half of the errors on one mechanism; "" where there is none."""
+    won = _won(at)
     solver, n = won.most_common(1)[0] if won else ("", 0)
     return solver if 2 * n > won.total() else ""
 
