@@ -149,7 +149,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "`IDA from C, stabilised`, the cheapest at most errors on 1 of 1 such mechanisms |",
         "on the four-bar in ms, for an error (m, rad) after 10 s of motion:",
         f"\n| 1e-4 | {cells} |\n| 1e-6 | {cells} |\n",
-        f"| first call, nothing built before, tolerance 1e-8 | {first} | – | – |\n",
+        f"| first call of a process, tolerance 1e-8 | {first} | – | – |\n",
         f"Of our calls {number(0.2 * prices[1])} to {number(0.2 * prices[0])} ms are spent in the integrator; ",
         f": all {n_others} on 1 of 2 mechanisms, at least {n_put} on the others. ",
         "“Ahead” and “behind” mean by at least 5 %:",
