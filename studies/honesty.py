@@ -226,7 +226,7 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
-    return found | {"silent": SILENT, "exact": EXACT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+    return found | {"exact": EXACT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
 
 
 def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -248,10 +248,8 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": []}
     found["solvers"] = totals(rows)
     for family, own in ran.groupby("trap", sort=False):
-        parts = parts_of(own)
-        line = {"family": str(family)} | {whose: counts_of(own[which]) for whose, which in parts.items()}
-        by = own[parts["ours"] & (own["outcome"] == SILENT)]["solver"]
-        found["families"].append(line | {"by": sorted(set(by))})
+        counts = {whose: counts_of(own[which]) for whose, which in parts_of(own).items()}
+        found["families"].append({"family": str(family)} | counts)
     found["mechanisms"] = [str(name) for name in ran["mechanism"].unique()]
     return found | {whose: counts_of(ran[which]) for whose, which in parts_of(ran).items()}
 

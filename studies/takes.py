@@ -4,11 +4,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from studies.headline import OWN_CODE
 from studies.render import listed
+from studies.solvers import DEFAULT
 from twoloop.methods import PRESETS
 
 SUFFIX = " (two-loop)"  # of our solvers, in the findings of honesty
-DEFAULT, COMPILED_DEFAULT = "auto", "auto, compiled"
 KINDS = {  # tags of mechanisms, and what a user calls them
     "redundant": "redundant constraints",
     "spatial": "spatial",
@@ -91,8 +92,8 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     paying = {line["solver"]: line for line in first_calls if line["pays"]}
     rivals = [line for name, line in paying.items() if name != DEFAULT and not name.endswith(", compiled")]
     parts = []
-    if COMPILED_DEFAULT in paying:
-        parts.append(f"`compiled=True`, which pays {_from_run(paying[COMPILED_DEFAULT])}")
+    if OWN_CODE in paying:
+        parts.append(f"`compiled=True`, which pays {_from_run(paying[OWN_CODE])}")
     if rivals:
         first = min(rivals, key=lambda line: (line["never"], max(line["pays"])))
         parts.append(f"of the rivals {call(first['solver'])} pays {_from_run(first)}")

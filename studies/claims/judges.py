@@ -8,6 +8,7 @@ from studies.claims.beam_judges import FOLLOWS, TIPS
 from studies.claims.experiments import PASSES
 from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
 from studies.claims.verdicts import Judgement, decide, span, span_known
+from studies.energy_drift import NO_DRIFT, verdict
 from studies.metrics import ASTRAY, LOST
 from studies.solvers import (
     GEAR_ORDERS,
@@ -30,8 +31,6 @@ SATISFIED = 1e-12  # violation that counts as rounding
 DEARER = 1.2  # times the cost: beyond the noise of times
 FACTOR = 2.0  # within which an estimate, or a limit, counts as the same
 NEEDLESS = 0.1  # share of steps given up, or of work, that counts as little
-RESOLVED = 3.0  # standard errors from which a slope counts as a drift
-EPS = float(np.finfo(float).eps)
 AGREE = 1e-10  # m or rad
 VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
 STEP = 0.02  # s
@@ -108,10 +107,8 @@ def constraints_kept(rows: Rows) -> Judgement:
 
 
 def _steady(runs: pd.DataFrame) -> pd.Series:
-    """Which runs reach their end without drift of the energy: no slope beyond its error, or rounding."""
-    rounding = EPS * runs["kinetic"] * runs["n_steps"] / runs["t_end"]
-    steady = runs["slope"].abs() <= np.maximum(RESOLVED * runs["slope_error"], rounding)
-    return steady & (runs["status"] == "REACHED_END") & ~runs["lost"]
+    """Which runs reach their end without drift of the energy, by the verdict of the study of energy."""
+    return runs.apply(verdict, axis=1) == NO_DRIFT
 
 
 def symplectic_stable(rows: Rows) -> Judgement:
