@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from studies.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
 from studies.store import Output
-from studies.tables import DECADE, SETTINGS, time_for, used
+from studies.tables import DECADE, SETTINGS, astray, time_for, used
 
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
@@ -210,7 +210,7 @@ def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINE
 def _told(rows: pd.DataFrame) -> pd.Series:
     """Whether the reference resolves the error of a run, and the run has not lost the motion."""
     resolved = rows["error_q"].astype(float) > rows["floor"].astype(float)
-    return resolved & ~rows["astray"].isin((True, "True")) if "astray" in rows else resolved
+    return resolved & ~astray(rows)
 
 
 def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:

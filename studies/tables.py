@@ -21,7 +21,7 @@ RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, a
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
-LOOKED_AT = ("error_q", "floor", "used", "times", *SETTINGS)  # columns by which costs at an error are found
+LOOKED_AT = ("error_q", "floor", "used", "times", "astray", *SETTINGS)  # columns by which costs at an error are found
 RANKED = (
     *("family", "called_from", "keeps_constraints", "call_s", "call_q1", "call_q3", "n_evaluations"),
     *("violation_q", "violation_v", "energy"),
@@ -114,6 +114,11 @@ def used(run: pd.Series) -> str:
     return run["used"] if isinstance(run.get("used"), str) else ""
 
 
+def astray(runs: pd.DataFrame) -> pd.Series:
+    """Which runs have another motion than the reference; none where that was not looked at."""
+    return runs["astray"].isin((True, "True")) if "astray" in runs else pd.Series(False, runs.index)
+
+
 def _errors(runs: pd.DataFrame) -> Array:
     return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
 
@@ -161,7 +166,7 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     """Of the solvers of one case that get to an error and were asked for about so much, what they take.
 
     `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
-    either side, so that no solver is ahead of another for want of a run.
+    either side, so that no solver is ahead of another for want of a run. A run out of phase is on neither side.
     """
     found = {}
     for solver, own in _with_columns(rows, ("solver", "call_s", *LOOKED_AT)).groupby("solver", sort=False):
@@ -169,7 +174,8 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
         place = None if runs.empty else _place(own, runs, target)
         if place is None and doubt and not runs.empty and target >= runs["floor"].max():
             n_good = int((_errors(runs) <= target).sum())
-            place = None if n_good == 0 else (min(n_good + 1, len(runs)), None)
+            looser = n_good < len(runs) and not astray(runs).to_numpy()[n_good]
+            place = None if n_good == 0 else (n_good + looser, None)
         if place is not None:
             costs, drawn = runs["call_s"].to_numpy(float), resampled(runs)
             if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest the scatter is not known
