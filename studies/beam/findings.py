@@ -61,8 +61,7 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     best = [None if line["best"] is None else line["best"]["solver"] for line in found["at"]]
     found["one_best"] = best[0] is not None and len(set(best)) == 1
     known = [line for line in found["at"] if line["newmark_over_paper"] is not None]
-    found["newmark_cheaper"] = [line["error"] for line in known if line["newmark_over_paper"] < 1.0]
-    found["newmark_dearer"] = [line["error"] for line in known if line["newmark_over_paper"] >= 1.0]
+    found["newmark"] = [{"error": line["error"], "over": line["newmark_over_paper"]} for line in known]
     changes = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
     below_mesh = [error for error in TARGETS if error < changes[MESH]]
     return found | {"changes": changes.to_dict(), "below_mesh": below_mesh}

@@ -3,9 +3,9 @@
 A solver is asked for no more accuracy on a mechanism once it cannot run it, has passed the time limit at two settings
 running (a loose one may take longer than the next), has failed at two tolerances running after one that ended, or has
 taken more than `FAR` times as long as the fastest of its side, ours or others', so far for no smaller an error, at two
-settings running. Where two of its errors lie more than a decade apart it is asked between them, so that nothing need be
-interpolated over more, and beyond its ends, be they tolerances or steps, where these leave accuracies out. What takes
-`OUTCLASSED` times as long as another of its side is not repeated. A part of `studies.work_precision`.
+settings running. Where two of its errors lie about a decade apart, or more, it is asked between them, so that nothing
+need be interpolated over more, and beyond its ends, be they tolerances or steps, where these leave accuracies out. What
+takes `OUTCLASSED` times as long as another of its side is not repeated. A part of `studies.work_precision`.
 """
 
 import itertools
@@ -23,6 +23,7 @@ from studies.bench.tables import DECADE, LOOSEST, NEAR, TIGHTEST
 FAR = 20.0
 RUNNING = 2
 ROUNDS = 4  # of asking between settings
+APART = 0.5 * DECADE  # errors of which repetitions may lie a decade apart
 OUTCLASSED = 10.0  # times the least time of its side: such a run decides nothing, and is made once
 CLOSE = 5.0  # times the time of the fastest of its side: what costs more is not asked between its settings
 ENDING = (*NOTHING_RUN, "RAISED")
@@ -143,7 +144,7 @@ def between(
     asked = []
     for loose, tight in itertools.pairwise(made):
         apart, inside = error[loose] / error[tight], any(error[tight] < each < error[loose] for each in errors)
-        if inside and apart > DECADE and loose / tight > NEAR and (close[loose] or close[tight]):
+        if inside and apart > APART and loose / tight > NEAR and (close[loose] or close[tight]):
             asked.append(float(np.sqrt(loose * tight)))
     asked += _beyond(own[0], made, error, close, sorted(rows), errors)
     tidy = [_tidy(own[0], value) for value in asked]

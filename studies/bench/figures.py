@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
 from studies.bench.store import Output
-from studies.bench.tables import DECADE, SETTINGS, time_for, used
+from studies.bench.tables import DECADE, SETTINGS, astray, time_for, used
 
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
@@ -62,13 +62,13 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "TRBDF2": (SKY, "v"),
     "ESDIRK4": (GREY, "v"),
     "Gauss12": (BLUE, "s"),
-    "Gauss6": (VIOLET, "D"),
+    "Gauss6": (BROWN, "D"),
     "SunRadau5": (PINK, "v"),
     "RadauIIA5": (ORANGE, "^"),
     "RadauIIA9": (BROWN, "^"),
     "RadauIIA13": (MAGENTA, "^"),
     "RadauIIA5, by differences": (GREY, "^"),
-    "Gauss6, Newton": (VIOLET, "X"),
+    "Gauss6, Newton": (BROWN, "X"),
     "BDF": (GREEN, "P"),
     "Newmark": (GREY, "h"),
     "PaperIRK": (YELLOW, "H"),
@@ -210,7 +210,7 @@ def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINE
 def _told(rows: pd.DataFrame) -> pd.Series:
     """Whether the reference resolves the error of a run, and the run has not lost the motion."""
     resolved = rows["error_q"].astype(float) > rows["floor"].astype(float)
-    return resolved & ~rows["astray"].isin((True, "True")) if "astray" in rows else resolved
+    return resolved & ~astray(rows)
 
 
 def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:

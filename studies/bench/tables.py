@@ -1,7 +1,7 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
 from collections.abc import Iterable, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,11 @@ RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, a
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
+LOOKED_AT = ("error_q", "floor", "used", "times", "astray", *SETTINGS)  # columns by which costs at an error are found
+RANKED = (
+    *("family", "called_from", "keeps_constraints", "call_s", "call_q1", "call_q3", "n_evaluations"),
+    *("violation_q", "violation_v", "energy"),
+)
 FEWEST = 3  # repetitions that an interval asks for
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
@@ -55,8 +60,13 @@ def resampled(rows: pd.DataFrame) -> Array:
     drawn = np.full((len(rows), RESAMPLES), np.nan)
     for k, times in enumerate(rows.get("times", ())):
         if len(times) >= FEWEST:
-            drawn[k] = np.median(np.array(times)[_rounds(len(times))], axis=1)
+            drawn[k] = _medians_drawn(tuple(times))
     return drawn
+
+
+@lru_cache(maxsize=20_000)
+def _medians_drawn(times: tuple[float, ...]) -> Array:
+    return np.asarray(np.median(np.array(times)[_rounds(len(times))], axis=1))
 
 
 def setting_of(rows: pd.DataFrame) -> Array:
@@ -104,6 +114,11 @@ def used(run: pd.Series) -> str:
     return run["used"] if isinstance(run.get("used"), str) else ""
 
 
+def astray(runs: pd.DataFrame) -> pd.Series:
+    """Which runs have another motion than the reference; none where that was not looked at."""
+    return runs["astray"].isin((True, "True")) if "astray" in runs else pd.Series(False, runs.index)
+
+
 def _errors(runs: pd.DataFrame) -> Array:
     return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
 
@@ -120,8 +135,16 @@ def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
 
 
 def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
-    """The runs that have an error and this cost, by error."""
-    return rows[rows["error_q"].notna() & rows[what].notna()].sort_values("error_q", kind="stable")
+    """The runs that have an error and this cost, by error; of their columns those that are looked at."""
+    errors = rows["error_q"].to_numpy(float)
+    order = np.argsort(errors, kind="stable")  # NaN last
+    known = order[~np.isnan(errors[order]) & rows[what].notna().to_numpy()[order]]
+    return _with_columns(rows, (*LOOKED_AT, what)).iloc[known]
+
+
+def _with_columns(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Those of these columns that there are: to select and sort rows of 70 columns takes minutes."""
+    return rows[[name for name in dict.fromkeys(names) if name in rows]]
 
 
 def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
@@ -143,15 +166,16 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     """Of the solvers of one case that get to an error and were asked for about so much, what they take.
 
     `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
-    either side, so that no solver is ahead of another for want of a run.
+    either side, so that no solver is ahead of another for want of a run. A run out of phase is on neither side.
     """
     found = {}
-    for solver, own in rows.groupby("solver", sort=False):
+    for solver, own in _with_columns(rows, ("solver", "call_s", *LOOKED_AT)).groupby("solver", sort=False):
         runs = _told(own, "call_s")
         place = None if runs.empty else _place(own, runs, target)
         if place is None and doubt and not runs.empty and target >= runs["floor"].max():
             n_good = int((_errors(runs) <= target).sum())
-            place = None if n_good == 0 else (min(n_good + 1, len(runs)), None)
+            looser = n_good < len(runs) and not astray(runs).to_numpy()[n_good]
+            place = None if n_good == 0 else (n_good + looser, None)
         if place is not None:
             costs, drawn = runs["call_s"].to_numpy(float), resampled(runs)
             if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest the scatter is not known
@@ -199,7 +223,7 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         log-log line between two runs), and violation_q, violation_v, energy of the cheapest run that is as good.
     """
     lines = []
-    for solver, runs in rows.groupby("solver", sort=False):
+    for solver, runs in _with_columns(rows, ("solver", *RANKED, *LOOKED_AT)).groupby("solver", sort=False):
         cpu = time_for(runs, target)
         if np.isnan(cpu):
             continue

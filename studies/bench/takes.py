@@ -4,11 +4,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from studies.bench.headline import OWN_CODE
 from studies.bench.render import listed
+from studies.bench.solvers import DEFAULT
 from twoloop.methods.presets import PRESETS
 
 SUFFIX = " (two-loop)"  # of our solvers, in the findings of honesty
-COMPILED_DEFAULT = "auto, compiled"
 KINDS = {  # tags of mechanisms, and what a user calls them
     "redundant": "redundant constraints",
     "spatial": "spatial",
@@ -31,47 +32,78 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Of each kind who is the cheapest on most mechanisms; kinds with none such are told together."""
-    rows, undecided = [], []
+    """Of each kind who is the cheapest on most mechanisms; of the others together the two that are it most often."""
+    rows, open_kinds, told = [], [], set()
+    others: dict[str, Sequence[Mapping[str, Any]]] = {}
     for kind, words in KINDS.items():
         these = [each["at"] for each in mechanisms if kind in each.get("tags", ())]
         cheapest = Counter(_cheapest(at) for at in these)
         solver, n = max(cheapest.items(), key=lambda item: (item[0] != "", item[1]), default=("", 0))
         if solver and 2 * n > len(these):
             said = f"{call(solver)}, the cheapest at most errors on {n} of {len(these)} such mechanisms"
-            rows.append({"what": words, "take": said})
+            rows.append({"what": words, "take": said + _drifting([solver], these)})
+            told |= {each["case"] for each in mechanisms if kind in each.get("tags", ())}
         elif these:
-            undecided.append(words)
-    if undecided:
-        said = "the default: no solver is the cheapest at most errors on most such mechanisms"
-        rows.append({"what": "; ".join(undecided), "take": said})
+            open_kinds.append(words)
+            others |= {each["case"]: each["at"] for each in mechanisms if kind in each.get("tags", ())}
+    open_ones = [at for case, at in others.items() if case not in told]
+    won = sum(map(_won, open_ones), Counter[str]())
+    names = [name for name, _ in won.most_common() if name][:2]
+    often = [f"{call(name)} ({won[name]})" for name in names]
+    if open_kinds:
+        told_apart = f"{' or '.join(often)}: the cheapest at that many of {won.total()} errors"
+        told_apart += _drifting(names, open_ones)
+        said = told_apart if often else "the default: no solver is told apart from the others"
+        rows.append({"what": "; ".join(open_kinds), "take": said})
     return rows
 
 
-def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
-    """The cheapest solver at more than half of the errors that any reaches on one mechanism; "" where there is none.
+def _drifting(names: Sequence[str], mechanisms: Sequence[Sequence[Mapping[str, Any]]]) -> str:
+    """What is said where none of these solvers keeps the constraints."""
+    runs = [run for at in mechanisms for line in at for run in (line["ours"], line["others"]) if run]
+    kept = [run.get("keeps", True) for run in runs if run["solver"] in names]
+    if any(kept) or not kept:
+        return ""
+    return f"; given accelerations, {'it drifts' if len(names) == 1 else 'they drift'} off the constraints"
 
-    Errors at which ours and others are not told apart, or others were not asked, count for no solver.
+
+def _won(at: Sequence[Mapping[str, Any]]) -> Counter[str]:
+    """At how many errors that any solver reaches on one mechanism each solver is the cheapest.
+
+    Errors at which ours and others are not told apart, or others were not asked, count for "".
     """
     won: Counter[str] = Counter()
     for line in at:
         runs = [(run["call_s"], run["solver"]) for run in (line["ours"], line["others"]) if run]
         decided = line["verdict"] in ("ahead", "behind", "alone", "missed")
         won.update([min(runs)[1] if decided else ""] if runs else [])
+    return won
+
+
+def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
+    """The cheapest solver at more than half of the errors on one mechanism; "" where there is none."""
+    won = _won(at)
     solver, n = won.most_common(1)[0] if won else ("", 0)
     return solver if 2 * n > won.total() else ""
 
 
 def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """From which run on code for the mechanism pays, by the first calls, where it does."""
-    for line in first_calls:
-        if line["solver"] == COMPILED_DEFAULT and line["pays"]:
-            least, most = min(line["pays"]), max(line["pays"])
-            runs = f"{least:.0f}" if least == most else f"{least:.0f} to {most:.0f}"
-            never = f"; on {line['never']} of {line['n']} it never does" if line["never"] else ""
-            said = f"`compiled=True`, which pays from run {runs} on the mechanisms measured{never}"
-            return [{"what": "run many times", "take": said}]
-    return []
+    paying = {line["solver"]: line for line in first_calls if line["pays"]}
+    rivals = [line for name, line in paying.items() if name != DEFAULT and not name.endswith(", compiled")]
+    parts = []
+    if OWN_CODE in paying:
+        parts.append(f"`compiled=True`, which pays {_from_run(paying[OWN_CODE])}")
+    if rivals:
+        first = min(rivals, key=lambda line: (line["never"], max(line["pays"])))
+        parts.append(f"of the rivals {call(first['solver'])} pays {_from_run(first)}")
+    return [{"what": "run many times", "take": "; ".join(parts)}] if parts else []
+
+
+def _from_run(line: Mapping[str, Any]) -> str:
+    least, most = min(line["pays"]), max(line["pays"])
+    runs = f"{least:.0f}" if least == most else f"{least:.0f} to {most:.0f}"
+    return f"from run {runs} on" + (f", on {line['never']} of {line['n']} mechanisms never" if line["never"] else "")
 
 
 def call(solver: str) -> str:

@@ -4,7 +4,19 @@ import numpy as np
 import pandas as pd
 
 from studies.beam.sensitivity import PARAMETERS
-from studies.bench.solvers import COMPILED, DEFAULT, IRK, OWN_EXPLICIT, PAPER_TOL
+from studies.bench.solvers import (
+    ADAMS,
+    COMPILED,
+    CVODE_C,
+    DEFAULT,
+    DIFFRAX,
+    HEYOKA,
+    IRK,
+    NEWMARK,
+    OWN_EXPLICIT,
+    PAPER_TOL,
+    QUARTER,
+)
 from studies.bench.tables import time_for
 from studies.claims.rows import BEAM_END, BEAMS, Rows, cheapest
 from studies.claims.verdicts import Judgement, decide, span, span_known
@@ -19,8 +31,9 @@ FOLLOWS = 1e-3  # m, of the tip over the run
 A_LOT = 5.0  # times; the frequencies grow by 10
 TIPS = (1e-2, 1e-3, 1e-4)  # m or rad, errors over the run at which costs are compared: tip, or the linkage
 TIP = TIPS[-1]  # m
-EXPLICIT = (OWN_EXPLICIT, "DOP853, projected")
-CHOOSING = (DEFAULT, *COMPILED)  # between explicit and implicit
+EXPLICIT = (OWN_EXPLICIT, ADAMS, HEYOKA, DIFFRAX, "DOP853, projected", "DOP853, index 1", "Pr9, index 1")
+FIXED_POINT = (IRK, NEWMARK, QUARTER, CVODE_C, "CVODE, Adams", "CVODES, CasADi, Adams")
+CHOOSING = (DEFAULT, *COMPILED, "LSODA, index 1")  # between explicit and implicit
 WIDTH = 0.02  # m, about the width of a line in a figure of the tip
 KEYS = ("soft", "stiff")
 PARTED = 10.0  # times the change until 1.2 s
@@ -54,7 +67,7 @@ def implicit_needed(rows: Rows) -> Judgement:
     for key, case in zip(KEYS, BEAMS, strict=True):
         runs = rows.beam(case, "")
         explicit = runs["solver"].isin(EXPLICIT)
-        implicit = ~explicit & ~runs["solver"].isin(CHOOSING)
+        implicit = ~explicit & ~runs["solver"].isin((*CHOOSING, *FIXED_POINT))
         for name, what in ((key, "call_s"), (f"{key}_evaluations", "n_evaluations")):
             costs = [[cheapest(runs[place], tip, what) for tip in TIPS] for place in (explicit, implicit)]
             ratios[name] = span_known((np.array(costs[0]) / costs[1]).tolist())

@@ -68,6 +68,7 @@ def told(row: pd.Series) -> dict[str, Any]:
     found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
     found |= {name: row[name] for name in ("verdict", "status")}
     found["label"] = f"{row['name']}, {setting(row)}"
+    found["kinetic"] = float(row["kinetic"])
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
     found |= {"calm": row["verdict"] == NO_DRIFT, "drifts": row["verdict"] in DRIFTING}
     return found | {"keeps": bool(row["keeps_constraints"])}

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from studies.bench import figures, study
 from studies.bench.cli import StudyError
+from studies.bench.end_states import EXACT
 from studies.bench.render import render, table
 from studies.bench.sharp_forces import T_END
 from studies.bench.store import Output, Row
@@ -39,7 +40,7 @@ UNASKED = "wrong and silent, never asked"  # shown of those that are the same, b
 SHORT = {
     HANG: "**hang**",
     SILENT: "**silent**",
-    UNASKED: "**silent** (unasked)",
+    UNASKED: "**silent** (force never seen)",
     SAID: "said",
     RIGHT: "right",
     NOT_RUN: "–",
@@ -226,7 +227,7 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
-    return found | {"silent": SILENT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+    return found | {"exact": EXACT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
 
 
 def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -248,10 +249,8 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": []}
     found["solvers"] = totals(rows)
     for family, own in ran.groupby("trap", sort=False):
-        parts = parts_of(own)
-        line = {"family": str(family)} | {whose: counts_of(own[which]) for whose, which in parts.items()}
-        by = own[parts["ours"] & (own["outcome"] == SILENT)]["solver"]
-        found["families"].append(line | {"by": sorted(set(by))})
+        counts = {whose: counts_of(own[which]) for whose, which in parts_of(own).items()}
+        found["families"].append({"family": str(family)} | counts)
     found["mechanisms"] = [str(name) for name in ran["mechanism"].unique()]
     return found | {whose: counts_of(ran[which]) for whose, which in parts_of(ran).items()}
 
@@ -270,6 +269,7 @@ def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
         ran = own[own["outcome"] != NOT_RUN]
         wrong = ran["outcome"].isin((SILENT, HANG))
         line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
+        line["gross"] = int((wrong & ~(ran["error"].astype(float) <= EXACT)).sum())
         line |= {"n_mistakes": int((ran["group"] == MISTAKE).sum()), "n_forces": int((ran["group"] == FORCE).sum())}
         found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
     return found

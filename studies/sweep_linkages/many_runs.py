@@ -116,15 +116,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any] | None:
     made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=FLOOR)
     made = made.assign(solver=made["way"], status="REACHED_END").sort_values(["way", "tol", "repeat"])
     medians = tables.medians(made)
-    names = ("way", "tol", "call_s", "first_s", "error_median", "error_worst", "n_failed")
     own, at = medians["way"].isin((SWEEP, SINGLE)), []
     for error in ERRORS:
         ours, others = tables.costs_at(medians[own], error), tables.costs_at(medians[~own], error, doubt=True)
         cheapest = [min(side, key=lambda name: side[name][0], default=None) for side in (ours, others)]
         line = {"error": error, "ours": cheapest[0], "rival": cheapest[1], **tables.compared(ours, others)}
         at.append(line | {"run_s": {name: cost for name, (cost, _) in (ours | others).items()}})
-    order = {way: k for k, way in enumerate((SWEEP, SINGLE, HEYOKA, DIFFRAX))}
-    lines = sorted(medians[list(names)].to_dict("records"), key=lambda line: (order[line["way"]], -line["tol"]))
     over = [line["run_s"][SWEEP] / line["run_s"][SINGLE] for line in at if {SWEEP, SINGLE} <= line["run_s"].keys()]
-    found = {"lines": lines, "n": int(made["n_runs"].iloc[0]), "repeats": int(medians["repeats"].max()), "at": at}
-    return found | {"ways": list(order), "sweep_over_single": [min(over), max(over)] if over else None}
+    found = {"n": int(made["n_runs"].iloc[0]), "repeats": int(medians["repeats"].max()), "at": at}
+    return found | {
+        "ways": [SWEEP, SINGLE, HEYOKA, DIFFRAX],
+        "sweep_over_single": [min(over), max(over)] if over else None,
+    }

@@ -161,8 +161,9 @@ def picture(rows: pd.DataFrame) -> Figure:
         axes.set_title(name, fontsize=9)
         axes.grid(False)
     panels[0].set_ylabel("err_in")
-    ticks = {"ticks": LogLocator(subs=(1.0, 2.0, 3.0, 4.0, 6.0, 8.0)), "format": lambda value, _: number(value)}
-    figure.colorbar(image, ax=panels, shrink=0.8, label="paper's time / ours", **ticks)
+    ticks = LogLocator(subs=(1.0, 2.0, 3.0, 4.0, 6.0, 8.0))
+    scale = figure.colorbar(image, ax=panels, shrink=0.8, ticks=ticks, format=lambda value, _: number(value))
+    scale.set_label("paper's time / ours")
     figure.suptitle("The paper's time over ours (★: no result)", fontsize=10)
     return figure
 
@@ -232,7 +233,7 @@ def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
 def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
     """CPU time of Newmark, with either beta, over that of Runge-Kutta, at errors that both reach or pass."""
     fine = _compared(first)
-    found = {}
+    found: dict[str, list[float]] = {}
     for target in (0.3, 0.1, 0.03, 0.01, 0.003):
         half, quarter, irk = (
             tables.time_for(runs_, target) if target <= runs_["error_q"].max() else np.nan

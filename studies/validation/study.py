@@ -303,7 +303,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["n_inexact"] = {"ours": int(inexact.sum()), "others": int((~inexact).sum())}
     found["exact"] = EXACT
     found["n_wrong"] = {"ours": len(ours), "others": len(found["wrong"]) - len(ours)}
-    found["n_singular"] = sum(line["case"] in singular for line in found["wrong"] if line["family"] != "two-loop")
+    given = [line for line in found["wrong"] if line["family"] != "two-loop" and line["solver"] != IDA_C]
+    found["n_singular"] = sum(line["case"] in singular for line in given)
+    sides = {"ours": rows["family"] == "two-loop", "python": rows["called_from"] == "Python"}
+    stopped = rows["status"].eq("TIME_LIMIT")
+    found["n_stopped"] = {side: [int(stopped[which].sum()), int(which.sum())] for side, which in sides.items()}
     ended = rows[rows["outcome"].isin(("right", "inexact", "wrong"))]["family"] == "two-loop"
     found["n_ended"] = {"ours": int(ended.sum()), "others": int((~ended).sum())}  # runs that report success
     return found | {"time_limit": TIME_LIMIT}

@@ -76,6 +76,8 @@ def _profile(
     inside = tables.time_for(own, at["error"], "inside_s") if "inside_s" in rows else float("nan")
     known = bool(np.isfinite(inside))
     seconds = inside if known else at["ours"]["call_s"]
+    if known and line["ours"]["steps"]:
+        line["ours"]["step_ns"] = 1e9 * inside / line["ours"]["steps"]
     line["integrators"] = line["ratio"] * at["ours"]["call_s"] / inside if known else None
     evaluations, count = at["ours"]["n_evaluations"], operations.get(at["case"], np.nan)
     # a step of Taylor, which the default takes, too, computes series, not accelerations at points

@@ -23,7 +23,10 @@ ADAPTERS = {
 }
 
 
-@pytest.mark.parametrize("name", ADAPTERS)
+@pytest.mark.parametrize(
+    "name",
+    ["DOP853", "IDA from C", *(pytest.param(each, marks=pytest.mark.slow) for each in ("CVODE", "IDA", "solve_dae"))],
+)
 def test_motion_and_multipliers_of_all_rows_are_those_of_the_reference(name):
     package, solve = ADAPTERS[name]
     pytest.importorskip(package)

@@ -70,14 +70,16 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     assert found["one_best"] and found["at"][0]["best"]["solver"] == NEWTON
     assert found["at"][0]["ours"]["call_s"] == pytest.approx(0.79, abs=0.01)
     assert found["at"][0]["others"]["call_s"] == pytest.approx(1.59, abs=0.02)
-    assert found["newmark_cheaper"] == list(TARGETS) and found["newmark_dearer"] == []
+    assert [at["error"] for at in found["newmark"]] == list(TARGETS) and all(
+        at["over"] < 1.0 for at in found["newmark"]
+    )
     made = rows()
     made.loc[made["solver"] == IDA_C_ORDER_2, "call_s"] /= 100.0
     made.loc[made["solver"] == PAPER, "call_s"] /= 100.0
     found = found_of(tmp_path, made)["cases"][1]
     assert found["one_best"] and found["at"][0]["best"]["solver"] == IDA_C_ORDER_2
     assert not found["at"][0]["best"]["ours"]
-    assert found["newmark_cheaper"] == [] and found["newmark_dearer"] == list(TARGETS)
+    assert [at["over"] >= 1.0 for at in found["newmark"]] == [True] * len(TARGETS)
     made = rows()
     made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "call_s"] = 1e-3
     found = found_of(tmp_path, made)["cases"][1]
@@ -86,7 +88,7 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     loosest = made["error_tip"] > 1e-3
     made.loc[(made["solver"] == PAPER) & loosest & (made["case"] == STIFF), "call_s"] = 0.1
     found = found_of(tmp_path, made)["cases"][1]
-    assert (found["newmark_cheaper"], found["newmark_dearer"]) == ([1e-4], [1e-2, 1e-3])
+    assert {at["error"]: at["over"] < 1.0 for at in found["newmark"]} == {1e-2: False, 1e-3: False, 1e-4: True}
 
 
 @pytest.mark.usefixtures("unsaved")

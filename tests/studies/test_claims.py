@@ -124,7 +124,8 @@ def energy():
         ("Newmark, β = 1/2", "velocities", 1e-13),
     ):
         rows.append(GOOD | {"solver": solver, "variables": variables, "slope": slope, "slope_error": 1e-11})
-    return pd.DataFrame(rows).assign(partition="lasting", h=0.02, t_end=1e4, n_steps=500_000, kinetic=5.6)
+    made = pd.DataFrame(rows).assign(partition="lasting", h=0.02, t_end=1e4, n_steps=500_000, kinetic=5.6)
+    return made.assign(swing=1e-3, t_reached=1e4)
 
 
 def steps():

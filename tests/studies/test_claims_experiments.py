@@ -22,7 +22,7 @@ def test_line_5_counts_the_criteria_that_were_fixed_afterwards():
     assert 0 < late < len(load())
     found["claims"] = {key: {"verdict": "not run"} for key in claims}
     text = render("claims", found, {}, lines=[], stamp="a; b", quick=False)
-    assert f"{late} of {len(load())} criteria were fixed after rows were at hand" in text.splitlines()[4]
+    assert f"{late} of {len(load())} criteria were fixed with rows at hand" in text.splitlines()[4]
 
 
 def test_energy_does_not_bound_y3():

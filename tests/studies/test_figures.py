@@ -190,8 +190,9 @@ def test_the_cells_of_table_3_are_drawn_as_ratios():
     ]
     made[5] |= {"call_s": 10.0 * made[5]["call_s"]}
     made[6] |= {"lost": True}
-    first, second = table3.picture(pd.DataFrame(made)).axes
+    first, second, scale = table3.picture(pd.DataFrame(made)).axes
     told = [[text.get_text() for text in axes.texts] for axes in (first, second)]
     assert told[0] == ["10"] * 5 + ["1.0", "★"] + ["10"] * 9
     assert told[1] == ["★", "10", "10", "10"] * 4
     assert first.get_xlabel() == "err_out" and first.get_ylabel() == "err_in"
+    assert scale.get_ylabel() == "paper's time / ours"

@@ -181,13 +181,14 @@ def told_of_forces(rows):
 
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces())
-    assert found["trust"]["default"] == {"n": 2, "wrong": 0, "unasked": 0, "n_mistakes": 1, "n_forces": 1, "refused": 0}
+    none = dict.fromkeys(("wrong", "unasked", "gross", "refused"), 0)
+    assert found["trust"]["default"] == none | {"n": 2, "n_mistakes": 1, "n_forces": 1}
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
     wrong = {"default": 0, "compiled": 1, "ours": 1, "others": 1, "limited": 0}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
-    assert "| the default, compiled | 0 of 0 | 1 of 2 | 0 | 0 |" in text
-    assert "| other projects' solvers as they come | 0 of 0 | 1 of 2 | 0 |" in text
-    assert "| the same with max_step | 0 of 0 | 0 of 2 | 0 |" in text
+    assert "| the default, compiled | 0 of 0 | 0 | 1 of 2 | 0 | 0 | 0 |" in text
+    assert "| other projects' solvers as they come | 0 of 0 | 0 | 1 of 2 | 0 | 0 |" in text
+    assert "| the same with max_step | 0 of 0 | 0 | 0 of 2 | 0 | 0 |" in text
     line = found["forces"]["families"][0]
     assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == line["limited"][honesty.RIGHT] == 1
 
@@ -220,7 +221,7 @@ def test_a_refusal_is_no_run(message):
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert "| the default, compiled | 0 of 0 | 0 of 1 | 0 | 1 |" in text
+    assert "| the default, compiled | 0 of 0 | 0 | 0 of 1 | 0 | 0 | 1 |" in text
 
 
 def test_what_a_refusal_says_is_what_is_said():

@@ -123,14 +123,12 @@ def text_of(rows):
 
 def test_sentences_turn_with_the_rows():
     good = text_of(rows_of("right"))
-    assert "No run of these linkages" in good
-    assert (
-        "Of 1 runs of 1 random mechanisms under sharp forces, half of them friction, none is wrong and silent." in good
-    )
+    assert "No run of the linkages, of any size and mass" in good
+    assert "None of 1 runs of 1 random mechanisms under sharp forces, half of them friction." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
-    assert "Wrong and silent: 2 runs" in bad
-    assert "half of them friction, 1 are wrong and silent: drag 1." in bad
-    assert "All methods are right from" in bad and "from 1 to 1e3 m" in bad
+    assert "Of linkages, sizes and masses: 2 runs" in bad
+    assert "Yes: 1 of 1 runs of 1 random mechanisms under sharp forces, half of them friction: drag 1." in bad
+    assert "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad

@@ -91,7 +91,7 @@ def test_the_runs_go_round_methods_and_tolerances():
 
 
 def test_counts_of_runs():
-    about = {"group": "sharp", "what": "drag", "name": "pendulum", "value": 0.0, "method": "auto"}
+    about = {"group": "sharp", "what": "drag", "name": "pendulum", "value": 0.0, "method": "auto", "message": "x"}
     found = sharp_runs.counts(pd.DataFrame([about | {"outcome": each} for each in (RIGHT, SILENT, SAID, RIGHT)]))
     assert (found["n"], found[RIGHT], found[SAID], found[SILENT], found["n_mechanisms"]) == (4, 2, 1, 1, 1)
     assert found["families"] == {"drag": 1}

@@ -140,11 +140,11 @@ def test_runs_made_once_as_they_are_far_behind_undo_no_verdict():
     assert tables.compared(tables.costs_at(once, 1e-3), theirs)["verdict"] == "undecided"
 
 
-def test_nobody_is_ahead_of_a_solver_for_want_of_a_run():
+def test_no_solver_is_ahead_of_another_for_want_of_a_run():
     made = rows(("heyoka", 1e-1, 1.0), ("heyoka", 1e-9, 50.0)).assign(tol=[1e-1, 1e-9])
     assert tables.costs_at(made, 1e-5) == {}  # nothing is told of its cost there ...
     (time, _) = tables.costs_at(made, 1e-5, doubt=True)["heyoka"]
-    assert time == 1.0  # ... and nobody is ahead of it who takes more than its looser run
+    assert time == 1.0  # ... and none is ahead of it that takes more than its looser run
     assert tables.costs_at(made, 1e-10, doubt=True) == {}
 
 

@@ -80,6 +80,7 @@ def made_up(**changed):
         for solver, family in (("Gauss12", "two-loop"), ("BDF", "two-loop"), ("LSODA, index 1", "SciPy")):
             for tol in validation.TOLERANCES:
                 line = {"group": "", "case": case, "solver": solver, "family": family, "tol": tol, "t_end": 3.0}
+                line["called_from"] = "Python" if family == "SciPy" else "compiled"
                 line |= {"status": "REACHED_END", "floor": 1e-15, "outcome": "right", "condition": np.nan}
                 line |= {f"error_{level}": tol for level in ("q", "v", "lam")}
                 line |= {f"digits_{level}": -np.log10(tol) for level in ("q", "v", "lam")}

@@ -87,12 +87,15 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
 
 @pytest.mark.parametrize(
     ("pays", "never", "said"),
-    [([3.0, 40.0], 1, "pays from run 3 to 40 on the mechanisms measured; on 1 of 5 it never does"), ([], 5, None)],
+    [([3.0, 40.0], 1, "pays from run 3 to 40 on, on 1 of 5 mechanisms never"), ([], 5, None)],
 )
 def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pays(pays, never, said):
     line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
-    made = takes({"work_precision": {"first_calls": [{**line, "solver": "heyoka", "pays": [1.0]}, line]}}, [])
-    assert [row["take"] for row in made] == ([f"`compiled=True`, which {said}"] if said else [])
+    theirs = {**line, "solver": "heyoka", "pays": [1.0], "never": 0}
+    (row,) = takes({"work_precision": {"first_calls": [theirs, line]}}, [])
+    own = [f"`compiled=True`, which {said}"] if said else []
+    assert row["take"] == "; ".join([*own, "of the rivals `heyoka` pays from run 1 on"])
+    assert takes({"work_precision": {"first_calls": []}}, []) == []
 
 
 def test_no_row_of_advice_stands_without_a_finding(tmp_path):

@@ -7,7 +7,8 @@ One stage after another, Newton's method finds the accelerations a of the indepe
 where v_j = v + h sum_k a_jk a_k and q_j = q + h sum_k a_jk V_k over the stages before. The corrections d solve
 (I - z^2 J_q - z J_v) d = F - a with the derivatives of the two-loop right-hand side F, see newton_step.py. Where the
 system gives tangents, they are those of each iterate: stiff directions turn as the body moves, and after the turn of a
-large step an older matrix no longer contracts. The stages of a method with eigenvalues of its own per stage cannot do so.
+large step an older matrix no longer contracts. The stages of a method with eigenvalues of its own per stage cannot do
+so.
 
 With step-size control TR-BDF2 goes on from its embedded formula of order 3, the difference to it filtered three times,
 which leaves the method L-stable: so the errors of many short steps add up to the tolerance, and not to their number
