@@ -7,16 +7,17 @@ from studies.work_precision.scaling import chain
 from tests.kernels.test_augmented import form, started
 from tests.problems import called
 from twoloop.kernels.algebra.saddle_point import solve_both
-from twoloop.kernels.data.common import AUGMENTED, DONE, FORM, NULL_SPACE, compiled
+from twoloop.kernels.data.common import AUGMENTED, DONE, FORM, MULTIPLIERS, NULL_SPACE, compiled
 from twoloop.kernels.evaluation.accelerations import factor_there
 from twoloop.kernels.evaluation.inner import factor_dependent, tangents
-from twoloop.mechanisms import andrews, four_bar, heavy_top, n_four_bar
+from twoloop.mechanisms import andrews, four_bar, heavy_top, moderately_stiff_beam, n_four_bar
 
 MECHANISMS = {
-    "four-bar, a dense mass": (andrews, NULL_SPACE),
+    "Andrews, a dense mass": (andrews, NULL_SPACE),
     "four-bar, a diagonal mass": (four_bar, NULL_SPACE),
     "chain": (lambda: chain(3, False), NULL_SPACE),
     "top": (heavy_top, NULL_SPACE),
+    "beam, few rows": (moderately_stiff_beam, MULTIPLIERS),
     "many loops": (lambda: n_four_bar(20), AUGMENTED),
 }
 
