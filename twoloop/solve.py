@@ -21,6 +21,7 @@ from twoloop.checks.arguments import (
     shown,
 )
 from twoloop.checks.consistency import check_start
+from twoloop.generate.derived import standing_for
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
@@ -180,6 +181,7 @@ def solve_dae(
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t1, q0, v0)
 
+        system, derived = standing_for(system, check)
         code = own_code(system, t0, q0, check) if compiled else None
         if hasattr(chosen, "for_system"):
             chosen = chosen.for_system(system, code, check)
@@ -195,6 +197,7 @@ def solve_dae(
                     f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
                 )
             plan = replace(plan, inner=code.inner, traced=(*plan.traced, code.equations.traced))
+        plan = replace(plan, traced=(*plan.traced, *derived))
         run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
         if step_size is None:
             run.set_sizes(first_step, float(max_step), t1)

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from references.driver import check_system
 from references.equations.duals import Dual, functions_on_duals
 from references.equations.redundant_rows import independent_rows
-from twoloop.generate.series import on_symbols
+from twoloop.generate.equations import Equations
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import Graph, Untraceable
+from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.data.common import GAMMA_GIVEN
 from twoloop.problem.system import ConstrainedSystem
 
@@ -75,12 +75,11 @@ class Expressions:
 
     def _check(self, t0: float, q0: Array, v0: Array) -> None:
         """See that what the callbacks do with symbols is what they do with numbers."""
-        graph, n = Graph(), self.system.n_q
-        (t,), q, v = graph.inputs(1, False), graph.inputs(n, False), graph.inputs(n, True)
+        equations = Equations(self.system)
         try:
-            for name, shape, state in _kinds(n, self.system.n_c, q, v):
-                on_symbols(self.system, graph, name, shape, t, *state)
-            Traced(self.system, graph).refuse(self.system, t0, t0 + 1.0, q0, v0)
+            for name, *_ in _kinds(self.system.n_q, self.system.n_c, equations.q, equations.v):
+                equations.of(name)
+            Traced(self.system, equations.graph).refuse(self.system, t0, t0 + 1.0, q0, v0)
         except Untraceable as error:
             raise NotSymbolic(str(error)) from error
 

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.equations import Equations
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import COSINE, PENDING, SINE, Form, Graph, Untraceable, symbols
-from twoloop.kernels.data.common import GIVEN
+from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE
 from twoloop.problem.system import ConstrainedSystem
 
 Integers = NDArray[np.int64]
@@ -113,59 +113,22 @@ def series_program(system: ConstrainedSystem) -> SeriesProgram:
     Untraceable
         Naming the callback, and why its equations cannot be had.
     """
-    for kind, size in (("jacobian", system.n_c), ("nonholonomic", system.n_a)):
-        if size and not system.functions.flags[GIVEN[kind]]:
-            raise Untraceable(f"{system.name!r} does not give {kind}, which is needed")
-    graph, n, n_rows = Graph(), system.n_q, system.n_c + system.n_a
-    (t,), q = graph.inputs(1, False), graph.inputs(n, False)
-    v, a, lam = graph.inputs(n, True), graph.inputs(n, True), graph.inputs(n_rows, True)
-    made = {}
-    for kind, shape, state in (
-        ("mass", (n, n), (q,)),
-        ("force", (n,), (q, v)),
-        ("jacobian", (system.n_c, n), (q,)),
-        ("constraint_rate", (system.n_c,), (q,)),
-        ("nonholonomic", (system.n_a, n), (q,)),
-        ("nonholonomic_rate", (system.n_a,), (q,)),
-    ):
-        made[kind] = on_symbols(system, graph, kind, shape, t, *state)
-    G = np.vstack([made["jacobian"], made["nonholonomic"]])
-    rates = [*made["constraint_rate"], *made["nonholonomic_rate"]]
+    equations, n, n_rows = Equations(system), system.n_q, system.n_c + system.n_a
+    graph, v = equations.graph, equations.v
+    a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
+    mass, force = equations.of("mass"), equations.of("force")
+    G = np.vstack([equations.of("jacobian"), equations.of("nonholonomic")])
+    rates = [*equations.of("constraint_rate"), *equations.of("nonholonomic_rate")]
     row_products: dict[Any, Any] = {}
     rows = [_sum_of_products(graph, G[i], v, rates[i], row_products) for i in range(n_rows)]
     reaction_products: dict[Any, Any] = {}
     balance = []
     for i in range(n):
         factors, others = [-each for each in G[:, i]], list(lam)
-        factors += [-each for each in made["mass"][i]]
-        balance.append(_sum_of_products(graph, factors, [*others, *a], made["force"][i], reaction_products))
+        factors += [-each for each in mass[i]]
+        balance.append(_sum_of_products(graph, factors, [*others, *a], force[i], reaction_products))
     program = _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
-
-
-def on_symbols(system: ConstrainedSystem, graph: Graph, kind: str, shape: tuple[int, ...], t: Form, *state: Any) -> Any:
-    """What a callback makes of symbols, as an array of forms.
-
-    Raises
-    ------
-    Untraceable
-        If it does not run on them.
-    """
-    out = np.full(shape, 0.0, dtype=object)
-    arrays, p = [symbols(each) for each in state], system.parameters.copy()
-    if 0 not in shape:
-        try:
-            if not system.called_in_python:
-                trace(getattr(system.functions, kind), t, *arrays, p, out)
-            elif kind in system.python_functions:
-                out = np.array(trace(system.python_functions[kind], t, *arrays), dtype=object)
-            out = as_forms(graph, out)
-            if out.shape != shape:
-                raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
-        except Untraceable as error:
-            raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
-    graph.traced.setdefault(kind, out.copy())
-    return out
 
 
 def _sum_of_products(

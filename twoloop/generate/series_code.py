@@ -21,10 +21,19 @@ from twoloop.generate.series import SeriesProgram
 from twoloop.generate.series_groups import WIDTH, Group, Groups, rounded
 from twoloop.generate.straight_code import OwnCode, function_of
 from twoloop.generate.straight_line import Solution
-from twoloop.generate.tracing import ARCTANGENT, EXPONENTIAL, LOGARITHM, PENDING, PRODUCT, RECIPROCAL, SINE, SQUARE_ROOT
 from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
 from twoloop.kernels.compile.callbacks import VECTOR, f8
 from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    EXPONENTIAL,
+    LOGARITHM,
+    PENDING,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+)
 
 LARGEST = 3000  # operations, which take 6 s to compile; the time grows faster than their number
 AT_ONCE = 8  # vectors that are summed in one loop, in registers

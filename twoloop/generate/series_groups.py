@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from twoloop.generate.llvm_code import Terms
 from twoloop.generate.series import SeriesProgram, Sums, Table
-from twoloop.generate.tracing import PENDING, SINE
+from twoloop.kernels.evaluation.operations import PENDING, SINE
 
 # doubles of the widest vector: with 8, which this processor also has, a four-bar takes a third more time
 WIDTH = 4

@@ -20,7 +20,11 @@ from twoloop.generate.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, V
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Choice, Outputs, StraightLine
 from twoloop.generate.traced_values import Check, unchecked
-from twoloop.generate.tracing import (
+from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
+from twoloop.kernels.compile.callbacks import VECTOR
+from twoloop.kernels.compile.private import Dispatcher, make_array
+from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
     EXPONENTIAL,
@@ -30,13 +34,7 @@ from twoloop.generate.tracing import (
     SINE,
     SQUARE_ROOT,
     SUM,
-    Form,
-    Graph,
-    Untraceable,
 )
-from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
-from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.private import Dispatcher, make_array
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]

@@ -19,23 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.series import on_symbols
+from twoloop.generate.equations import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import (
-    ARCTANGENT,
-    COSINE,
-    EXPONENTIAL,
-    LOGARITHM,
-    PRODUCT,
-    RECIPROCAL,
-    SINE,
-    SQUARE_ROOT,
-    SUM,
-    Form,
-    Graph,
-    Untraceable,
-)
-from twoloop.kernels.data.common import GIVEN
+from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
@@ -216,18 +202,13 @@ class StraightLine:
     """
 
     def __init__(self, system: ConstrainedSystem, choice: "Choice"):
-        given = system.functions.flags
-        for kind, size in (("jacobian", system.n_c), ("nonholonomic", system.n_a)):
-            if size and not given[GIVEN[kind]]:
-                raise Untraceable(f"{system.name!r} does not give {kind}, which is needed")
-        self.system, self.choice, self.graph = system, choice, Graph()
+        self.equations = Equations(system)
+        self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing = Form(self.graph, 0.0, {})
-        n, n_c, n_a = system.n_q, system.n_c, system.n_a
-        (self.t,) = self.graph.inputs(1, False)
-        self.q, self.v = self.graph.inputs(n, False), self.graph.inputs(n, True)
-        self.mass = self._made("mass", (n, n), self.q)
-        rows = [self._made("jacobian", (n_c, n), self.q), self._made("nonholonomic", (n_a, n), self.q)]
-        rates = [self._made("constraint_rate", (n_c,), self.q), self._made("nonholonomic_rate", (n_a,), self.q)]
+        n, n_a, (self.q, self.v) = system.n_q, system.n_a, (self.equations.q, self.equations.v)
+        self.mass = self._made("mass")
+        rows = [self._made("jacobian"), self._made("nonholonomic")]
+        rates = [self._made("constraint_rate"), self._made("nonholonomic_rate")]
         self.all_rows, counting = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
@@ -243,15 +224,15 @@ class StraightLine:
             raise Untraceable(f"its equations are more than {MOST} operations")
         self.traced = Traced(system, self.graph)
 
-    def _made(self, kind: str, shape: tuple[int, ...], *state: Sequence[Form]) -> Any:
-        made = on_symbols(self.system, self.graph, kind, shape, self.t, *state)
-        for place in np.ndindex(shape):
+    def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
+        made = self.equations.of(kind, v)
+        for place in np.ndindex(made.shape):
             made[place] = made[place].value()
         return made
 
     def _redundant(self, rates: Any) -> Outputs:
         left = [k for k in range(self.system.n_c) if k not in self.choice.rows]
-        off = self._made("constraint", (self.system.n_c,), self.q)
+        off = self._made("constraint")
         one, conditions = Form(self.graph, 1.0, {}), []
         size, speed = (sum((x * x for x in state), one) for state in (self.q, self.v))
         for k in left:
@@ -285,38 +266,16 @@ class StraightLine:
 
     def _accelerations(self, v: Sequence[Form]) -> list[Form]:
         """a and the multipliers of the rows that count, at velocities v."""
-        gamma = self._gamma(v)
-        right = list(self._made("force", (self.system.n_q,), self.q, v))
+        gamma = [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
+        right = list(self._made("force", v))
         for k in self.choice.added:
             for i, entry in enumerate(self.all_rows[k]):
                 right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
-    def _gamma(self, v: Sequence[Form]) -> list[Form]:
-        """The right-hand side of the constraints on accelerations: as given, else -(dG/dt v + dG_t/dt) by the rules."""
-        n_c, n_a, gamma = self.system.n_c, self.system.n_a, []
-        for kind, size, first in (("gamma", n_c, 0), ("nonholonomic_gamma", n_a, n_c)):
-            if self.system.functions.flags[GIVEN[kind]]:
-                gamma += [*self._made(kind, (size,), self.q, v)]
-            elif size:
-                rate = "constraint_rate" if first == 0 else "nonholonomic_rate"
-                rates = self._made(rate, (size,), self.q)
-                gamma += self._differentiated(self.all_rows[first : first + size], rates, v)
-        return gamma
-
-    def _differentiated(self, rows: Any, rates: Any, v: Sequence[Form]) -> list[Form]:
-        along = {_only(self.t): Form(self.graph, 1.0, {}), **{_only(q): u for q, u in zip(self.q, v, strict=True)}}
-        derivative, made = Derivative(self.graph, along), []
-        for row, rate in zip(rows, rates, strict=True):
-            total = derivative.of(rate)
-            for entry, u in zip(row, v, strict=True):
-                total = total + derivative.of(entry) * u
-            made.append((-total).value())
-        return made
-
     def _add_projection(self) -> None:
         n = self.system.n_q
-        off = self._made("constraint", (self.system.n_c,), self.q)[list(self.choice.rows)]
+        off = self._made("constraint")[list(self.choice.rows)]
         moved = self.factors.solve([*([self.nothing] * n), *(-each for each in off)])[:n]
         faster = []
         for row, rate in zip(self.rows, self.rates, strict=True):
@@ -380,7 +339,7 @@ class Solution:
         self.kept = Outputs({"kept": [Form(equations.graph, 0.0, {i: 1.0}) for i in known]}, equations.conditions)
         self.graph, n = Graph(), equations.system.n_q
         r, c = self.graph.inputs(n, False), self.graph.inputs(len(equations.all_rows), False)
-        places = dict(zip(known, (_only(form) for form in self.graph.inputs(len(known), False)), strict=True))
+        places = dict(zip(known, (only(form) for form in self.graph.inputs(len(known), False)), strict=True))
 
         def here(form: Form) -> Form:
             return Form(self.graph, form.constant, {places[i]: x for i, x in form.terms.items()})
@@ -447,11 +406,6 @@ def _is_zero(form: Form) -> bool:
     return not form.terms and form.constant == 0.0
 
 
-def _only(form: Form) -> int:
-    (quantity,) = form.terms
-    return quantity
-
-
 def _independent(G: Array) -> list[int]:
     """The first rows that no rows before add up to."""
     kept: list[int] = []
@@ -479,45 +433,3 @@ def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int,
             raise Untraceable(f"the mass of {name!r} stays singular with constraints added")
         added.append(int(free[0]))
         mass = mass + scale * np.outer(G[free[0]], G[free[0]])
-
-
-class Derivative:
-    """Derivatives of quantities along a direction in which the inputs change, by the rules of differentiation."""
-
-    def __init__(self, graph: Graph, direction: dict[int, Form]):
-        self.graph = graph
-        self._known = dict(direction)
-
-    def of(self, form: Form) -> Form:
-        """The derivative of a form."""
-        total = Form(self.graph, 0.0, {})
-        for i, c in form.terms.items():
-            total = total + self._of_quantity(i).times(c)
-        return total
-
-    def _of_quantity(self, i: int) -> Form:
-        if i not in self._known:
-            operation = self.graph.operations[i]
-            change = Form(self.graph, 0.0, {}) if operation is None else self._of_operation(i, *operation)
-            self._known[i] = change.value()
-        return self._known[i]
-
-    def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:
-        result, change = Form(self.graph, 0.0, {i: 1.0}), self.of(first)
-        if kind == PRODUCT:
-            assert second is not None
-            return change * second + first * self.of(second)
-        if kind == SUM:
-            return change
-        if kind == RECIPROCAL:
-            return -(change * result * result)
-        if kind == SQUARE_ROOT:
-            return change * result.reciprocal() * 0.5
-        if kind == EXPONENTIAL:
-            return change * result
-        if kind == SINE:
-            return change * first.cosine()
-        if kind == COSINE:
-            return -(change * first.sine())
-        assert kind in (LOGARITHM, ARCTANGENT) and second is not None
-        return change * second.reciprocal()

@@ -7,13 +7,13 @@ at states spread over the time of the run and about its start, later at states o
 
 import warnings
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.scales import sizes
-from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.generate.programs import program_of
+from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
 
@@ -52,31 +52,8 @@ class Traced:
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.trusted = False
-        self._write(graph, [graph.traced[kind][place] for kind, place in self.places])
-
-    def _write(self, graph: Graph, results: list[Form]) -> None:
-        from twoloop.kernels.evaluation import traced as kernels
-
-        n_inputs = 1 + 2 * int(self.sizes[0])
-        needed = graph.needed_by(results)
-        node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
-        nothing = Form(graph, 0.0, {})
-        rows: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
-        rows += [(kernels.RESULT, form, None, k) for k, form in enumerate(results)]
-        terms: list[tuple[int, float]] = []
-        program, constants = [], []
-        for kind, one, other, made in rows:
-            begin = len(terms)
-            other = nothing if other is None else other
-            terms += [(node[i], c) for i, c in one.terms.items()]
-            program.append((kind, made, begin, len(terms), len(terms) + len(other.terms)))
-            terms += [(node[i], c) for i, c in other.terms.items()]
-            constants.append((one.constant, other.constant))
-        self.program = np.array(program, dtype=np.int64).reshape(-1, kernels.N_COLUMNS)
-        self.columns = np.array([i for i, _ in terms], dtype=np.int64)
-        self.coefficients = np.array([c for _, c in terms], dtype=float)
-        self.constants = np.array(constants, dtype=float).reshape(-1, 2)
-        self.n_nodes = len(node)
+        results = [graph.traced[kind][place] for kind, place in self.places]
+        self.program = program_of(graph, 1 + 2 * system.n_q, results)
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
         """Compare at states about the start, spread over the time of a run.
@@ -143,11 +120,8 @@ class Traced:
             self.sizes,
             self.which,
             np.ascontiguousarray(states),
-            self.program,
-            self.columns,
-            self.coefficients,
-            self.constants,
-            np.zeros((2, self.n_nodes)),
+            *self.program[:-1],
+            np.zeros((2, self.program.n_nodes)),
             called,
             traced,
             bounds,

@@ -11,8 +11,19 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-# kinds of operation; the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
-PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM = range(10)
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    LOGARITHM,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+    SUM,
+)
+
+# the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"

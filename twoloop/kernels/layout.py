@@ -18,6 +18,7 @@ def make_work(
     rank_v: int | None = None,
     reduced: bool = True,
     augmented: bool = False,
+    n_nodes: int = 0,
 ) -> Work:
     """Allocate the workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a."""
     n_rows = n_c + n_a
@@ -77,6 +78,7 @@ def make_work(
         lapack=integers(N_ROUTINES),
         predicted=np.zeros(r),
         notes=np.zeros(N_NOTES),
+        nodes=np.zeros(n_nodes),
     )
     table = WORK.table(work)
     return work._replace(table=table, address=table.ctypes.data)

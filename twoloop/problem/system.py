@@ -14,7 +14,7 @@ from twoloop.checks.arguments import check_flag, check_number, check_real, check
 from twoloop.checks.bounds import check_callback
 from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, Functions
+from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions
 from twoloop.problem.adapters import (
     ConstantMatrix,
     PythonFunctions,
@@ -119,7 +119,9 @@ class ConstrainedSystem:
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
         all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
-        self.functions: Any = Functions(**all_callbacks, p=p, flags=flags)  # type: ignore[call-arg]
+        none = (np.zeros(0, np.int64), np.zeros(0))
+        programs = dict(zip(PROGRAMS, 2 * none, strict=True))
+        self.functions: Any = Functions(**all_callbacks, p=p, flags=flags, **programs)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
         self._shapes = {

@@ -8,6 +8,7 @@ from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays
 from twoloop.kernels.data import common
+from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import make_work
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
@@ -57,7 +58,9 @@ def workspace(
     """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows."""
     flags = kit.flags
     reduced, augmented = flags[common.DENSE_FORM] == common.NULL_SPACE, flags[common.FORM] == common.AUGMENTED
-    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented))
+    programs = [each for each in (kit.jacobian_program, kit.gamma_program) if each.size]
+    n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
+    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
     work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf

@@ -25,8 +25,10 @@ from twoloop.kernels.compile.reference import Reference
 i8 = types.int64
 INTEGERS = types.int64[::1]
 
-# the callbacks of a mechanism, its parameters and its flags
-Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags"])  # type: ignore[misc]
+# programs in the place of callbacks that are not given, see evaluation/program.py; of size 0 where there is none
+PROGRAMS = ("jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers")
+# the callbacks of a mechanism, its parameters, its flags and its programs
+Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 
 
 # places in Functions.flags; BANDWIDTH is -1 where linear algebra is not banded; FORM: how accelerations
@@ -97,6 +99,7 @@ class Work(NamedTuple):
     lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see below
+    nodes: Any  # what the operations of a program make
 
     address: Any = 0  # of the table by which kernels find these arrays
     table: Any = None
@@ -234,7 +237,9 @@ class Kit:
         return getattr(self.functions, name)
 
 
-KIT = Reference("Kit", {"p": VECTOR, "flags": INTEGERS})
+KIT = Reference(
+    "Kit", {"p": VECTOR, "flags": INTEGERS, **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR), strict=True))}
+)
 for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)
 # (kit, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py

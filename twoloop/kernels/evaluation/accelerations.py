@@ -21,6 +21,7 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.finite import MASS, finite, not_finite, source_of_acceleration
 from twoloop.kernels.evaluation.gamma import gamma_by_differences
+from twoloop.kernels.evaluation.program import gamma_by_program
 
 
 @merged
@@ -30,14 +31,16 @@ def acceleration_constraint(f, w, t, q, v):
     if w.notes[KNOWN] == 1.0 and n_rows == n_c:
         return DONE
     given, given_a = f.flags[GAMMA_GIVEN] == 1, f.flags[NONHOLONOMIC_GAMMA_GIVEN] == 1
-    first, last = 0, n_rows  # rows to be differenced
+    first, last = 0, n_rows  # rows that no callback gives
     w.Gamma[:] = 0.0
     if given:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
         first = n_c
     if n_rows == n_c or given_a:
         last = n_c
-    if last > n_c or not given:
+    if (last > n_c or not given) and f.gamma_program.size > 0:
+        gamma_by_program(f, w, t, q, v)
+    elif last > n_c or not given:
         code = gamma_by_differences(f, w, t, q, v, first, last)
         if code != DONE:
             return code
@@ -90,7 +93,7 @@ def accelerate(f, w, t, q, v, a):
         if not np.isfinite(a[j]):
             source = source_of_acceleration(w)
             return not_finite(w.notes, source if source >= 0 or finite(w.M) else MASS, t, q)
-    if f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size:
+    if f.gamma_program.size == 0 and (f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size):
         _note_scale(w, a)
     return DONE
 

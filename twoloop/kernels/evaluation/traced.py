@@ -8,11 +8,23 @@ import math
 from numba import types
 
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, exact, i8, kernel
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    END,
+    EXPONENTIAL,
+    FIRST,
+    KIND,
+    LOGARITHM,
+    MADE,
+    PRODUCT,
+    RECIPROCAL,
+    RESULT,
+    SECOND,
+    SINE,
+    SQUARE_ROOT,
+)
 
-# kinds of operation, as twoloop.generate.tracing has them; RESULT is the entry of a callback
-PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, _, SUM, RESULT = range(11)
-# columns of the program: kind, the node (or entry) that is made, and where the terms of two forms begin and end
-KIND, MADE, FIRST, SECOND, END, N_COLUMNS = range(6)
 VALUE, BOUND = range(2)  # rows of `nodes`
 
 EPS = 2.0**-52

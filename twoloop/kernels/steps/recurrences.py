@@ -7,9 +7,16 @@ import numpy as np
 
 from twoloop.kernels.algebra.saddle_point import solve_both
 from twoloop.kernels.data.common import DONE, N_EVALUATIONS, NOT_FINITE, compiled, inlined, merged
-
-# kinds of operation, as twoloop.generate.tracing has them; PENDING: products whose second factors wait for the solution
-PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING = range(9)
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    EXPONENTIAL,
+    LOGARITHM,
+    PENDING,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+)
 
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits

@@ -1,0 +1,56 @@
+"""Derivatives of traced quantities."""
+
+from twoloop.generate.tracing import Form, Graph
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    LOGARITHM,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+    SUM,
+)
+
+
+class Derivative:
+    """Derivatives of quantities along a direction in which the inputs change, by the rules of differentiation."""
+
+    def __init__(self, graph: Graph, direction: dict[int, Form]):
+        self.graph = graph
+        self._known = dict(direction)
+
+    def of(self, form: Form) -> Form:
+        """The derivative of a form."""
+        total = Form(self.graph, 0.0, {})
+        for i, c in form.terms.items():
+            total = total + self._of_quantity(i).times(c)
+        return total
+
+    def _of_quantity(self, i: int) -> Form:
+        if i not in self._known:
+            operation = self.graph.operations[i]
+            change = Form(self.graph, 0.0, {}) if operation is None else self._of_operation(i, *operation)
+            self._known[i] = change.value()
+        return self._known[i]
+
+    def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:
+        result, change = Form(self.graph, 0.0, {i: 1.0}), self.of(first)
+        if kind == PRODUCT:
+            assert second is not None
+            return change * second + first * self.of(second)
+        if kind == SUM:
+            return change
+        if kind == RECIPROCAL:
+            return -(change * result * result)
+        if kind == SQUARE_ROOT:
+            return change * result.reciprocal() * 0.5
+        if kind == EXPONENTIAL:
+            return change * result
+        if kind == SINE:
+            return change * first.cosine()
+        if kind == COSINE:
+            return -(change * first.sine())
+        assert kind in (LOGARITHM, ARCTANGENT) and second is not None
+        return change * second.reciprocal()

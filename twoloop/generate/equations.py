@@ -1,0 +1,106 @@
+"""The equations of one system, traced: every callback as an array of forms, and exact derivatives of what is not given.
+
+Series, straight-line code, references and the programs that stand for callbacks that are not given read them from here.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.derivative import Derivative
+from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
+from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.problem.system import ConstrainedSystem
+
+OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
+
+
+class Equations:
+    """What the callbacks of a system make of symbols; each is traced when it is first asked for, once.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+
+    Attributes
+    ----------
+    graph : Graph
+        Its first quantities are t, q and v.
+    t : Form
+    q, v : list of Form (n_q,)
+    """
+
+    def __init__(self, system: ConstrainedSystem):
+        self.system, self.graph = system, Graph()
+        (self.t,) = self.graph.inputs(1, False)
+        self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
+        self._made: dict[str, Any] = {}
+
+    def of(self, kind: str, v: Sequence[Form] | None = None) -> Any:
+        """What a kind of callback gives, as an array of forms: zeros, or derivatives, where there is none.
+
+        `v`: forms in the place of the velocities, if not these themselves.
+
+        Raises
+        ------
+        Untraceable
+            If a callback does not run on symbols; says which, and why.
+        """
+        if v is not None and "v" in KINDS[kind].state:
+            return self._make(kind, v)
+        if kind not in self._made:
+            self._made[kind] = self._make(kind, self.v)
+        return self._made[kind].copy()
+
+    def _make(self, kind: str, v: Sequence[Form]) -> Any:
+        absent = kind not in self.system.given
+        if absent and kind == "jacobian":
+            return self._jacobian()
+        return self._gamma(*OF_ROWS[kind], v) if absent and kind in OF_ROWS else self._traced(kind, v)
+
+    def _traced(self, kind: str, v: Sequence[Form]) -> Any:
+        system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
+        out, shape, p = out.astype(object), out.shape, system.parameters.copy()
+        arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
+        if out.size:
+            try:
+                if not system.called_in_python:
+                    trace(getattr(system.functions, kind), self.t, *arrays, p, out)
+                elif kind in system.python_functions:
+                    out = np.array(trace(system.python_functions[kind], self.t, *arrays), dtype=object)
+                out = as_forms(graph, out)
+                if out.shape != shape:
+                    raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
+            except Untraceable as error:
+                raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
+        graph.traced.setdefault(kind, out.copy())
+        return out
+
+    def _jacobian(self) -> Any:
+        """C_q from C."""
+        constraint, one = self.of("constraint"), Form(self.graph, 1.0, {})
+        made = np.empty((self.system.n_c, self.system.n_q), dtype=object)
+        for j, coordinate in enumerate(self.q):
+            by = Derivative(self.graph, {only(coordinate): one})
+            made[:, j] = [by.of(form) for form in constraint]
+        return made
+
+    def _gamma(self, rows: str, rates: str, v: Sequence[Form]) -> Any:
+        """-(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma, by the rules of differentiation."""
+        moving = {only(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
+        along = Derivative(self.graph, {only(self.t): Form(self.graph, 1.0, {}), **moving})
+        made = self.of(rates)
+        for i, row in enumerate(self.of(rows)):
+            total = along.of(made[i])
+            for entry, u in zip(row, v, strict=True):
+                total = total + along.of(entry) * u
+            made[i] = -total
+        return made
+
+
+def only(form: Form) -> int:
+    """The one quantity that a form is."""
+    (place,) = form.terms
+    return place

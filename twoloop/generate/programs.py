@@ -1,0 +1,44 @@
+"""Traced quantities as programs for kernels: rows of operations in an order in which they can be done."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from twoloop.generate.tracing import Form, Graph
+from twoloop.kernels.evaluation.operations import N_COLUMNS, RESULT
+
+
+class Program(NamedTuple):
+    """Operations, see kernels/evaluation/operations.py; `columns` and `coefficients` are those of all terms."""
+
+    rows: Any
+    columns: Any
+    coefficients: Any
+    constants: Any
+    n_nodes: int
+
+
+def program_of(graph: Graph, n_inputs: int, results: Sequence[Form]) -> Program:
+    """What makes these results of the first quantities of a graph."""
+    needed = graph.needed_by(results)
+    node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
+    nothing = Form(graph, 0.0, {})
+    operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
+    operations += [(RESULT, form, None, k) for k, form in enumerate(results)]
+    terms: list[tuple[int, float]] = []
+    rows, constants = [], []
+    for kind, one, other, made in operations:
+        begin = len(terms)
+        other = nothing if other is None else other
+        terms += [(node[i], c) for i, c in one.terms.items()]
+        rows.append((kind, made, begin, len(terms), len(terms) + len(other.terms)))
+        terms += [(node[i], c) for i, c in other.terms.items()]
+        constants.append((one.constant, other.constant))
+    return Program(
+        np.array(rows, dtype=np.int64).reshape(-1, N_COLUMNS),
+        np.array([i for i, _ in terms], dtype=np.int64),
+        np.array([c for _, c in terms], dtype=float),
+        np.array(constants, dtype=float).reshape(-1, 2),
+        len(node),
+    )

@@ -1,0 +1,96 @@
+"""C_q and Gamma by what callbacks were traced to, where they are not given: see generate/programs.py."""
+
+import math
+
+from twoloop.kernels.data.common import compiled, exact
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    END,
+    EXPONENTIAL,
+    FIRST,
+    HEAD,
+    KIND,
+    LOGARITHM,
+    MADE,
+    N_COLUMNS,
+    N_NODES,
+    N_RESULTS,
+    N_ROWS,
+    N_TERMS,
+    PRODUCT,
+    RECIPROCAL,
+    SECOND,
+    SINE,
+    SQUARE_ROOT,
+)
+
+
+@exact
+def _sum(program, numbers, nodes, terms, coefficients, constant, begin, end):
+    """A form: a constant and multiples of nodes."""
+    total = constant
+    for k in range(begin, end):
+        total += numbers[coefficients + k] * nodes[program[terms + k]]
+    return total
+
+
+@exact
+def _run(program, numbers, nodes, t, q, v):
+    """Make all nodes from t, q and v."""
+    n, n_rows = q.size, program[N_ROWS]
+    terms, coefficients = HEAD + N_COLUMNS * n_rows, 2 * n_rows
+    nodes[0] = t
+    for j in range(n):
+        nodes[1 + j] = q[j]
+        nodes[1 + n + j] = v[j]
+    for i in range(n_rows):
+        row = HEAD + N_COLUMNS * i
+        begin, middle, end = program[row + FIRST], program[row + SECOND], program[row + END]
+        kind, made = program[row + KIND], program[row + MADE]
+        x = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i], begin, middle)
+        if kind == PRODUCT:
+            x *= _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i + 1], middle, end)
+        elif kind == RECIPROCAL:
+            x = 1.0 / x
+        elif kind == SQUARE_ROOT:
+            x = math.sqrt(x)
+        elif kind == EXPONENTIAL:
+            x = math.exp(x)
+        elif kind == SINE:
+            x = math.sin(x)
+        elif kind == COSINE:
+            x = math.cos(x)
+        elif kind == LOGARITHM:
+            x = math.log(x)
+        elif kind == ARCTANGENT:
+            x = math.atan(x)
+        nodes[made] = x
+
+
+@exact
+def _results(program):
+    """How many results there are, at which node they begin, and where it stands to what they belong."""
+    n = program[N_RESULTS]
+    return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
+
+
+@compiled
+def gamma_by_program(f, w, t, q, v):
+    """Rows of Gamma that no callback gives, into w.Gamma."""
+    program = f.gamma_program
+    _run(program, f.gamma_numbers, w.nodes, t, q, v)
+    n, first, places = _results(program)
+    for k in range(n):
+        w.Gamma[program[places + k]] = w.nodes[first + k]
+
+
+@compiled
+def jacobian_by_program(f, w, t, q, G):
+    """C_q at (t, q) into the first rows of G, full of zeros."""
+    program = f.jacobian_program
+    _run(program, f.jacobian_numbers, w.nodes, t, q, q)
+    n, first, places = _results(program)
+    for k in range(n):
+        place = program[places + k]
+        G[place // q.size, place % q.size] = w.nodes[first + k]
