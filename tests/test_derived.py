@@ -1,0 +1,144 @@
+"""C_q and gamma that are not given come exactly from what the other callbacks were traced to."""
+
+import numpy as np
+import pytest
+
+from tests.problems import called
+from twoloop import ConstrainedSystem, consistent_state, solve_dae
+from twoloop.generate.derived import standing_for
+from twoloop.generate.equations import Equations
+from twoloop.generate.traced_values import unchecked
+from twoloop.kernels.data.common import DONE, compiled
+from twoloop.kernels.evaluation.accelerations import acceleration_constraint
+from twoloop.kernels.evaluation.constraints import constraint_rows
+from twoloop.run.workspace import kit_of, workspace
+
+SPEED = 4000.0  # rad/s
+
+
+def bar(speed=SPEED, length=1.0, **more):
+    """A bar about a pin, [x, y, angle] of its centre, that a drive turns at a speed."""
+    functions = {
+        "constraint": lambda t, q: np.array(
+            [q[0] - length * np.cos(q[2]), q[1] - length * np.sin(q[2]), q[2] - speed * t]
+        ),
+        "jacobian": lambda t, q: np.array(
+            [[1.0, 0.0, length * np.sin(q[2])], [0.0, 1.0, -length * np.cos(q[2])], [0.0, 0.0, 1.0]]
+        ),
+        "constraint_rate": lambda t, q: np.array([0.0, 0.0, -speed]),
+        "gamma": lambda t, q, v: -length * v[2] ** 2 * np.array([np.cos(q[2]), np.sin(q[2]), 0.0]),
+    }
+    functions |= more
+    given = {kind: function for kind, function in functions.items() if function is not None}
+    return ConstrainedSystem.from_python(
+        n_q=3, n_c=3, mass=np.diag([1.0, 1.0, 1.0 / 3.0]), force=lambda t, q, v: np.array([0.0, -9.81, 0.0]), **given
+    )
+
+
+def pendulum(**more):
+    """A point on a bar of 1 m; what is None is not given."""
+    functions = {
+        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+        "jacobian": lambda t, q: q[None, :],
+        "gamma": lambda t, q, v: np.array([-(v @ v)]),
+    } | more
+    given = {kind: function for kind, function in functions.items() if function is not None}
+    return ConstrainedSystem.from_python(
+        n_q=2, n_c=1, mass=np.eye(2), force=lambda t, q, v: np.array([0.0, -9.81]), **given
+    )
+
+
+@compiled
+def rows_and_gamma(f, w, t, q, v):
+    w.G[:, :] = 0.0
+    constraint_rows(f, w, t, q, w.G)
+    return acceleration_constraint(f, w, t, q, v)
+
+
+def in_kernels(system, t, q, v):
+    """C_q and Gamma as an evaluation takes them."""
+    system, traced = standing_for(system, unchecked)
+    kit = kit_of(system, t, q)
+    work = workspace(system, kit, np.ones((system.n_c, system.n_q)), q, 1e-8, 0.0)
+    assert called(rows_and_gamma, kit, work, t, q, v) == DONE
+    return work.G[:-1].copy(), work.Gamma.copy(), traced
+
+
+@pytest.mark.parametrize("absent", [("gamma",), ("jacobian", "gamma")], ids=" and ".join)
+def test_they_are_those_of_the_formulas(absent):
+    q, v = np.array([0.6, -0.8, 0.3]), np.array([1.0, 2.0, -3.0])
+    given, less = bar(), bar(**dict.fromkeys(absent))
+    rows, gamma, traced = in_kernels(less, 0.1, q, v)
+    assert traced
+    assert np.allclose(rows, given.jacobian(0.1, q), rtol=1e-14, atol=1e-15)
+    assert np.allclose(gamma, given.gamma(0.1, q, v), rtol=1e-14, atol=1e-15)
+
+
+def test_a_driven_rate_that_depends_on_position_and_time():
+    def rate(t, q):
+        return np.array([np.sin(2.0 * t) * q[0]])
+
+    def constraint(t, q):
+        return np.array([0.5 * (q @ q - 1.0) + 0.5 * (1.0 - np.cos(2.0 * t)) * q[0]])
+
+    def jacobian(t, q):
+        return np.array([[q[0] + 0.5 * (1.0 - np.cos(2.0 * t)), q[1]]])
+
+    q, v, t = np.array([0.6, -0.8]), np.array([1.0, 2.0]), 0.7
+    system = pendulum(constraint=constraint, jacobian=jacobian, constraint_rate=rate, gamma=None)
+    _, gamma, _ = in_kernels(system, t, q, v)
+    known = -(v @ v + 2.0 * np.sin(2.0 * t) * v[0] + 2.0 * np.cos(2.0 * t) * q[0])
+    assert gamma[0] == pytest.approx(known, rel=1e-13)
+
+
+def test_a_fast_bar_is_as_right_without_gamma_as_with():
+    """Differences along the motion err where 2e-8 s are an angle: by two hundred times as much."""
+    errors = []
+    for system in (bar(), bar(gamma=None)):
+        q0, v0 = consistent_state(system, 0.0, [1.0, 0.0, 0.0], [0.0, SPEED, SPEED])
+        q = solve_dae(system, (0.0, 0.01), q0, v0, rtol=1e-8, atol=1e-8).q[:, -1]
+        errors.append(np.abs(q[:2] - [np.cos(0.01 * SPEED), np.sin(0.01 * SPEED)]).max())
+    assert errors[1] <= 1.01 * errors[0] + 1e-12
+
+
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "PaperIRK", "Taylor"])
+def test_a_motion_without_them_is_the_motion_with_them(method):
+    ends = []
+    for absent in ((), ("gamma",), ("jacobian", "gamma")):
+        system = pendulum(**dict.fromkeys(absent))
+        ends.append(solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], method, 1e-9, 1e-9).q[:, -1])
+    assert np.allclose(ends[1], ends[0], rtol=0.0, atol=1e-12)
+    assert np.allclose(ends[2], ends[0], rtol=0.0, atol=1e-12)
+
+
+def test_what_branches_is_differenced():
+    system = pendulum(jacobian=lambda t, q: q[None, :] if q[0] > -2.0 else q[None, :], gamma=None)
+    other, traced = standing_for(system, unchecked)
+    assert other is system and traced == ()
+    assert solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6]).success
+
+
+def test_all_given_is_left_alone():
+    system = pendulum()
+    assert standing_for(system, unchecked) == (system, ())
+
+
+def test_each_callback_is_traced_once():
+    calls = []
+
+    def constraint(t, q):
+        calls.append(1)
+        return np.array([0.5 * (q @ q - 1.0)])
+
+    equations = Equations(pendulum(constraint=constraint, jacobian=None, gamma=None))
+    for kind in ("jacobian", "gamma", "constraint", "gamma"):
+        equations.of(kind)
+    assert len(calls) == 1
+
+
+def test_code_made_for_a_mechanism_needs_no_jacobian():
+    ends = [
+        solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], rtol=1e-9, atol=1e-9, compiled=True).q[:, -1]
+        for system in (pendulum(), pendulum(jacobian=None, gamma=None))
+    ]
+    assert np.allclose(*ends, rtol=0.0, atol=1e-11)
