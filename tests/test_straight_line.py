@@ -16,7 +16,8 @@ from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.generate import straight_code
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import function_of, own_code
-from twoloop.generate.straight_line import Choice, Derivative, Factors, Outputs, Solution, StraightLine
+from twoloop.generate.derivative import Derivative
+from twoloop.generate.straight_line import Choice, Factors, Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile import caches
 from twoloop.kernels.data.common import BY_GENERAL, DONE
