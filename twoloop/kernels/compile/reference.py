@@ -4,6 +4,7 @@ Numba passes a named tuple by value, member by member: a workspace of forty arra
 each call that LLVM does not inline stores them all. A `Reference` has the same attributes and is one argument.
 """
 
+import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -51,6 +52,11 @@ class Reference(types.Type):
 
     def __reduce__(self) -> Any:
         return _known, (self.name,)
+
+    def __repr__(self) -> str:
+        """The name, and what tells layouts apart: machine code on disk is kept by it."""
+        fields = [(field, str(kind)) for field, kind in self.arrays.items()] + list(self.functions)
+        return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
         """Add a function, whose signature may name this very type."""
