@@ -307,7 +307,7 @@ def test_digests_of_functions_that_name_themselves_end():
 
 SYMBOL = """
 import sys
-from twoloop.adapters import through_python
+from twoloop.problem.adapters import through_python
 
 print(next(iter(through_python(sys.argv[1]).overloads.values())).fndesc.mangled_name)
 """

@@ -89,7 +89,8 @@ def test_a_constant_mass_is_factored_once():
 
     once, always = run(True), run(False)
     np.testing.assert_allclose(once.q[:, -1], always.q[:, -1], atol=1e-10)
-    assert abs(always.stats.n_factorizations - once.stats.n_factorizations) < 10  # T^T M T is factored at every state
+    # T^T M T is factored at every state, with M constant not again at the same
+    assert 0.9 * always.stats.n_factorizations < once.stats.n_factorizations <= always.stats.n_factorizations
 
 
 def test_unknown_kind_lists_the_known():

@@ -6,7 +6,7 @@ import pytest
 from tests.problems import called
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.generate.derived import standing_for
-from twoloop.generate.equations import Equations
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.data.common import DONE, compiled
 from twoloop.kernels.evaluation.accelerations import acceleration_constraint

@@ -15,10 +15,10 @@ from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.generate import straight_code
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.equations import Equations
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import function_of, own_code
 from twoloop.generate.straight_line import Choice, Factors, Outputs, Solution, StraightLine
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile import caches
 from twoloop.kernels.data.common import BY_GENERAL, DONE

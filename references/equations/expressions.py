@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from references.driver import check_system
 from references.equations.duals import Dual, functions_on_duals
 from references.equations.redundant_rows import independent_rows
-from twoloop.generate.equations import Equations
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.data.common import GAMMA_GIVEN

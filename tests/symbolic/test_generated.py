@@ -99,7 +99,7 @@ UNPICKLED = """
 import pickle, sys
 from pathlib import Path
 sys.modules["sympy"] = None
-from twoloop import generated
+from twoloop.problem import generated
 generated.sources_folder = lambda: Path("equations").resolve()
 problem = pickle.loads(Path("problem.pickle").read_bytes())
 system = problem.system

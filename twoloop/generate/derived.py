@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.generate.equations import Equations
 from twoloop.generate.programs import Program, program_of
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Check, Traced
 from twoloop.generate.tracing import Form, Untraceable
 from twoloop.kernels.evaluation.operations import KIND, MADE, RESULT
@@ -57,7 +57,8 @@ def _made(system: ConstrainedSystem, absent: Sequence[str]) -> tuple[dict[str, A
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Form]]:
     """The forms that a program makes, each by its place."""
-    system, gamma = equations.system, {}
+    system = equations.system
+    gamma: dict[int, Form] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
         if kind in absent:
             gamma |= dict(enumerate(equations.of(kind), first))

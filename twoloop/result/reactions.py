@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_text
-from twoloop.mechanisms.rotation import half_spin, rotated
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
@@ -86,6 +85,8 @@ def _point(joint: Joint, q: Array) -> Array:
         s, c = np.sin(angles[0]), np.cos(angles[0])
         point = np.stack([c * point[0] - s * point[1], s * point[0] + c * point[1]])
     elif len(angles) == 4:
+        from twoloop.mechanisms.rotation import rotated  # whose import compiles
+
         point = np.stack(rotated.py_func(*angles, *point))
     elif len(angles) == 9:
         point = np.einsum("kit,kt->it", angles.reshape(3, 3, -1), point)
@@ -102,6 +103,8 @@ def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) 
     if dimension == 2:
         return force, turning[0] - (arm[0] * force[1] - arm[1] * force[0])
     if len(turning) == 4:  # e' = G^T spin / 2, so that the torque is G g / 2 along the axes of the body
+        from twoloop.mechanisms.rotation import half_spin, rotated  # whose import compiles
+
         torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *turning)))
     else:  # each column of the matrix turns like an arm
         torque = np.cross(angles.reshape(3, 3, -1), turning.reshape(3, 3, -1), axis=1).sum(axis=0)

@@ -1,5 +1,7 @@
 """What `solve_dae` returns: the record of a run, and what can be made of it."""
 
+from __future__ import annotations  # so that help shows the names of types as they are written
+
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,7 @@ from twoloop.result.storage import save
 from twoloop.run.record import Record
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result(Record):
     """A trajectory, how the run ended, and what it cost.
 
