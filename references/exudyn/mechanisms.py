@@ -16,8 +16,8 @@ from references.exudyn.run import check_radius, check_steps, run
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
 from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
-from twoloop.problem.problem import Problem
 from twoloop.mechanisms.rotation import euler_parameters, rotated_rate, rotation_matrix
+from twoloop.problem.problem import Problem
 from twoloop.result.result import Result
 
 Array = NDArray[np.float64]
