@@ -45,11 +45,18 @@ def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([before[~before["processor"].isin(made["processor"])], made], ignore_index=True)
 
 
-def kept(output: Output, rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Keep the verdicts of these rows beside those of other processors; the findings of all."""
-    table = added(output.file(FILE), verdicts(rows))
+def kept(output: Output, rows: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
+    """Keep the verdicts of these rows beside those of other processors; the findings of all, and of the time inside."""
+    made = verdicts(rows)
+    table = added(output.file(FILE), made)
     output.write(FILE, table.to_csv(index=False))
-    return findings_of(table)
+    return {"processors": findings_of(table), "inside": inside(made)}
+
+
+def inside(made: pd.DataFrame) -> list[dict[str, Any]]:
+    """How each of ours stands by the time inside the integrators alone, of the pairs that it and a rival reach."""
+    own = made[made["time"] == "inside"].groupby("who", sort=False)["verdict"]
+    return [{"name": str(who), "n": len(each), **each.value_counts()} for who, each in own]
 
 
 def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
