@@ -5,7 +5,7 @@ added by `python -m studies.processors FOLDER`, the folder of reports from there
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import StringIO
 from itertools import combinations, product
 from pathlib import Path
@@ -16,23 +16,34 @@ import pandas as pd
 
 from studies import headline, rivals, tables
 from studies.cli import REPORTS, StudyError
-from studies.store import Output
+from studies.store import WHOLE_CALL, Output
 
 FILE = "processors.csv"
-TIMES = {"whole call": "call_s", "inside": "inside_s"}  # the measure of record first
+TIMES = {WHOLE_CALL: "call_s", "inside": "inside_s"}  # the measure of record first
 PLACE = ["case", "error", "who"]
 
+Standings = Sequence[
+    tuple[str, float, Mapping[str, Mapping[str, Any]]]
+]  # mechanism, error, and how each of ours stands
 
-def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """Who is ahead at each error on each mechanism, by the time of the call and by that inside; `rows`: of all runs."""
+
+def standings(rows: pd.DataFrame, column: str) -> Standings:
+    """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
+    medians = tables.medians(rows.assign(call_s=rows[column]))
+    cases = medians.groupby("case", sort=False)
+    return [(str(case), error, headline.of_error(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
+
+
+def verdicts(rows: pd.DataFrame, known: Standings = ()) -> pd.DataFrame:
+    """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     rows = rows[rows["group"] == rivals.GROUP]
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
             continue
-        medians = tables.medians(rows.assign(call_s=rows[column]))
-        for (case, own), error in product(medians.groupby("case", sort=False), rivals.DECADES):
-            for who, at in headline.of_error(own, error).items():
+        found = known if known and time == WHOLE_CALL else standings(rows, column)
+        for case, error, standing in found:
+            for who, at in standing.items():
                 if at["verdict"] in ("ahead", "behind", "undecided"):
                     line = {"processor": rows["processor"].iloc[0], "time": time, "case": case, "error": error}
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
@@ -45,9 +56,13 @@ def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([before[~before["processor"].isin(made["processor"])], made], ignore_index=True)
 
 
-def kept(output: Output, rows: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
-    """Keep the verdicts of these rows beside those of other processors; the findings of all, and of the time inside."""
-    made = verdicts(rows)
+def kept(output: Output, rows: pd.DataFrame, found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Keep the verdicts of these rows beside those of other processors; the findings of all, and of the time inside.
+
+    `found`: of `rivals.findings_of`, in which those by the time of the call are.
+    """
+    known = [(each["case"], at["error"], at["standing"]) for each in found["mechanisms"] for at in each["at"]]
+    made = verdicts(rows, known)
     table = added(output.file(FILE), made)
     output.write(FILE, table.to_csv(index=False))
     return {"processors": findings_of(table), "inside": inside(made)}

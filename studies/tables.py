@@ -22,8 +22,9 @@ LEAST = 1.05  # ratio of times that counts: less is within what machine and orde
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
 LOOKED_AT = ("error_q", "floor", "used", "times", "astray", *SETTINGS)  # columns by which costs at an error are found
+COSTS = ("call_s", "call_q1", "call_q3", "n_evaluations")
 RANKED = (
-    *("family", "called_from", "keeps_constraints", "call_s", "call_q1", "call_q3", "n_evaluations"),
+    *("family", "called_from", "keeps_constraints", *COSTS),
     *("violation_q", "violation_v", "energy"),
 )
 FEWEST = 3  # repetitions that an interval asks for
@@ -134,12 +135,12 @@ def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
     return np.fmin(best, between)
 
 
-def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
-    """The runs that have an error and this cost, by error; of their columns those that are looked at."""
+def _told(rows: pd.DataFrame, what: str, *more: str) -> pd.DataFrame:
+    """The runs that have an error and this cost, by error; of their columns those that are looked at, and more."""
     errors = rows["error_q"].to_numpy(float)
     order = np.argsort(errors, kind="stable")  # NaN last
     known = order[~np.isnan(errors[order]) & rows[what].notna().to_numpy()[order]]
-    return _with_columns(rows, (*LOOKED_AT, what)).iloc[known]
+    return _with_columns(rows, (*LOOKED_AT, what, *more)).iloc[known]
 
 
 def _with_columns(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
@@ -224,16 +225,14 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """
     lines = []
     for solver, runs in _with_columns(rows, ("solver", *RANKED, *LOOKED_AT)).groupby("solver", sort=False):
-        cpu = time_for(runs, target)
-        if np.isnan(cpu):
+        told = _told(runs, *COSTS)
+        place = None if told.empty else _place(runs, told, target)
+        if place is None:
             continue
-        good = runs[runs["error_q"] <= target]
-        run = good.loc[good["call_s"].astype(float).idxmin()]
+        good = told[told["error_q"] <= target]
+        run = runs.loc[good["call_s"].astype(float).idxmin()]
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
-        line |= {
-            "call_s": cpu,
-            **{what: time_for(runs, target, what) for what in ("call_q1", "call_q3", "n_evaluations")},
-        }
+        line |= {what: float(_cost(told[what].to_numpy(float), place)) for what in COSTS}
         lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
     return pd.DataFrame(lines).sort_values("call_s", ignore_index=True) if lines else pd.DataFrame()
 

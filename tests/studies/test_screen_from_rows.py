@@ -6,7 +6,7 @@ import shutil
 import matplotlib.pyplot as plt
 import pytest
 
-from studies import figures, index, processors
+from studies import figures, index
 from studies.cli import REPORTS, ROOT
 from tests.studies.test_first_screen import differing
 
@@ -17,7 +17,6 @@ def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, 
     if not set(TOLD) <= set(index.findings(REPORTS)):
         pytest.skip("reports/ has findings with times of before the whole call: python -m studies all")
     monkeypatch.setattr(figures, "save", lambda figure, *_: plt.close(figure))
-    monkeypatch.setattr(processors, "kept", lambda *_: [])  # the screen does not show them, and they take long
     for name in TOLD:
         for path in (REPORTS / f"{name}.csv", REPORTS / f"{name}_series.npz"):
             if path.exists():
