@@ -154,6 +154,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
     found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
     rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
+    best = [at["verdict"] for each in made if "singular" in each["tags"] for at in each["at"]]
+    found["singular_ahead"] = best.count("ahead")
     found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
     found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from studies.headline import OWN_CODE
-from studies.render import listed
+from studies.render import listed, number
 from studies.solvers import DEFAULT
 from twoloop.methods import PRESETS
 
@@ -22,7 +22,8 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
     """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
     rows = []
     for group in groups:
-        what = f"{group[0]['class']} ({'; '.join(entry['name'] for entry in group)})"
+        motions = "; ".join(f"{entry['name']}, {number(entry['t_end'])} s" for entry in group)
+        what = f"{group[0]['class']} ({motions})"
         picks = [f"{call(pick['solver'])} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]]
         open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
@@ -97,7 +98,7 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     if rivals:
         first = min(rivals, key=lambda line: (line["never"], max(line["pays"])))
         parts.append(f"of the rivals {call(first['solver'])} pays {_from_run(first)}")
-    return [{"what": "run many times", "take": "; ".join(parts)}] if parts else []
+    return [{"what": "run many times", "take": "; ".join(parts) + " (at one tolerance, 1e-8)"}] if parts else []
 
 
 def _from_run(line: Mapping[str, Any]) -> str:

@@ -222,7 +222,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     in_angles = part(rows, minimal.GROUP)
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
-    findings |= {} if output.call.quick else processors.kept(output, rows, found)
+    findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)
     text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
