@@ -85,8 +85,8 @@ Place = tuple[int, int, float | None]
 def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> Place | None:
     """Which runs of one solver, by error, are good enough, and where between them and the next the target is.
 
-    Of those good enough the ones within a decade of the target count, or the worst of them: a run that is better by
-    far, and cheaper by the scatter of its time, is not what a user asks for. First, and number of all up to the last.
+    Of those good enough the ones within a decade of the worst of them count: a run that is better by far, and cheaper
+    by the scatter of its time, is not what a user asks for. The first of these, and the number of all up to the last.
     `rows` are all of the solver, `runs` those that have an error and the cost. None: no run is so good, or none was
     asked for about this: within a decade below the target, at the loosest setting that the solver can run, or at nearly
     the same setting as a looser one that is not good enough (the solver leaps over the target). The place between two
@@ -102,7 +102,7 @@ def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> Place | Non
     near = ((looser >= 1.0) & (looser <= NEAR)).any()
     if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
         return None
-    first = min(int((errors < target / DECADE).sum()), n_good - 1)
+    first = int((errors < below / DECADE).sum())
     if not joined or used(runs.iloc[n_good - 1]) != used(runs.iloc[n_good]):
         return first, n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])

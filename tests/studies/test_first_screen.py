@@ -105,7 +105,7 @@ def findings():
     known = [Case("crane", four_bar(), 10.0, tags=("smooth",))]
     made = work_precision.findings_of(four, known) | {"rivals": rivals.findings_of(both)}
     made["price"] = headline.price(both, first_rows(), FOUR_BAR)
-    robustness = {"sharp": {"n": 2111, "wrong and silent": 14}}
+    robustness = {"looseness": 1e3, "sharp": {"n": 2111, "wrong and silent": 14, "methods": []}}
     told = {"work_precision": made, "table3": of_table3(), "honesty": of_honesty()}
     return told | {"robustness": robustness, "energy": energy()}
 
@@ -288,7 +288,7 @@ def test_table_3_may_be_run_again_and_no_other_study(tmp_path):
     for again in ({"table3": of_table3(paper=(7.0, 8.0, 9.0))}, {"table3": of_table3(paper=(np.nan,) * 3)}):
         block_of(tmp_path, again)
         assert differing(readme, tmp_path) == []
-    block_of(tmp_path, {"robustness": {"sharp": {"n": 2111, "wrong and silent": 15}}})
+    block_of(tmp_path, {"robustness": {"looseness": 1e3, "sharp": {"n": 2111, "wrong and silent": 15, "methods": []}}})
     (pair,) = differing(readme, tmp_path)
     assert all("**Trust**" in line for line in pair)
 
