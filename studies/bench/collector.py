@@ -32,7 +32,7 @@ INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
 COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
 AROUND = 10.0  # times the limit of a run, for all that an adapter does beside the user's call: building, output
-MOST_CALLS = 3
+CALLS = 3
 REPEATS = 5
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
 ONCE = (*NOTHING_RUN, "TIME_LIMIT")  # which is not asked again
@@ -75,7 +75,7 @@ class Case:
     time_limit : float
         CPU seconds that the call of a run may use that its user writes.
     timed : float
-        s of CPU time: a shorter run is timed by calling it again until it has used so much.
+        s of CPU time: a shorter run is timed by calling it again, CALLS times.
     tags : tuple of str
         Class of the problem, "smooth", "stiff", "long", for tables over several cases.
     note : str
@@ -93,7 +93,7 @@ class Case:
     step_sizes: tuple[float, ...] | None = None
     tolerances: tuple[float, ...] | None = None
     time_limit: float = 60.0
-    timed: float = 0.02
+    timed: float = 0.1
     tags: tuple[str, ...] = ()
     note: str = ""
 
@@ -295,22 +295,20 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
 def timed(run: Run, repeat: int) -> Timed:
     """A run, its status and message, and what it takes, each call the same: all studies time in this place.
 
-    call_s is the CPU time of the call that a user writes, the mean over `calls` of them until their sum can be read
-    off the clock: of solve_dae all of it, of another project's solver what its adapter marks (`references.driver`).
-    inside_s is what the solver says of the time in its own loop.
+    call_s is the CPU time of the call that a user writes: of solve_dae all of it, of another project's solver what its
+    adapter marks (`references.driver`). Where it is shorter than `case.timed`, it is the mean of CALLS more, as the
+    first in a row of others' runs takes up to 1.6 times as long. inside_s is what the solver says of the time in its
+    own loop.
     """
     result, status, message, spent = attempt(run, repeat)
     if result is None:
         return None, status, message, {"call_s": None, "inside_s": None, "calls": 0}
-    calls, inside = [spent], [result.stats.cpu_time]
-    while result.success and sum(calls) < run.case.timed and len(calls) < MOST_CALLS:
-        again, _, _, spent = attempt(run, repeat)
-        if again is None:
-            break
-        calls.append(spent)
-        inside.append(again.stats.cpu_time)
-    n = len(calls)
-    return result, status, message, {"call_s": sum(calls) / n or None, "inside_s": sum(inside) / n or None, "calls": n}
+    calls = [(spent, result.stats.cpu_time)]
+    if result.success and spent < run.case.timed:
+        again = [attempt(run, repeat) for _ in range(CALLS)]
+        calls = [(spent, each.stats.cpu_time) for each, _, _, spent in again if each is not None] or calls
+    call, inside = (float(np.mean(times)) for times in zip(*calls, strict=True))
+    return result, status, message, {"call_s": call or None, "inside_s": inside or None, "calls": len(calls)}
 
 
 def warm_up(run: Run, repeat: int, warm: set[tuple[int, str, float]], limit: float = COMPILING) -> None:

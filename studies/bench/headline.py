@@ -113,7 +113,7 @@ def _priced(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     best = min(((time, name) for time, name in by_solver if time == time), default=None)  # not NaN
     if best is not None:
         own = runs[runs["solver"] == best[1]]
-        line = own.loc[own["call_s"].where(own["error_q"] <= error).astype(float).idxmin()]
+        line = tables.run_for(own, error)
         told = {"keeps": bool(line["keeps_constraints"]), "from_python": bool(line["called_from"] == "Python")}
         return {"solver": best[1], "call_s": float(best[0]), "inside_s": float(line["inside_s"]), "why": None} | told
     put = tables.put(runs)

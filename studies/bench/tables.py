@@ -22,8 +22,9 @@ LEAST = 1.05  # ratio of times that counts: less is within what machine and orde
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
 LOOKED_AT = ("error_q", "floor", "used", "times", "astray", *SETTINGS)  # columns by which costs at an error are found
+COSTS = ("call_s", "call_q1", "call_q3", "n_evaluations")
 RANKED = (
-    *("family", "called_from", "keeps_constraints", "call_s", "call_q1", "call_q3", "n_evaluations"),
+    *("family", "called_from", "keeps_constraints", *COSTS),
     *("violation_q", "violation_v", "energy"),
 )
 FEWEST = 3  # repetitions that an interval asks for
@@ -78,9 +79,14 @@ def setting_of(rows: pd.DataFrame) -> Array:
     return found
 
 
-def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, float | None] | None:
-    """How many of the runs of one solver, by error, are good enough, and where between them and the next the target is.
+Place = tuple[int, int, float | None]
 
+
+def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> Place | None:
+    """Which runs of one solver, by error, are good enough, and where between them and the next the target is.
+
+    Of those good enough the ones within a decade of the worst of them count: a run that is better by far, and cheaper
+    by the scatter of its time, is not what a user asks for. The first of these, and the number of all up to the last.
     `rows` are all of the solver, `runs` those that have an error and the cost. None: no run is so good, or none was
     asked for about this: within a decade below the target, at the loosest setting that the solver can run, or at nearly
     the same setting as a looser one that is not good enough (the solver leaps over the target). The place between two
@@ -96,10 +102,11 @@ def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> tuple[int, 
     near = ((looser >= 1.0) & (looser <= NEAR)).any()
     if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
         return None
+    first = int((errors < below / DECADE).sum())
     if not joined or used(runs.iloc[n_good - 1]) != used(runs.iloc[n_good]):
-        return n_good, None
+        return first, n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])
-    return n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
+    return first, n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
 
 
 def _loosest(rows: pd.DataFrame) -> float:
@@ -123,10 +130,10 @@ def _errors(runs: pd.DataFrame) -> Array:
     return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
 
 
-def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
+def _cost(costs: Array, place: Place) -> Array:
     """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
-    n_good, share = place
-    best = np.fmin.reduce(costs[:n_good])  # NaN are the draws of runs that were made once, as others are far cheaper
+    first, n_good, share = place
+    best = np.fmin.reduce(costs[first:n_good])  # NaN: draws of runs made once, as others are cheaper
     if share is None:
         return np.asarray(best)
     with np.errstate(invalid="ignore"):
@@ -134,12 +141,12 @@ def _cost(costs: Array, place: tuple[int, float | None]) -> Array:
     return np.fmin(best, between)
 
 
-def _told(rows: pd.DataFrame, what: str) -> pd.DataFrame:
-    """The runs that have an error and this cost, by error; of their columns those that are looked at."""
+def _told(rows: pd.DataFrame, what: str, *more: str) -> pd.DataFrame:
+    """The runs that have an error and this cost, by error; of their columns those that are looked at, and more."""
     errors = rows["error_q"].to_numpy(float)
     order = np.argsort(errors, kind="stable")  # NaN last
     known = order[~np.isnan(errors[order]) & rows[what].notna().to_numpy()[order]]
-    return _with_columns(rows, (*LOOKED_AT, what)).iloc[known]
+    return _with_columns(rows, (*LOOKED_AT, what, *more)).iloc[known]
 
 
 def _with_columns(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
@@ -159,6 +166,14 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     return float("nan") if place is None else float(_cost(runs[what].to_numpy(float), place))
 
 
+def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
+    """The run of one solver that `time_for` prices, where there is one."""
+    runs = _told(rows, "call_s")
+    place = _place(rows, runs, target)
+    assert place is not None
+    return rows.loc[runs.iloc[place[0] : place[1]]["call_s"].astype(float).idxmin()]
+
+
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
 
 
@@ -175,10 +190,11 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
         if place is None and doubt and not runs.empty and target >= runs["floor"].max():
             n_good = int((_errors(runs) <= target).sum())
             looser = n_good < len(runs) and not astray(runs).to_numpy()[n_good]
-            place = None if n_good == 0 else (n_good + looser, None)
+            place = None if n_good == 0 else (n_good - 1, n_good + looser, None)
         if place is not None:
             costs, drawn = runs["call_s"].to_numpy(float), resampled(runs)
-            if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest the scatter is not known
+            first, n_good, _ = place
+            if np.isnan(drawn[first + np.argmin(costs[first:n_good])]).any():  # of the cheapest it is not known
                 drawn[:] = np.nan
             found[str(solver)] = float(_cost(costs, place)), _cost(drawn, place)
     return found
@@ -220,20 +236,19 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     -------
     DataFrame
         solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on the
-        log-log line between two runs), and violation_q, violation_v, energy of the cheapest run that is as good.
+        log-log line between two runs), and violation_q, violation_v, energy of the cheapest run near it.
     """
     lines = []
     for solver, runs in _with_columns(rows, ("solver", *RANKED, *LOOKED_AT)).groupby("solver", sort=False):
-        cpu = time_for(runs, target)
-        if np.isnan(cpu):
+        told = _told(runs, *COSTS)
+        place = None if told.empty else _place(runs, told, target)
+        if place is None:
             continue
-        good = runs[runs["error_q"] <= target]
-        run = good.loc[good["call_s"].astype(float).idxmin()]
+        first, n_good, _ = place
+        good = told.iloc[first:n_good]
+        run = runs.loc[good["call_s"].astype(float).idxmin()]
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
-        line |= {
-            "call_s": cpu,
-            **{what: time_for(runs, target, what) for what in ("call_q1", "call_q3", "n_evaluations")},
-        }
+        line |= {what: float(_cost(told[what].to_numpy(float), place)) for what in COSTS}
         lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
     return pd.DataFrame(lines).sort_values("call_s", ignore_index=True) if lines else pd.DataFrame()
 

@@ -4,11 +4,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from studies.bench.headline import OWN_CODE
-from studies.bench.render import listed
+from studies.bench.render import listed, number
 from studies.bench.solvers import DEFAULT
 from twoloop.methods.presets import PRESETS
 
+_UNDECIDED = "the default: no solver is told apart from the others"
 SUFFIX = " (two-loop)"  # of our solvers, in the findings of honesty
 KINDS = {  # tags of mechanisms, and what a user calls them
     "redundant": "redundant constraints",
@@ -22,7 +22,8 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
     """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
     rows = []
     for group in groups:
-        what = f"{group[0]['class']} ({'; '.join(entry['name'] for entry in group)})"
+        motions = "; ".join(f"{entry['name']}, {number(entry['t_end'])} s" for entry in group)
+        what = f"{group[0]['class']} ({motions})"
         picks = [f"{call(pick['solver'])} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]]
         open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
@@ -32,39 +33,44 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Of each kind who is the cheapest on most mechanisms; of the others together the two that are it most often."""
+    """Of each kind who is the cheapest on all mechanisms; of the other kinds who is it on which mechanism."""
     rows, open_kinds, told = [], [], set()
     others: dict[str, Sequence[Mapping[str, Any]]] = {}
     for kind, words in KINDS.items():
-        these = [each["at"] for each in mechanisms if kind in each.get("tags", ())]
+        own = [each for each in mechanisms if kind in each.get("tags", ())]
+        these = [each["at"] for each in own]
         cheapest = Counter(_cheapest(at) for at in these)
         solver, n = max(cheapest.items(), key=lambda item: (item[0] != "", item[1]), default=("", 0))
-        if solver and 2 * n > len(these):
+        if solver and n == len(these):
             said = f"{call(solver)}, the cheapest at most errors on {n} of {len(these)} such mechanisms"
             rows.append({"what": words, "take": said + _drifting([solver], these)})
-            told |= {each["case"] for each in mechanisms if kind in each.get("tags", ())}
+            told |= {each["case"] for each in own}
         elif these:
             open_kinds.append(words)
-            others |= {each["case"]: each["at"] for each in mechanisms if kind in each.get("tags", ())}
-    open_ones = [at for case, at in others.items() if case not in told]
-    won = sum(map(_won, open_ones), Counter[str]())
-    names = [name for name, _ in won.most_common() if name][:2]
-    often = [f"{call(name)} ({won[name]})" for name in names]
+            others |= {each["case"]: each["at"] for each in own}
+    left = {case: at for case, at in others.items() if case not in told}
+    by_solver: dict[str, list[str]] = {}
+    for case, at in left.items():
+        by_solver.setdefault(_cheapest(at), []).append(case)
+    open_ones = by_solver.pop("", [])
     if open_kinds:
-        told_apart = f"{' or '.join(often)}: the cheapest at that many of {won.total()} errors"
-        told_apart += _drifting(names, open_ones)
-        said = told_apart if often else "the default: no solver is told apart from the others"
-        rows.append({"what": "; ".join(open_kinds), "take": said})
+        ranked = sorted(by_solver.items(), key=lambda item: -len(item[1]))
+        parts = [f"{call(solver)} on {listed(cases)}" for solver, cases in ranked]
+        parts += [f"none is the cheapest at most errors on {listed(open_ones)}"] if open_ones else []
+        drifting = [name for name in by_solver if _drifting([name], list(left.values()))]
+        said = "; ".join(parts) + _drifting(drifting, list(left.values()), drifting != list(by_solver))
+        rows.append({"what": "; ".join(open_kinds), "take": said if by_solver else _UNDECIDED})
     return rows
 
 
-def _drifting(names: Sequence[str], mechanisms: Sequence[Sequence[Mapping[str, Any]]]) -> str:
-    """What is said where none of these solvers keeps the constraints."""
+def _drifting(names: Sequence[str], mechanisms: Sequence[Sequence[Mapping[str, Any]]], named: bool = False) -> str:
+    """What is said where none of these solvers keeps the constraints; `named`: others stand beside them."""
     runs = [run for at in mechanisms for line in at for run in (line["ours"], line["others"]) if run]
     kept = [run.get("keeps", True) for run in runs if run["solver"] in names]
     if any(kept) or not kept:
         return ""
-    return f"; given accelerations, {'it drifts' if len(names) == 1 else 'they drift'} off the constraints"
+    who = listed(list(map(call, names))) if named else "it" if len(names) == 1 else "they"
+    return f"; given accelerations, {who} {'drifts' if len(names) == 1 else 'drift'} off the constraints"
 
 
 def _won(at: Sequence[Mapping[str, Any]]) -> Counter[str]:
@@ -89,15 +95,13 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
 
 def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """From which run on code for the mechanism pays, by the first calls, where it does."""
-    paying = {line["solver"]: line for line in first_calls if line["pays"]}
-    rivals = [line for name, line in paying.items() if name != DEFAULT and not name.endswith(", compiled")]
-    parts = []
-    if OWN_CODE in paying:
-        parts.append(f"`compiled=True`, which pays {_from_run(paying[OWN_CODE])}")
-    if rivals:
-        first = min(rivals, key=lambda line: (line["never"], max(line["pays"])))
-        parts.append(f"of the rivals {call(first['solver'])} pays {_from_run(first)}")
-    return [{"what": "run many times", "take": "; ".join(parts)}] if parts else []
+    paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
+    sides = ([line for line in paying if line["solver"].endswith(", compiled") is ours] for ours in (False, True))
+    best = [min(side, key=lambda line: (line["never"], max(line["pays"])), default=None) for side in sides]
+    parts = [f"{call(line['solver'])}, which pays {_from_run(line)}" for line in best if line is not None]
+    if len(parts) > 1:
+        parts[1] = f"of ours {parts[1]}"
+    return [{"what": "run many times", "take": "; ".join(parts) + " (at one tolerance, 1e-8)"}] if parts else []
 
 
 def _from_run(line: Mapping[str, Any]) -> str:

@@ -227,6 +227,12 @@ def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
         return None
     times = dict(zip(ranked["solver"], ranked["call_s"] / ranked["call_s"].iloc[0], strict=True))
     found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
+    found["beside"] = None
+    if len(ranked) > 1:
+        best, second = ranked["solver"].iloc[:2]
+        costs = tables.costs_at(first, error)
+        verdict = tables.compared({best: costs[best]}, {second: costs[second]})["verdict"]
+        found["beside"] = None if verdict == "ahead" else str(second)
     return found | (tables.best(ranked) or {})
 
 

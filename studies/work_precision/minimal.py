@@ -77,6 +77,11 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}
     asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)] if len(rows) else pd.DataFrame({"error_q": []})
     found |= {"asked": len(asked), "wrong": int((asked["error_q"].astype(float) > WRONG).sum())}
+    wrong = asked[asked["error_q"].astype(float) > WRONG]
+    found["wrong_by"] = [
+        {"solver": str(name), "n": len(own), "cases": sorted(set(own["case"])), "tightest": float(own["tol"].min())}
+        for name, own in (wrong.groupby("solver", sort=False) if len(wrong) else ())
+    ]
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
     loops = [at["over_loop"] for each in made for at in each["at"] if at["over_loop"] is not None]
     found["over_loop"] = float(np.median(loops)) if loops else None

@@ -4,8 +4,9 @@
 added by `python -m studies.work_precision.processors FOLDER`, the folder of reports from there.
 """
 
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import StringIO
 from itertools import combinations, product
 from pathlib import Path
@@ -16,28 +17,41 @@ import pandas as pd
 
 from studies.bench import headline, tables
 from studies.bench.cli import REPORTS, StudyError
-from studies.bench.store import Output
+from studies.bench.store import WHOLE_CALL, Output
 from studies.work_precision import rivals
 
 FILE = "processors.csv"
-TIMES = {"whole call": "call_s", "inside": "inside_s"}  # the measure of record first
+TIMES = {WHOLE_CALL: "call_s", "inside": "inside_s"}  # the measure of record first
 PLACE = ["case", "error", "who"]
 
+Standings = Sequence[
+    tuple[str, float, Mapping[str, Mapping[str, Any]]]
+]  # mechanism, error, and how each of ours stands
 
-def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """Who is ahead at each error on each mechanism, by the time of the call and by that inside; `rows`: of all runs."""
+
+def standings(rows: pd.DataFrame, column: str) -> Standings:
+    """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
+    medians = tables.medians(rows.assign(call_s=rows[column]))
+    cases = medians.groupby("case", sort=False)
+    return [(str(case), error, headline.of_error(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
+
+
+def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFrame:
+    """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
+    commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
             continue
-        medians = tables.medians(rows.assign(call_s=rows[column]))
-        for (case, own), error in product(medians.groupby("case", sort=False), rivals.DECADES):
-            for who, at in headline.of_error(own, error).items():
+        found = known if known and time == WHOLE_CALL else standings(rows, column)
+        for case, error, standing in found:
+            for who, at in standing.items():
                 if at["verdict"] in ("ahead", "behind", "undecided"):
-                    line = {"processor": rows["processor"].iloc[0], "time": time, "case": case, "error": error}
+                    line = {"processor": rows["processor"].iloc[0], "commit": commit[1] if commit else ""}
+                    line |= {"time": time, "case": case, "error": error}
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
-    return pd.DataFrame(lines, columns=["processor", "time", *PLACE, "ratio", "verdict"])
+    return pd.DataFrame(lines, columns=["processor", "commit", "time", *PLACE, "ratio", "verdict"])
 
 
 def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
@@ -46,11 +60,22 @@ def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([before[~before["processor"].isin(made["processor"])], made], ignore_index=True)
 
 
-def kept(output: Output, rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Keep the verdicts of these rows beside those of other processors; the findings of all."""
-    table = added(output.file(FILE), verdicts(rows))
+def kept(output: Output, rows: pd.DataFrame, stamp: str, found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Keep the verdicts of these rows beside those of other processors; the findings of all, and of the time inside.
+
+    `found`: of `rivals.findings_of`, in which those by the time of the call are.
+    """
+    known = [(each["case"], at["error"], at["standing"]) for each in found["mechanisms"] for at in each["at"]]
+    made = verdicts(rows, stamp, known)
+    table = added(output.file(FILE), made)
     output.write(FILE, table.to_csv(index=False))
-    return findings_of(table)
+    return {"processors": findings_of(table), "inside": inside(made)}
+
+
+def inside(made: pd.DataFrame) -> list[dict[str, Any]]:
+    """How each of ours stands by the time inside the integrators alone, of the pairs that it and a rival reach."""
+    own = made[made["time"] == "inside"].groupby("who", sort=False)["verdict"]
+    return [{"name": str(who), "n": len(each), **each.value_counts()} for who, each in own]
 
 
 def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -66,6 +91,7 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
             apart = np.exp(np.abs(np.log(both["ratio_one"] / both["ratio_other"])))
             line = {
                 "processors": [one, other],
+                "commits": [str(side["commit"].iloc[0]) for side in sides],
                 "time": time,
                 "n": len(both),
                 "turned": turned[PLACE].to_dict("records"),
@@ -75,8 +101,8 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
     return found
 
 
-def rows_of(folder: Path) -> pd.DataFrame:
-    """The rows of `work_precision` in a folder of reports.
+def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
+    """The rows of `work_precision` in a folder of reports, and their stamp.
 
     Raises
     ------
@@ -86,14 +112,15 @@ def rows_of(folder: Path) -> pd.DataFrame:
     path = folder / "work_precision.csv"
     if not path.is_file():
         raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")
-    return pd.read_csv(StringIO(path.read_text().split("\n", 1)[1]), low_memory=False)
+    stamp, rest = path.read_text().split("\n", 1)
+    return pd.read_csv(StringIO(rest), low_memory=False), stamp
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Add the rows of another machine."""
     (folder,) = sys.argv[1:] if words is None else words
     path = REPORTS / FILE
-    added(path, verdicts(rows_of(Path(folder)))).to_csv(path, index=False)
+    added(path, verdicts(*rows_of(Path(folder)))).to_csv(path, index=False)
     print(f"added to {path}; python -m studies.work_precision --redraw puts it into the reports")
 
 

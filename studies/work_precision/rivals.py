@@ -45,7 +45,7 @@ TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
 BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
 STEPS = (100, 300, 1000, 3000, 10_000)  # of those of fixed steps
 QUICK_TOLERANCES = (1e-3, 1e-5)
-TIMED = 0.01  # s; a shorter run is called until it has used so much
+TIMED = 0.1  # s; a shorter run is called several times more
 TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 30.0  # s of what is built before
 TIGHT = 1e-14  # tolerance of the reference of the second geometry, which a third way holds ...
@@ -154,6 +154,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
     found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
     rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
+    best = [at["verdict"] for each in made if "singular" in each["tags"] for at in each["at"]]
+    found["singular_ahead"] = best.count("ahead")
     found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
     found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None

@@ -14,7 +14,10 @@ from studies.work_precision import first_calls
 
 def rows(*lines):
     """Rows of (solver, first call, later call) on one mechanism."""
-    made = [{"solver": solver, "first_call_s": first, "call_s": later} for solver, first, later in lines]
+    made = [
+        {"solver": solver, "first_call_s": first, "call_s": later, "call_q1": later, "call_q3": later}
+        for solver, first, later in lines
+    ]
     return pd.DataFrame(made).assign(case="crane", status="REACHED_END")
 
 
@@ -28,8 +31,8 @@ def rows(*lines):
     ],
 )
 def test_building_pays_from_the_run_in_which_all_runs_together_take_less(first, later, pays):
-    line = {"first_call_s": first, "call_s": later}
-    default = {"first_call_s": 0.1, "call_s": 0.2}
+    line = {"first_call_s": first, "call_s": later, "call_q3": later}
+    default = {"first_call_s": 0.1, "call_s": 0.2, "call_q1": 0.2}
     found = first_calls.pays_from(line, default)
     assert found == pays
 
@@ -38,6 +41,11 @@ def test_building_pays_from_the_run_in_which_all_runs_together_take_less(first, 
 
     ahead = [n for n in range(1, 100) if total(line, n) < total(default, n)]
     assert (ahead[0] if ahead else None) == pays
+
+
+def test_what_is_cheaper_by_less_than_its_scatter_pays_never():
+    line = {"first_call_s": 1.0, "call_s": 0.19, "call_q3": 0.21}
+    assert first_calls.pays_from(line, {"first_call_s": 0.1, "call_s": 0.2, "call_q1": 0.18}) is None
 
 
 def test_a_line_a_solver_and_never_where_its_calls_are_no_cheaper():
@@ -72,7 +80,7 @@ def test_the_first_call_ends_where_that_of_a_user_ends(marks, spent, monkeypatch
 
     for module in (driver, first_calls):
         monkeypatch.setattr(module, "cpu_time", lambda: clock[0])
-    monkeypatch.setattr(first_calls, "_compiled_anew", lambda module: module)  # other tests hold its functions
+    monkeypatch.setattr(first_calls, "_compiled_anew", lambda modules: modules[-1])  # other tests hold its functions
     monkeypatch.setitem(CATALOGUE, "twice", replace(ours, name="twice", run=run))
     row = first_calls.times_of("heavy top", "twice")
     assert row["status"] == "REACHED_END" and row["first_call_s"] == spent

@@ -109,7 +109,7 @@ def findings():
     known = [Case("crane", four_bar(), 10.0, tags=("smooth",))]
     made = work_precision.findings_of(four, known) | {"rivals": rivals.findings_of(both)}
     made["price"] = headline.price(both, first_rows(), FOUR_BAR)
-    robustness = {"sharp": {"n": 2111, "wrong and silent": 14}}
+    robustness = {"looseness": 1e3, "sharp": {"n": 2111, "wrong and silent": 14, "methods": []}}
     told = {"work_precision": made, "table3": of_table3(), "honesty": of_honesty()}
     return told | {"robustness": robustness, "energy": energy()}
 
@@ -147,13 +147,14 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
     cells = " | ".join(number(price) for price in prices)
     first = " | ".join(number(1e3 * FIRST[name]) for name in FIRST)
     expected = [
-        "| smooth, rigid (crane) | `compiled=True` for errors of 1e-2, 1e-4 and 1e-6 |",
-        "| long and conservative (four-bar, switching) | `LSODA` for errors of 0.020 J |",
+        "| smooth, rigid (crane, 10 s) | `compiled=True` for errors of 1e-2, 1e-4 and 1e-6 |",
+        "| long and conservative (four-bar, switching, 1e4 s) | `LSODA` for errors of 0.020 J |",
         "`IDA from C, stabilised`, the cheapest at most errors on 1 of 1 such mechanisms |",
         "`IDA from C, stabilised`, the cheapest at most errors on 1 of 1 such mechanisms |",
-        "on the four-bar in ms, for an error (m, rad) after 10 s of motion:",
+        "on the four-bar in ms, for an error (m, rad) after 10 s of motion, in which the fixed cost of our calls "
+        "counts for more than over the lengths above:",
         f"\n| 1e-4 | {cells} |\n| 1e-6 | {cells} |\n",
-        f"| first call of a process, tolerance 1e-8 | {first} | – | – |\n",
+        f"| first call on the mechanism, tolerance 1e-8 | {first} | – | – |\n",
         f"Of our calls {number(0.2 * prices[1])} to {number(0.2 * prices[0])} ms are spent in the integrator; ",
         f": all {n_others} on 1 of 2 mechanisms, at least {n_put} on the others. ",
         "“Ahead” and “behind” mean by at least 5 %:",
@@ -170,8 +171,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "(off by over 1e-5 at a tolerance of 1e-8)",
         "and on 23 other traps: 7 of 67 (6 of them step over a force of 1 ms), 2 of 63 (the forces alone), "
         "3 of 65 and 4 of 67 (",
-        " Of 2111 runs of random mechanisms under such forces, by every preset but the paper's two, 14 are wrong in "
-        "this way",
+        " Of 2111 runs of random mechanisms under such forces at tolerances from 1e-4 to 1e-12, by every preset but "
+        "the paper's two, 14 are off by more than 1000 tolerances, times",
     ]
     for said in expected:
         assert said in text, said
@@ -242,7 +243,7 @@ def test_ours_alone_is_said_only_where_others_were_asked(changed, verdict):
     assert made["alone"] == [FOUR_BAR] and made["not_put"] == ([FOUR_BAR] if verdict == "unasked" else [])
 
 
-def test_of_a_kind_of_mechanism_the_cheapest_on_most_mechanisms_is_named():
+def test_of_a_kind_of_mechanism_the_cheapest_is_named_or_that_of_each_mechanism():
     """A mechanism has one vote, however many errors it has; who is not told apart has none."""
     run, theirs = {"solver": "auto, compiled", "call_s": 0.1}, {"solver": "heyoka", "call_s": 0.05}
     won = {"ours": run, "others": None, "verdict": "alone"}
@@ -252,21 +253,19 @@ def test_of_a_kind_of_mechanism_the_cheapest_on_most_mechanisms_is_named():
         made = [{"case": f"{k}", "tags": list(tags), "at": at} for k, at in enumerate(mechanisms)]
         return takes({"work_precision": {"rivals": {"mechanisms": made}}}, [])
 
-    (row,) = told([won, won, lost], [won], [lost] * 9)
-    said = "`compiled=True`, the cheapest at most errors on 2 of 3 such mechanisms"
+    (row,) = told([won, won, lost], [won])
+    said = "`compiled=True`, the cheapest at most errors on 2 of 2 such mechanisms"
     assert row == {"what": "spatial", "take": said}
-    counted = {
-        "`compiled=True` (2): the cheapest at that many of 3 errors": [won, near],
-        "`compiled=True` (2) or `heyoka` (1): the cheapest at that many of 3 errors": [lost, won],
-        "`compiled=True` (1): the cheapest at that many of 4 errors": [near] * 3,
-        "`compiled=True` (1): the cheapest at that many of 2 errors": [won | {"verdict": "unasked"}],
+    told_apart = {
+        "`compiled=True` on 0 and 1; `heyoka` on 2": ([won, won, lost], [won], [lost] * 9),
+        "`compiled=True` on 0; none is the cheapest at most errors on 1": ([won], [lost, won]),
+        "`compiled=True` on 0; none is the cheapest at most errors on 1 and 2": ([won], [near] * 3, [near, won]),
     }
-    for said, others in counted.items():
-        (row,) = told([won], others)
-        assert row["take"] == said
+    for said, others in told_apart.items():
+        assert told(*others)[0]["take"] == said
     assert told([near, near])[0]["take"].startswith("the default")
     (row,) = told([won, lost], tags=("spatial", "redundant"))
-    assert row["what"] == "redundant constraints; spatial" and row["take"].endswith("of 2 errors")
+    assert row["what"] == "redundant constraints; spatial" and row["take"].startswith("the default")
     assert {"spatial", "redundant"} <= set(rivals.tags()[bricard().name])
 
 
@@ -292,7 +291,7 @@ def test_table_3_may_be_run_again_and_no_other_study(tmp_path):
     for again in ({"table3": of_table3(paper=(7.0, 8.0, 9.0))}, {"table3": of_table3(paper=(np.nan,) * 3)}):
         block_of(tmp_path, again)
         assert differing(readme, tmp_path) == []
-    block_of(tmp_path, {"robustness": {"sharp": {"n": 2111, "wrong and silent": 15}}})
+    block_of(tmp_path, {"robustness": {"looseness": 1e3, "sharp": {"n": 2111, "wrong and silent": 15, "methods": []}}})
     (pair,) = differing(readme, tmp_path)
     assert all("**Trust**" in line for line in pair)
 

@@ -194,13 +194,13 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     assert "traps: 0 of 50, 3 of 50 (the forces alone), 5 of 50 and 7 of 50 ([honesty]" in text
     assert "step over" not in text and "random mechanisms under such forces" not in text
     trust["default"] |= {"wrong": 3, "unasked": 2}
-    sharp = {"n": 3000, "wrong and silent": 4}
-    text = front(
-        tmp_path, [case()], honesty=honesty, robustness={"sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
-    )
+    sharp = {"n": 3000, "wrong and silent": 4, "methods": [{"method": "auto", "n": 150, "wrong and silent": 1}]}
+    random = {"looseness": 1e3, "sharp": sharp, "n_linkages": 9, "long": [], "silent": []}
+    text = front(tmp_path, [case()], honesty=honesty, robustness=random)
     assert "traps: 3 of 50 (2 of them step over a force of 1 ms), 3 of 50" in text
     assert "Of 3000 runs of random mechanisms" in text
-    assert "under such forces, by every preset but the paper's two, 4 are wrong in this way" in text
+    assert "from 1e-4 to 1e-12, by every preset but the paper's two, 4 are off by more than 1000 tolerances" in text
+    assert "sensitivity of the motion (1 of 150 of the default) ([robustness]" in text
     assert "**Trust**" not in front(tmp_path, [case()])
 
 
@@ -365,7 +365,7 @@ def test_each_of_default_compiled_default_and_best_stands_in_the_table_by_its_ve
     at = at_error()
     at["standing"] = standing(0.25, "behind") | {"best of ours": standing(0.1, "undecided")["best of ours"]}
     at["standing"]["auto, compiled"] |= {"verdict": "missed", "call_s": None, "ratio": None}
-    line = next(line for line in screen(tmp_path, [case(at=[at])]).splitlines() if "crane, 1.0 s" in line)
+    line = next(line for line in screen(tmp_path, [case(at=[at])]).splitlines() if ": crane, 1.0 s" in line)
     assert [cell.strip() for cell in line.split("|")[3:7]] == [
         "0.25 −",
         "–",

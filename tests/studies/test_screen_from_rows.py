@@ -8,7 +8,6 @@ import pytest
 
 from studies.bench import figures, index
 from studies.bench.cli import REPORTS, ROOT
-from studies.work_precision import processors
 from tests.studies.test_first_screen import differing
 
 TOLD = ("work_precision", "table3", "honesty", "robustness", "energy")  # of these the screen says something
@@ -18,7 +17,6 @@ def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, 
     if not set(TOLD) <= set(index.findings(REPORTS)):
         pytest.skip("reports/ has findings with times of before the whole call: python -m studies all")
     monkeypatch.setattr(figures, "save", lambda figure, *_: plt.close(figure))
-    monkeypatch.setattr(processors, "kept", lambda *_: [])  # the screen does not show them, and they take long
     for name in TOLD:
         for path in (REPORTS / f"{name}.csv", REPORTS / f"{name}_series.npz"):
             if path.exists():

@@ -178,3 +178,12 @@ def test_a_figure_has_at_most_nine_lines_and_both_formats(tmp_path):
 def test_the_cheapest_lines_are_the_cheapest():
     made = rows(*[(f"s{k}", 1e-4, 1.0 + k) for k in range(9)])
     assert figures.cheapest_lines(made, (1e-3,), 2) == ["s0", "s1"]
+
+
+def test_a_run_that_is_better_by_far_and_cheaper_by_scatter_is_not_the_price():
+    """Of many runs that are good enough the least time is that of the luckiest."""
+    made = rows(("a", 8e-5, 8.7), ("a", 2e-5, 8.5), ("a", 1e-7, 9.0), ("a", 1e-13, 7.7))
+    made = made.assign(tol=[1e-4, 1e-5, 1e-7, 1e-12])
+    assert tables.time_for(made, 1e-4) == 8.5 and tables.costs_at(made, 1e-4)["a"][0] == 8.5
+    assert tables.run_for(made, 1e-4)["error_q"] == 2e-5
+    assert tables.time_for(made, 1e-6) == 9.0

@@ -76,9 +76,9 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
     loose = {"solver": "TRBDF2", "accuracies": ["1e-2", "1e-4"], "undecided": []}
     tight = {"solver": "auto, compiled", "accuracies": ["1e-6"], "undecided": []}
     picked = [loose, tight]
-    entries = [{"class": "stiff", "name": name, "picks": picked} for name in ("a beam", "another")]
+    entries = [{"class": "stiff", "name": name, "t_end": 2.0, "picks": picked} for name in ("a beam", "another")]
     (row,) = takes({}, advice(entries))
-    assert row["what"] == "stiff (a beam; another)"
+    assert row["what"] == "stiff (a beam, 2.0 s; another, 2.0 s)"
     assert row["take"] == '`method="TRBDF2"` for errors of 1e-2 and 1e-4; `compiled=True` for errors of 1e-6'
     entries[1]["picks"] = [loose | {"undecided": ["1e-4"]}, tight]
     (row,) = takes({}, advice(entries))
@@ -93,8 +93,8 @@ def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pay
     line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
     theirs = {**line, "solver": "heyoka", "pays": [1.0], "never": 0}
     (row,) = takes({"work_precision": {"first_calls": [theirs, line]}}, [])
-    own = [f"`compiled=True`, which {said}"] if said else []
-    assert row["take"] == "; ".join([*own, "of the rivals `heyoka` pays from run 1 on"])
+    own = [f"of ours `compiled=True`, which {said}"] if said else []
+    assert row["take"] == "; ".join(["`heyoka`, which pays from run 1 on", *own]) + " (at one tolerance, 1e-8)"
     assert takes({"work_precision": {"first_calls": []}}, []) == []
 
 

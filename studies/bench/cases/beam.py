@@ -70,7 +70,7 @@ def case(kind: str, name: str, quick: bool, t_end: float | None = None) -> Case:
         watched=(problem.q0.size - 5,),  # the tip's height
         tolerances=TOLERANCES,
         time_limit=TIME_LIMIT,
-        timed=0.004 if quick else 0.02,
+        timed=0.004 if quick else 0.1,
         tags=TAGS[kind],
         note=NOTE,
     )

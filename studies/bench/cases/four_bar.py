@@ -29,6 +29,6 @@ def period() -> float:
 
 def cases(quick: bool) -> list[Case]:
     """Both geometries, released from rest, over 100 s; quick: 10 s."""
-    t_end, timed = (10.0, 0.004) if quick else (100.0, 0.02)
+    t_end, timed = (10.0, 0.004) if quick else (100.0, 0.1)
     made = {"four-bar": four_bar(), "four-bar, second": four_bar(**SECOND)}  # type: ignore[arg-type]
     return [Case(name, each, t_end, partial(_known, each), timed=timed, **TOLD) for name, each in made.items()]  # type: ignore[arg-type]
