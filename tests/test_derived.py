@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.problems import called
-from twoloop import ConstrainedSystem, consistent_state, solve_dae
+from tests.problems import called, worst
+from twoloop import ConstrainedSystem, consistent_state, mechanisms, solve_dae
 from twoloop.generate.derived import standing_for
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
@@ -59,7 +59,7 @@ def in_kernels(system, t, q, v):
     """C_q and Gamma as an evaluation takes them."""
     system, traced = standing_for(system, unchecked)
     kit = kit_of(system, t, q)
-    work = workspace(system, kit, np.ones((system.n_c, system.n_q)), q, 1e-8, 0.0)
+    work = workspace(system, kit, np.ones((system.n_c + system.n_a, system.n_q)), q, 1e-8, 0.0)
     assert called(rows_and_gamma, kit, work, t, q, v) == DONE
     return work.G[:-1].copy(), work.Gamma.copy(), traced
 
@@ -72,6 +72,25 @@ def test_they_are_those_of_the_formulas(absent):
     assert traced
     assert np.allclose(rows, given.jacobian(0.1, q), rtol=1e-14, atol=1e-15)
     assert np.allclose(gamma, given.gamma(0.1, q, v), rtol=1e-14, atol=1e-15)
+
+
+READY = sorted({name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam", "n_four_bar"})
+
+
+@pytest.mark.parametrize("name", READY)
+def test_of_every_ready_mechanism_they_are_those_of_its_formulas(name):
+    problem = getattr(mechanisms, name)()
+    system, v = problem.system, problem.v0 + np.linspace(0.5, 1.5, problem.system.n_q)
+    left_out = {"gamma", "nonholonomic_gamma", "kinematics", *(["jacobian"] if system.n_q < 30 else [])}
+    given = {kind: function for kind, function in system.given.items() if kind not in left_out}
+    sizes = {size: getattr(system, size) for size in ("n_q", "n_c", "n_a", "constant_mass", "parameters")}
+    rows, gamma, traced = in_kernels(ConstrainedSystem(**sizes, **given), 0.3, problem.q0, v)
+    assert traced
+    if system.n_c:
+        assert worst(rows[: system.n_c], system.jacobian(0.3, problem.q0)) < 1e-13 * max(1.0, np.abs(rows).max())
+    kinds = [kind for kind, n in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if n]
+    known = np.concatenate([system.evaluate(kind, 0.3, problem.q0, v) for kind in kinds])
+    assert worst(gamma, known) < 1e-12 * max(1.0, np.abs(known).max())
 
 
 def test_a_driven_rate_that_depends_on_position_and_time():

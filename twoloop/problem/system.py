@@ -227,9 +227,10 @@ class ConstrainedSystem:
 
         Notes
         -----
-        Without `gamma` the differences of C_q and C_t are taken over 2e-4 of the largest coordinate and 2e-8 to 2e-4 s
-        (before t too): good to about 1e-11 unless coordinates of very different scale, or a driving motion of
-        kilohertz, ask for the formula.
+        `jacobian` and `gamma` that are not given are exact derivatives of what the other functions do with symbols.
+        Where these branch on t, q or v, or call what is not known to do the same with symbols, differences stand for
+        them: of C_q and C_t over 2e-4 of the largest coordinate and 2e-8 to 2e-4 s (before t too), good to about 1e-11
+        unless coordinates of very different scale, or a driving motion of kilohertz, ask for the formula.
         """
         n_q, n_c, n_a = check_size("n_q", n_q, 1), check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
         if functions.get("kinematics") is not None:
