@@ -52,9 +52,8 @@ QUICK_TOLERANCES = (1e-1, 1e-3)
 def without_tangent(problem: Problem) -> ConstrainedSystem:
     """The same system without the tangent of its force and the bandwidth of its matrices."""
     system = problem.system
-    f = system.functions._asdict()
-    for name in ("p", "flags", "force_by_q", "force_by_v", "reaction_by_q"):
-        f.pop(name)
+    tangents = {"force_by_q", "force_by_v", "reaction_by_q"}
+    f = {kind: function for kind, function in system.given.items() if kind not in tangents}
     sizes = {"n_q": system.n_q, "n_c": system.n_c, "parameters": system.parameters}
     return ConstrainedSystem(**sizes, **f, constant_mass=True, name=problem.name)  # type: ignore[arg-type]
 

@@ -86,7 +86,7 @@ class Mutant:
     Attributes
     ----------
     kernel : str
-        Name of the file in twoloop/kernels.
+        Whose file is twoloop/kernels/steps/KERNEL_step.py.
     line, begin, end : int
     old, new : str
     text : str
@@ -112,6 +112,11 @@ class Mutant:
         line = lines[self.line - 1]
         lines[self.line - 1] = line[: self.begin] + self.new + line[self.end :]
         return "".join(lines)
+
+
+def file_of(folder: Path, kernel: str) -> Path:
+    """The file of a kernel in a folder with the project."""
+    return folder / "twoloop" / "kernels" / "steps" / f"{kernel}_step.py"
 
 
 def mutants_of(kernel: str, source: str) -> Iterator[Mutant]:
@@ -149,7 +154,7 @@ def sample(quick: bool) -> list[Mutant]:
     """The same mutants every time, as many of each file."""
     chosen = []
     for kernel in TESTS:
-        found = list(mutants_of(kernel, (ROOT / "twoloop" / "kernels" / f"{kernel}.py").read_text()))
+        found = list(mutants_of(kernel, file_of(ROOT, kernel).read_text()))
         chosen += random.Random(SEED).sample(found, QUICK_EACH if quick else N_EACH)
     return chosen
 
@@ -186,7 +191,7 @@ def first_failure(folder: Path, tests: Sequence[str]) -> str:
 
 def row_of(mutant: Mutant, folder: Path) -> Row:
     """A mutant, and the test that sees it."""
-    path, began = folder / "twoloop" / "kernels" / f"{mutant.kernel}.py", time.monotonic()
+    path, began = file_of(folder, mutant.kernel), time.monotonic()
     sound = path.read_text()
     try:
         path.write_text(mutant.applied(sound))

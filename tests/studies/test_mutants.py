@@ -53,7 +53,7 @@ def test_the_sample_is_the_same_every_time_and_of_all_kernels():
     assert chosen == mutants.sample(False)
     assert len({mutant.name for mutant in chosen}) == len(chosen) == mutants.N_EACH * len(mutants.TESTS)
     for kernel, tests in mutants.TESTS.items():
-        source = (ROOT / "twoloop" / "kernels" / f"{kernel}.py").read_text()
+        source = mutants.file_of(ROOT, kernel).read_text()
         for mutant in (each for each in chosen if each.kernel == kernel):
             assert source.splitlines()[mutant.line - 1][mutant.begin : mutant.end] == mutant.old
             ast.parse(mutant.applied(source))
@@ -62,11 +62,12 @@ def test_the_sample_is_the_same_every_time_and_of_all_kernels():
 
 @pytest.fixture
 def folder(tmp_path):
-    (tmp_path / "twoloop" / "kernels").mkdir(parents=True)
-    (tmp_path / "twoloop" / "kernels" / "x.py").write_text("def f():\n    return 1\n")
+    path = mutants.file_of(tmp_path, "x")
+    path.parent.mkdir(parents=True)
+    path.write_text("def f():\n    return 1\n")
     (tmp_path / "test_x.py").write_text(
         "from pathlib import Path\n\n\ndef test_it():\n"
-        "    assert 'return 1' in (Path(__file__).parent / 'twoloop' / 'kernels' / 'x.py').read_text()\n"
+        "    assert 'return 1' in next(Path(__file__).parent.rglob('x_step.py')).read_text()\n"
     )
     return tmp_path
 
@@ -79,7 +80,7 @@ def row(folder, new, monkeypatch):
 def test_a_mutant_that_is_seen_and_one_that_is_not(folder: Path, monkeypatch):
     assert row(folder, "2", monkeypatch)["seen_by"] == "test_x.py::test_it"
     assert row(folder, "1 ", monkeypatch)["seen_by"] == mutants.NONE
-    assert (folder / "twoloop" / "kernels" / "x.py").read_text() == "def f():\n    return 1\n"
+    assert mutants.file_of(folder, "x").read_text() == "def f():\n    return 1\n"
 
 
 def text_of(seen_by, why=""):
