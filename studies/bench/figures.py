@@ -191,8 +191,8 @@ def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOS
 def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
     """The solvers that a figure of a case shows, of those with errors that can be told.
 
-    The default, compiled too, and the paper's procedure; the cheapest of the main rivals that got anywhere; of ours the
-    cheapest others, as many as there is room for.
+    The default, compiled too, and the paper's procedure; the cheapest of the main rivals that got anywhere, and of all
+    at each target; of ours the cheapest others, those at a target first, as many as there is room for.
     """
     seen = rows[_told(rows)]
     first = [name for name in FIRST if (seen["solver"] == name).any()][:most]
@@ -202,9 +202,20 @@ def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINE
         if not own.empty:
             best = own.loc[own["error_q"].astype(float).idxmin(), "solver"]
             rivals += cheapest_lines(rows[rows["solver"].isin(own["solver"])], targets, 1) or [best]
-    ours = seen[(seen["family"] == "two-loop") & ~seen["solver"].isin(first)]["solver"]
+    of_us = seen["family"] == "two-loop"
+    rivals += [
+        name for name in _winners(rows[rows["solver"].isin(seen[~of_us]["solver"])], targets) if name not in rivals
+    ]
+    ours = rows[rows["solver"].isin(seen[of_us & ~seen["solver"].isin(first)]["solver"])]
     room = max(0, most - len(first) - len(rivals))
-    return [*first, *cheapest_lines(rows[rows["solver"].isin(ours)], targets, room), *rivals]
+    chosen = list(dict.fromkeys([*_winners(ours, targets), *cheapest_lines(ours, targets, room)]))[:room]
+    return [*first, *(name for name in dict.fromkeys(ours["solver"]) if name in chosen), *rivals]
+
+
+def _winners(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
+    """The cheapest solver at each of the targets that any reaches."""
+    best = (cheapest_lines(rows, (target,), 1) for target in targets)
+    return list(dict.fromkeys(name for names in best for name in names))
 
 
 def _told(rows: pd.DataFrame) -> pd.Series:
