@@ -161,3 +161,57 @@ def test_code_made_for_a_mechanism_needs_no_jacobian():
         for system in (pendulum(), pendulum(jacobian=None, gamma=None))
     ]
     assert np.allclose(*ends, rtol=0.0, atol=1e-11)
+
+
+def switched_on(rapidity):
+    """A slider that a smoothed step moves by 1 m in about 1 / rapidity, with a bar of 1 m that hangs from it."""
+    return ConstrainedSystem.from_python(
+        n_q=3,
+        n_c=2,
+        mass=np.eye(3),
+        force=lambda t, q, v: np.array([0.0, 0.0, -9.81]),
+        constraint=lambda t, q: np.array(
+            [q[0] - 0.5 * (1.0 + np.tanh(rapidity * (t - 0.5))), (q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0]
+        ),
+        constraint_rate=lambda t, q: np.array([-0.5 * rapidity * (1.0 - np.tanh(rapidity * (t - 0.5)) ** 2), 0.0]),
+    )
+
+
+def test_where_a_derivative_overflows_differences_take_its_place():
+    """That of tanh(x) is made of exp(2 x), which is infinite from x = 355 on."""
+    system = switched_on(2000.0)
+    q0, v0 = consistent_state(system, 0.0, [0.0, 0.3, -0.95], [0.0, 0.0, 0.0])
+    rows, gamma, traced = in_kernels(system, 0.0, q0, v0)
+    assert traced
+    assert np.allclose(rows, [[1.0, 0.0, 0.0], [-2.0 * q0[1], 2.0 * q0[1], 2.0 * q0[2]]], atol=1e-7)
+    assert np.allclose(gamma, 0.0, atol=1e-7)
+    result = solve_dae(system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6)
+    assert result.success
+    assert result.q[0, -1] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_where_there_is_no_second_derivative_a_motion_goes_on():
+    """The curve y = |x|**1.5 has an infinite curvature at the start."""
+    system = pendulum(constraint=lambda t, q: np.array([q[1] - (q[0] * q[0]) ** 0.75]), jacobian=None, gamma=None)
+    assert solve_dae(system, (0.0, 0.1), [0.3, 0.3**1.5], [0.0, 0.0]).success
+    _, gamma, _ = in_kernels(system, 0.0, np.zeros(2), np.zeros(2))
+    assert np.isfinite(gamma).all()
+
+
+def test_products_may_be_a_thousand_deep():
+    def constraint(t, q):
+        x = q[0]
+        for _ in range(1000):
+            x = x * np.cos(0.001 * q[1])
+        return np.array([x + q[1]])
+
+    system = pendulum(constraint=constraint, jacobian=None, gamma=None)
+    rows, gamma, traced = in_kernels(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    assert traced
+    assert np.allclose(rows, [[1.0, 1.0]], rtol=1e-12)
+    assert gamma[0] == pytest.approx(1000.0 * 1e-6, rel=1e-9)
+
+
+def test_a_result_keeps_the_system_that_was_given():
+    system = pendulum(jacobian=None, gamma=None)
+    assert solve_dae(system, (0.0, 0.1), [0.6, -0.8], [0.0, 0.0]).system is system

@@ -181,7 +181,8 @@ def solve_dae(
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t1, q0, v0)
 
-        system, derived = standing_for(system, check)
+        given = system
+        system, derived = standing_for(given, check)
         code = own_code(system, t0, q0, check) if compiled else None
         if hasattr(chosen, "for_system"):
             chosen = chosen.for_system(system, code, check)
@@ -211,7 +212,7 @@ def solve_dae(
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
-        own = {"method": chosen.name, "rtol": float(rtol), "atol": atol, "untested": untested}
+        own = {"system": given, "method": chosen.name, "rtol": float(rtol), "atol": atol, "untested": untested}
         return Result(**vars(record) | own)
     return Result(**vars(not_begun(system, t0, event_functions, chosen.name)))
 

@@ -29,10 +29,18 @@ class Derivative:
         return total
 
     def _of_quantity(self, i: int) -> Form:
-        if i not in self._known:
-            operation = self.graph.operations[i]
-            change = Form(self.graph, 0.0, {}) if operation is None else self._of_operation(i, *operation)
-            self._known[i] = change.value()
+        ahead = [i]  # no recursion: products may be a thousand deep
+        while i not in self._known:
+            operation = self.graph.operations[ahead[-1]]
+            forms = () if operation is None else [form for form in operation[1:] if isinstance(form, Form)]
+            unknown = [k for form in forms for k in form.terms if k not in self._known]
+            if unknown:
+                ahead += unknown
+                continue
+            k = ahead.pop()
+            if k not in self._known:
+                change = Form(self.graph, 0.0, {}) if operation is None else self._of_operation(k, *operation)
+                self._known[k] = change.value()
         return self._known[i]
 
     def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:

@@ -47,7 +47,7 @@ def _made(system: ConstrainedSystem, absent: Sequence[str]) -> tuple[dict[str, A
         return None
     programs: dict[str, Any] = {}
     for name, forms in results.items():
-        program = program_of(equations.graph, 1 + 2 * system.n_q, list(forms.values()))
+        program = program_of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
         if len(program.rows) > MOST:
             return None
         vectors = _packed(program, list(forms))

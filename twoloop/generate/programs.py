@@ -1,6 +1,6 @@
 """Traced quantities as programs for kernels: rows of operations in an order in which they can be done."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,13 +19,13 @@ class Program(NamedTuple):
     n_nodes: int
 
 
-def program_of(graph: Graph, n_inputs: int, results: Sequence[Form]) -> Program:
-    """What makes these results of the first quantities of a graph."""
-    needed = graph.needed_by(results)
+def program_of(graph: Graph, n_inputs: int, results: Mapping[int, Form]) -> Program:
+    """What makes results, each with its place, of the first quantities of a graph."""
+    needed = graph.needed_by(results.values())
     node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
     nothing = Form(graph, 0.0, {})
     operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
-    operations += [(RESULT, form, None, k) for k, form in enumerate(results)]
+    operations += [(RESULT, form, None, k) for k, form in results.items()]
     terms: list[tuple[int, float]] = []
     rows, constants = [], []
     for kind, one, other, made in operations:

@@ -95,7 +95,7 @@ class Equations:
         for i, row in enumerate(self.of(rows)):
             total = along.of(made[i])
             for entry, u in zip(row, v, strict=True):
-                total = total + along.of(entry) * u
+                total = total + along.of(entry) * u if entry.terms else total
             made[i] = -total
         return made
 

@@ -52,8 +52,9 @@ class Traced:
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.trusted = False
-        results = [graph.traced[kind][place] for kind, place in self.places]
-        self.program = program_of(graph, 1 + 2 * system.n_q, results)
+        forms = (graph.traced[kind][place] for kind, place in self.places)
+        made = {k: form for k, form in enumerate(forms) if form.terms or form.constant}  # others stay zero
+        self.program = program_of(graph, 1 + 2 * system.n_q, made)
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
         """Compare at states about the start, spread over the time of a run.

@@ -38,9 +38,7 @@ def acceleration_constraint(f, w, t, q, v):
         first = n_c
     if n_rows == n_c or given_a:
         last = n_c
-    if (last > n_c or not given) and f.gamma_program.size > 0:
-        gamma_by_program(f, w, t, q, v)
-    elif last > n_c or not given:
+    if (last > n_c or not given) and not gamma_by_program(f, w, t, q, v):
         code = gamma_by_differences(f, w, t, q, v, first, last)
         if code != DONE:
             return code
@@ -93,7 +91,7 @@ def accelerate(f, w, t, q, v, a):
         if not np.isfinite(a[j]):
             source = source_of_acceleration(w)
             return not_finite(w.notes, source if source >= 0 or finite(w.M) else MASS, t, q)
-    if f.gamma_program.size == 0 and (f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size):
+    if f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size:
         _note_scale(w, a)
     return DONE
 

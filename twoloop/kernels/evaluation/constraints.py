@@ -15,9 +15,7 @@ from twoloop.kernels.evaluation.program import jacobian_by_program
 def constraint_rows(f, w, t, q, G):
     """C_q and A at (t, q) into G, which is w.G or w.Gx, full of zeros."""
     n_c, n_rows = w.C.size, w.Rate.size
-    if f.jacobian_program.size > 0:
-        jacobian_by_program(f, w, t, q, G)
-    elif n_c > 0:
+    if n_c > 0 and not jacobian_by_program(f, w, t, q, G):
         f.jacobian(t, q, f.p, G[:n_c])
     if n_rows > n_c:
         f.nonholonomic(t, q, f.p, G[n_c:n_rows])

@@ -1,4 +1,7 @@
-"""C_q and Gamma by what callbacks were traced to, where they are not given: see generate/programs.py."""
+"""C_q and Gamma by what callbacks were traced to, where they are not given: see generate/derived.py.
+
+An exact derivative may overflow where the callback does not, as that of tanh does for large numbers.
+"""
 
 import math
 
@@ -27,6 +30,30 @@ from twoloop.kernels.evaluation.operations import (
 
 
 @exact
+def operation(kind, x, y):
+    """The result of an operation; y is the second factor of a product."""
+    if kind == PRODUCT:
+        z = x * y
+    elif kind == RECIPROCAL:
+        z = 1.0 / x
+    elif kind == SQUARE_ROOT:
+        z = math.sqrt(x)
+    elif kind == EXPONENTIAL:
+        z = math.exp(x)
+    elif kind == SINE:
+        z = math.sin(x)
+    elif kind == COSINE:
+        z = math.cos(x)
+    elif kind == LOGARITHM:
+        z = math.log(x)
+    elif kind == ARCTANGENT:
+        z = math.atan(x)
+    else:
+        z = x
+    return z
+
+
+@exact
 def _sum(program, numbers, nodes, terms, coefficients, constant, begin, end):
     """A form: a constant and multiples of nodes."""
     total = constant
@@ -49,23 +76,8 @@ def _run(program, numbers, nodes, t, q, v):
         begin, middle, end = program[row + FIRST], program[row + SECOND], program[row + END]
         kind, made = program[row + KIND], program[row + MADE]
         x = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i], begin, middle)
-        if kind == PRODUCT:
-            x *= _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i + 1], middle, end)
-        elif kind == RECIPROCAL:
-            x = 1.0 / x
-        elif kind == SQUARE_ROOT:
-            x = math.sqrt(x)
-        elif kind == EXPONENTIAL:
-            x = math.exp(x)
-        elif kind == SINE:
-            x = math.sin(x)
-        elif kind == COSINE:
-            x = math.cos(x)
-        elif kind == LOGARITHM:
-            x = math.log(x)
-        elif kind == ARCTANGENT:
-            x = math.atan(x)
-        nodes[made] = x
+        y = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i + 1], middle, end)
+        nodes[made] = operation(kind, x, y)
 
 
 @exact
@@ -77,20 +89,31 @@ def _results(program):
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Rows of Gamma that no callback gives, into w.Gamma."""
+    """Rows of Gamma that no callback gives, into w.Gamma; whether there is a program and all are finite."""
     program = f.gamma_program
+    if program.size == 0:
+        return False
     _run(program, f.gamma_numbers, w.nodes, t, q, v)
     n, first, places = _results(program)
     for k in range(n):
+        if not math.isfinite(w.nodes[first + k]):
+            return False
         w.Gamma[program[places + k]] = w.nodes[first + k]
+    return True
 
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """C_q at (t, q) into the first rows of G, full of zeros."""
+    """C_q at (t, q) into the first rows of G, full of zeros; whether there is a program and all is finite."""
     program = f.jacobian_program
+    if program.size == 0:
+        return False
     _run(program, f.jacobian_numbers, w.nodes, t, q, q)
     n, first, places = _results(program)
     for k in range(n):
+        if not math.isfinite(w.nodes[first + k]):
+            return False
+    for k in range(n):
         place = program[places + k]
         G[place // q.size, place % q.size] = w.nodes[first + k]
+    return True

@@ -10,7 +10,6 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, exact, i8, kernel
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
-    COSINE,
     END,
     EXPONENTIAL,
     FIRST,
@@ -21,9 +20,9 @@ from twoloop.kernels.evaluation.operations import (
     RECIPROCAL,
     RESULT,
     SECOND,
-    SINE,
     SQUARE_ROOT,
 )
+from twoloop.kernels.evaluation.program import operation
 
 VALUE, BOUND = range(2)  # rows of `nodes`
 
@@ -46,30 +45,21 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 @exact
 def _operation(kind, x, dx, y, dy):
     """The result of an operation, and its bound."""
+    z = operation(kind, x, y)
     if kind == PRODUCT:
-        z = x * y
         dz = abs(x) * dy + abs(y) * dx
     elif kind == RECIPROCAL:
-        z = 1.0 / x
         dz = dx * z * z
     elif kind == SQUARE_ROOT:
-        z = math.sqrt(x)
         dz = min(0.5 * dx / z, math.sqrt(dx / EPS)) if dx > 0.0 else 0.0
     elif kind == EXPONENTIAL:
-        z = math.exp(x)
         dz = dx * z
-    elif kind == SINE:
-        z, dz = math.sin(x), dx
-    elif kind == COSINE:
-        z, dz = math.cos(x), dx
     elif kind == LOGARITHM:
-        z = math.log(x)
         dz = dx / abs(x)
     elif kind == ARCTANGENT:
-        z = math.atan(x)
         dz = dx / (1.0 + x * x)
     else:
-        z, dz = x, dx
+        dz = dx
     dz += abs(z)
     return z, 0.0 if math.isnan(dz) else dz
 
