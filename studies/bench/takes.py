@@ -101,7 +101,7 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     parts = [f"{call(line['solver'])}, which pays {_from_run(line)}" for line in best if line is not None]
     if len(parts) > 1:
         parts[1] = f"of ours {parts[1]}"
-    return [{"what": "run many times", "take": "; ".join(parts) + " (at one tolerance, 1e-8)"}] if parts else []
+    return [{"what": "run many times", "take": "; ".join(parts) + " (at one tolerance)"}] if parts else []
 
 
 def _from_run(line: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ def rows(*lines):
         {"solver": solver, "first_call_s": first, "call_s": later, "call_q1": later, "call_q3": later}
         for solver, first, later in lines
     ]
-    return pd.DataFrame(made).assign(case="crane", status="REACHED_END")
+    return pd.DataFrame(made).assign(case="crane", tol=1e-8, status="REACHED_END")
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,9 @@ def test_building_pays_from_the_run_in_which_all_runs_together_take_less(first, 
 
 
 def test_what_is_cheaper_by_less_than_its_scatter_pays_never():
-    line = {"first_call_s": 1.0, "call_s": 0.19, "call_q3": 0.21}
-    assert first_calls.pays_from(line, {"first_call_s": 0.1, "call_s": 0.2, "call_q1": 0.18}) is None
+    default = {"first_call_s": 0.1, "call_s": 0.2, "call_q1": 0.18}
+    for first in (1.0, 0.05):
+        assert first_calls.pays_from({"first_call_s": first, "call_s": 0.19, "call_q3": 0.21}, default) is None
 
 
 def test_a_line_a_solver_and_never_where_its_calls_are_no_cheaper():
