@@ -24,8 +24,8 @@ from twoloop.checks.consistency import check_start
 from twoloop.generate.derived import standing_for
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.traced_values import Traced
-from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
 from twoloop.methods.plan import Method
+from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import PRESETS
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
@@ -184,20 +184,7 @@ def solve_dae(
         given = system
         system, derived = standing_for(given, check)
         code = own_code(system, t0, q0, check) if compiled else None
-        if hasattr(chosen, "for_system"):
-            chosen = chosen.for_system(system, code, check)
-        plan = chosen.plan(system.n_q, float(rtol), float(atol.min()), step_size is not None)
-        interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
-        if plan.parts > 1:
-            always = (system.n_q, float(rtol), float(atol.min()), True)
-            interiors[ACCELERATIONS] = chosen.plan(*always) if plan.interior is None else plan.interior
-        if code is not None:
-            if not plan.compilable:
-                constant = " with step_size, by which it is implicit" if chosen.name == "auto" else ""
-                raise ValueError(
-                    f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {chosen.name}{constant}"
-                )
-            plan = replace(plan, inner=code.inner, traced=(*plan.traced, code.equations.traced))
+        plan, interiors = plans_for(system, chosen, float(rtol), float(atol.min()), step_size is not None, code, check)
         plan = replace(plan, traced=(*plan.traced, *derived))
         run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
         if step_size is None:

@@ -47,7 +47,7 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
     unsymmetric = unsymmetric_mass(system, t0, q0)
     if unsymmetric is not None:
         raise ValueError(unsymmetric)
-    if system.n_c > 0:
+    if not _at_rounding(system.constraint(t0, q0), jacobian, q0):
         scales = scales_of(system, t0, q0, jacobian)
         Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")
     if derivatives:
@@ -58,10 +58,15 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
             f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "
             "there. Leave these constraints out, or start from another position"
         )
-    if system.n_a > 0:
+    rate = system.rates(t0, q0)
+    if not _at_rounding(rows @ v0 + rate, rows, v0, rate):
         scales = scales_of(system, t0, q0, rows)
-    if len(rows) > 0:
         Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
+
+
+def _at_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> bool:
+    """Whether values are no more than rounding of their terms, which needs no scales to be accepted."""
+    return bool((np.abs(values) <= ROUNDING * EPS * (np.abs(rows) @ np.abs(state) + np.abs(rate))).all())
 
 
 class Violation:

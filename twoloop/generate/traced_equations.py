@@ -54,11 +54,15 @@ class Equations:
             self._made[kind] = self._make(kind, self.v)
         return self._made[kind].copy()
 
+    def derived(self, kind: str, v: Sequence[Form] | None = None) -> Any:
+        """C_q, C_t or a right-hand side by the rules of differentiation, whether there is a callback or not."""
+        if kind == "jacobian":
+            return self._jacobian()
+        return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
+
     def _make(self, kind: str, v: Sequence[Form]) -> Any:
         absent = kind not in self.system.given
-        if absent and kind == "jacobian":
-            return self._jacobian()
-        return self._gamma(*OF_ROWS[kind], v) if absent and kind in OF_ROWS else self._traced(kind, v)
+        return self.derived(kind, v) if absent and kind in ("jacobian", *OF_ROWS) else self._traced(kind, v)
 
     def _traced(self, kind: str, v: Sequence[Form]) -> Any:
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
@@ -86,6 +90,11 @@ class Equations:
             by = Derivative(self.graph, {only(coordinate): one})
             made[:, j] = [by.of(form) for form in constraint]
         return made
+
+    def _rate(self) -> Any:
+        """C_t from C."""
+        constraint, by_t = self.of("constraint"), Derivative(self.graph, {only(self.t): Form(self.graph, 1.0, {})})
+        return symbols(by_t.of(form) for form in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Form]) -> Any:
         """-(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma, by the rules of differentiation."""

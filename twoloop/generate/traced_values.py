@@ -6,7 +6,8 @@ at states spread over the time of the run and about its start, later at states o
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,17 +44,21 @@ class Traced:
     system : ConstrainedSystem
     graph : Graph
         On whose first quantities, t, q and v, the callbacks ran.
+    forms : mapping or None
+        By kind of callback, what it should give. None: what those that are given were traced to.
     """
 
-    def __init__(self, system: ConstrainedSystem, graph: Graph):
-        known = [kind for kind in KINDS if kind in graph.traced and kind in system.given and graph.traced[kind].size]
-        self.places = [(kind, place) for kind in known for place in np.ndindex(graph.traced[kind].shape)]
+    def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):
+        if forms is None:
+            forms = {kind: made for kind, made in graph.traced.items() if kind in system.given}
+        known = [kind for kind in KINDS if kind in forms and forms[kind].size]
+        self.places = [(kind, place) for kind in known for place in np.ndindex(forms[kind].shape)]
         self.which = np.array([kind in known for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.trusted = False
-        forms = (graph.traced[kind][place] for kind, place in self.places)
-        made = {k: form for k, form in enumerate(forms) if form.terms or form.constant}  # others stay zero
+        entries = (forms[kind][place] for kind, place in self.places)
+        made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:

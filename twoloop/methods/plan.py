@@ -1,6 +1,6 @@
 """What a method hands to a run: its plan; and what the methods share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,7 @@ INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # `least_error` of a Plan, of most methods
 ROUGH = 10.0  # `rough` of a Plan, as measured for most methods
 LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
+PARTS = ("interior", "substitute", "within_newton")  # fields of a Plan that are plans
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
 LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them
@@ -60,6 +61,11 @@ class Plan:
     def rule(self) -> list[float]:
         """Of step-size control, see kernels/control/controller.py."""
         return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
+
+    def fresh(self) -> "Plan":
+        """The same for another run, with memory of its own."""
+        parts = {name: each.fresh() for name in PARTS if (each := getattr(self, name)) is not None}
+        return replace(self, memory=self.memory.copy(), **parts)
 
 
 def least_tolerance(rtol: float, atol: float) -> float:

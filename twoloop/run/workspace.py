@@ -1,5 +1,7 @@
 """What every use of the kernels needs of a system: its callbacks with flags, and a workspace."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,9 +41,14 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
     functions = system.functions._replace(flags=flags)
-    if plan is None:
-        return common.Kit(functions, inner_loop)
-    flags[common.STRAIGHT] = plan.inner is not None
+    return common.Kit(functions, inner_loop) if plan is None else kit_with(functions, plan)
+
+
+def kit_with(functions: Any, plan: Plan) -> common.Kit:
+    """The same callbacks and flags, with what another plan calls."""
+    from twoloop.kernels.evaluation.calls import inner_loop
+
+    functions.flags[common.STRAIGHT] = plan.inner is not None
     steps = (plan.step, plan.first, plan.second)
     return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, plan.own, plan.instead)
 

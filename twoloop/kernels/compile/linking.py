@@ -173,12 +173,12 @@ def direct(function: Dispatcher) -> Any:
     return compiled.entry_point
 
 
-_ADDRESSES: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # of the code of each library, which has one function
+_ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()  # of functions, which have one signature each
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
     """The address of a compiled function; it takes arguments and reports errors as numba's functions do."""
-    compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
-    if compiled.library not in _ADDRESSES:
-        _ADDRESSES[compiled.library] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))
-    return _ADDRESSES[compiled.library]
+    if function not in _ADDRESSES:
+        compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
+        _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))
+    return _ADDRESSES[function]

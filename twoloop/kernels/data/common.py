@@ -226,6 +226,7 @@ class Kit:
         own: Any = None,
         instead: Any = None,
     ):
+        self.__dict__.update(functions._asdict())
         self.functions, self.inner, self.general, self.own, self.instead = functions, inner, general, own, instead
         self.attempt, self.settle = step or Step()
         self.attempt_first, self.settle_first = first or Step()

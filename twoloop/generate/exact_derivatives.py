@@ -1,0 +1,49 @@
+"""What C_q, C_t and Gamma must be, exactly: to be compared with what is given, by no differences."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.scales import sizes
+from twoloop.generate.traced_equations import OF_ROWS, Equations
+from twoloop.generate.traced_values import Traced
+from twoloop.generate.tracing import Untraceable
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+MOST = 50_000  # entries of C_q
+
+
+def exact_derivatives(system: ConstrainedSystem) -> Traced | None:
+    """What the callbacks of a system should give, by those that they are derivatives of.
+
+    None: there are no constraints or too many, or they cannot be traced.
+    """
+    if system.n_q * (system.n_c + system.n_a) > MOST:
+        return None
+    made: Traced | None = system.remembered("derivatives", lambda: _made(system))
+    return made
+
+
+def _made(system: ConstrainedSystem) -> Traced | None:
+    equations = Equations(system)
+    given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
+    try:
+        forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
+        # of which the others are derivatives, if they are what they were traced to
+        forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
+    except Untraceable:
+        return None
+    return Traced(system, equations.graph, forms)
+
+
+def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
+    """Rows [t, q, v] of states (t, q, v), with velocities in which each coordinate matters and as fast as these."""
+    random = np.random.default_rng(1)
+    times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
+    size = np.array([sizes(q) for q in positions])
+    generic = size * random.uniform(0.5, 1.5, size.shape) * random.choice((-1.0, 1.0), size.shape)
+    speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))
+    return np.column_stack([times, positions, speed * generic])

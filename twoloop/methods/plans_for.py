@@ -1,0 +1,61 @@
+"""The plans by which a method runs a system; those of presets are made once for a system and a tolerance."""
+
+from dataclasses import replace
+
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.traced_values import Check
+from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
+from twoloop.methods.plan import Method, Plan
+from twoloop.methods.presets import PRESETS
+from twoloop.problem.system import ConstrainedSystem
+
+MOST = 16  # that are kept with a system
+
+Plans = tuple[Plan, dict[int, Plan]]  # of steps, and of parts of steps, by kind, between which the solution is wanted
+
+
+def plans_for(
+    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: OwnCode | None, check: Check
+) -> Plans:
+    """The plans of a run.
+
+    Raises
+    ------
+    ValueError
+        If the method cannot run the system, or does not go with code made for it.
+    """
+    key = (id(method), rtol, atol, fixed, None if code is None else code.digest)
+    kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
+    made = kept.get(key)
+    if made is None:
+        ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
+        made = _made(system, ready, rtol, atol, fixed, code)
+        preset = any(each is method for each in PRESETS.values())  # others may go, and another have their id
+        if preset and _series(ready) == _series(method) and all(each.trusted for each in made[0].traced):
+            if len(kept) == MOST:
+                del kept[next(iter(kept))]
+            kept[key] = made
+    plan, interiors = made
+    return plan.fresh(), {kind: each.fresh() for kind, each in interiors.items()}
+
+
+def _series(method: Method) -> bool:
+    """Whether a method has a series: it may lose it for one start, where `check` finds other values."""
+    return getattr(method, "series", None) is not None
+
+
+def _made(
+    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: OwnCode | None
+) -> Plans:
+    plan = method.plan(system.n_q, rtol, atol, fixed)
+    interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
+    if plan.parts > 1:
+        interiors[ACCELERATIONS] = method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
+    if code is None:
+        return plan, interiors
+    if not plan.compilable:
+        constant = " with step_size, by which it is implicit" if method.name == "auto" else ""
+        raise ValueError(
+            f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{constant}"
+        )
+    return replace(plan, inner=code.inner, traced=(*plan.traced, code.equations.traced)), interiors
