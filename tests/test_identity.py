@@ -82,7 +82,7 @@ def test_a_copy_works_when_the_original_is_gone(name, copied):
     del system
     assert observed(other) == expected
     if other.called_in_python:
-        assert int(other.parameters[0]) in PythonFunctions.registry
+        assert int(other.functions.p[0]) in PythonFunctions.registry
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
@@ -184,7 +184,7 @@ def test_numbers_that_lead_to_no_function_are_refused():
 
 
 def test_handles_cannot_be_guessed_and_fit_a_float():
-    handles = {int(made().parameters[0]) for _ in range(50)}
+    handles = {int(made().functions.p[0]) for _ in range(50)}
     assert len(handles) == 50
     assert max(handles) < 2**52
     assert max(handles) - min(handles) > 2**40

@@ -87,7 +87,7 @@ def test_the_energy_of_generated_equations_goes_along():
 
 @pytest.mark.parametrize("compile", [False, True])
 def test_functions_without_parameters_say_so(compile):
-    with pytest.raises(TypeError, match=r"'pendulum' has no parameters: it is made by from_python, .*callback, which"):
+    with pytest.raises(TypeError, match=r"'pendulum' has no parameters: it is made by from_python without them"):
         pendulum(compile=compile).with_parameters([1.0])
 
 

@@ -1,5 +1,7 @@
 """ConstrainedSystem and consistent_state."""
 
+import copy
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +13,7 @@ from tests.problems import (
     oblique_pendulum,
     oblique_start,
     pendulum,
+    pendulum_state,
     slope,
     worst,
 )
@@ -154,3 +157,54 @@ def test_what_cannot_be_projected_says_how_far_it_is():
 def test_wrong_guesses_are_named(q, v, error, words):
     with pytest.raises(error, match=words):
         consistent_state(pendulum(), 0.0, q, v)
+
+
+def bead(**changed):
+    """A bead of mass p[0] on a circle of radius p[1]."""
+    functions = {
+        "mass": lambda t, q, p: np.array([[p[0], 0.0], [0.0, p[0]]]),
+        "force": lambda t, q, v, p: np.array([0.0, -9.81 * p[0]]),
+        "constraint": lambda t, q, p: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])]),
+        "jacobian": lambda t, q: q.reshape((1, 2)),
+    } | changed
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, parameters=[2.0, 1.0], **functions)
+
+
+@pytest.mark.parametrize("compile", [False, True])
+def test_plain_functions_take_parameters_last(compile):
+    system = bead(compile=compile)
+    other = system.with_parameters([2.0, 0.5])
+    assert system.parameters.tolist() == [2.0, 1.0] and other.parameters.tolist() == [2.0, 0.5]
+    for each, radius in ((system, 1.0), (other, 0.5), (copy.deepcopy(other), 0.5)):
+        result = solve_dae(each, (0.0, 1.0), [radius, 0.0], [0.0, 0.0], rtol=1e-9, atol=1e-9)
+        expected = pendulum_state(np.sqrt(1.0 / radius), angle=0.5 * np.pi)[0]
+        assert result.success and np.allclose(result.q[:, -1], radius * expected, atol=1e-7)
+        assert result.system is each
+    assert other.functions[:3] == system.functions[:3]  # nothing is compiled again
+
+
+def test_parameters_are_taken_where_they_are_asked_for():
+    length = 3.0
+    system = bead(
+        force=lambda t, q, v, length=length: np.array([0.0, -length])
+    )  # an argument with a default is its own
+    assert system.force(0.0, [1.0, 0.0], [0.0, 0.0]).tolist() == [0.0, -3.0]
+    assert bead(force=lambda *arguments: arguments[-1]).force(0.0, [1.0, 0.0], [0.0, 0.0]).tolist() == [2.0, 1.0]
+    with pytest.raises(
+        TypeError, match=r"force is called as force\(t, q, v, p\); the function given takes \(p, t, q, v\)"
+    ):
+        bead(force=lambda p, t, q, v: p)
+    with pytest.raises(ValueError, match="parameters are given, but none of the functions"):
+        ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: -q, parameters=[1.0])
+    with pytest.raises(ValueError, match="must be 2 numbers"):
+        bead().with_parameters([1.0])
+
+
+def test_functions_cannot_change_the_parameters():
+    def force(t, q, v, p):
+        p[0] = 5.0
+        return np.array([0.0, -9.81 * p[0]])
+
+    system = bead(force=force)
+    assert system.force(0.0, [1.0, 0.0], [0.0, 0.0])[1] == -9.81 * 5.0
+    assert system.mass(0.0, [1.0, 0.0])[0, 0] == 2.0

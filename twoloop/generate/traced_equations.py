@@ -73,7 +73,8 @@ class Equations:
                 if not system.called_in_python:
                     trace(getattr(system.functions, kind), self.t, *arrays, p, out)
                 elif kind in system.python_functions:
-                    out = np.array(trace(system.python_functions[kind], self.t, *arrays), dtype=object)
+                    function, more = system.python_functions[kind], system.parameters_for(kind)
+                    out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
                 out = as_forms(graph, out)
                 if out.shape != shape:
                     raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")

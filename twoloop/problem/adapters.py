@@ -26,21 +26,22 @@ HANDLE_BITS = 52  # so that a handle is a float64 exactly; a foreign one, of ano
 class PythonFunctions:
     """Plain Python functions of one system, called through the compiled `through_python`.
 
-    These find them by the handle, which is the only parameter of the system. It holds in this process and in forks of
-    it; unpickled elsewhere, the functions are registered again.
+    These find them by the handle, which stands before the parameters. It holds in this process and in forks of it;
+    unpickled elsewhere, the functions are registered again. Those in `taking` get the parameters.
     """
 
     registry: ClassVar[WeakValueDictionary[int, "PythonFunctions"]] = WeakValueDictionary()
 
-    def __init__(self, name: str, functions: dict[str, Callable[..., Any]]):
-        self.name = name
-        self.functions = functions
+    def __init__(self, name: str, functions: dict[str, Callable[..., Any]], taking: frozenset[str]):
+        self.name, self.functions, self.taking = name, functions, taking
         self.handle = secrets.randbits(HANDLE_BITS)
         self.registry[self.handle] = self
 
-    def call(self, kind: str, arguments: tuple[Any, ...], out: Array) -> None:
+    def call(self, kind: str, arguments: tuple[Any, ...], p: Array, out: Array) -> None:
         """Call one function with copies of the arrays, check what comes back and write it to `out`."""
         t = arguments[0]
+        if kind in self.taking:
+            arguments = (*arguments, p.copy())
         try:
             value = self.functions[kind](*arguments)
         except Exception as error:
@@ -70,13 +71,13 @@ def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
 
 
 def _call(number: int, arguments: tuple[Any, ...], p: Array, out: Array) -> None:
-    functions = PythonFunctions.registry.get(int(p[0])) if p.size == 1 and np.isfinite(p[0]) else None
+    functions = PythonFunctions.registry.get(int(p[0])) if p.size and np.isfinite(p[0]) else None
     if functions is None:
         raise RuntimeError(
             "these callbacks lead to Python functions of a system that is not in this process, or no longer: their "
             "`parameters` are not numbers to keep. Pass the system itself on, by pickle if need be"
         )
-    functions.call(KIND_NAMES[number], arguments, out)
+    functions.call(KIND_NAMES[number], arguments, p[1:], out)
 
 
 @cache
@@ -98,7 +99,7 @@ def through_python(kind: str) -> Dispatcher:
     return compile_callback(kind, through, ("through Python", str(place)))
 
 
-def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
+def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) -> Dispatcher:
     """Compile a function that returns its array, and wrap it to the in-place signature of its kind.
 
     The machine code is kept beside the source of the function, if it has one.
@@ -129,7 +130,20 @@ def compile_returning(kind: str, function: Callable[..., Any]) -> Dispatcher:
             raise ValueError(message)
         out[:] = value
 
-    in_place: Any = with_two if len(KINDS[kind].state) == 1 else with_three
+    def with_two_and_p(t, q, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, p)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
+
+    def with_three_and_p(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, x, p)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        out[:] = value
+
+    wrappers: Any = ((with_two, with_two_and_p), (with_three, with_three_and_p))
+    in_place = wrappers[len(KINDS[kind].state) > 1][takes_p]
     watched = watch(in_place)
     code = user.py_func.__code__
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
@@ -148,14 +162,30 @@ class ConstantMatrix:
         return self.matrix
 
 
-def check_arguments(kind: str, function: Callable[..., Any]) -> None:
-    """Raise if a function that returns its array names its arguments t, q, v, but in another order."""
+def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -> bool:
+    """Whether a function that returns its array takes `p` after what all of its kind take.
+
+    Where there are `parameters`, it does unless that place is missing, or has a default and another name.
+
+    Raises
+    ------
+    TypeError
+        If it names its arguments t, q, v, but in another order.
+    """
     wanted = ("t", *KINDS[kind].state)
     try:
-        given = tuple(inspect.signature(function).parameters)
+        given = inspect.signature(function).parameters
     except (TypeError, ValueError):  # built-in functions have none to look at
-        return
-    if sorted(given) == sorted(wanted) and given != wanted:
-        raise TypeError(
-            f"{kind} is called as {kind}({', '.join(wanted)}); the function given takes ({', '.join(given)})"
-        )
+        return parameters
+    names = tuple(given)
+    for known in (wanted, (*wanted, "p")):
+        if sorted(names) == sorted(known) and names != known:
+            raise TypeError(
+                f"{kind} is called as {kind}({', '.join(known)}); the function given takes ({', '.join(names)})"
+            )
+    if any(each.kind == each.VAR_POSITIONAL for each in given.values()):
+        return parameters
+    if not parameters or len(names) <= len(wanted):
+        return False
+    place = given[names[len(wanted)]]
+    return place.kind != place.KEYWORD_ONLY and (place.default is place.empty or place.name == "p")

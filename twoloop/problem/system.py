@@ -124,6 +124,7 @@ class ConstrainedSystem:
         self.functions: Any = Functions(**all_callbacks, p=p, flags=flags, **programs)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
+        self._taking: frozenset[str] = frozenset()  # kinds of plain functions that take the parameters
         self._shapes = {
             kind: [tuple(getattr(self, size) for size in shape) for _, shape in entry.outputs]
             for kind, entry in KINDS.items()
@@ -138,7 +139,7 @@ class ConstrainedSystem:
     @property
     def parameters(self) -> Array:
         """The vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
-        p = self.functions.p.copy()  # kernels want an array that may be written
+        p = self.functions.p[self.called_in_python :].copy()  # kernels want an array that may be written
         p.setflags(write=False)
         return p.view()  # which nobody can make writable again
 
@@ -170,16 +171,17 @@ class ConstrainedSystem:
         TypeError, ValueError
             If the parameters are not as many finite numbers, or the system is made of functions that take none.
         """
-        if self._python is not None or self._returning:
+        p, known = _checked_parameters(parameters), self.parameters
+        if not self._taking and (self._python is not None or self._returning):
             raise TypeError(
-                f"{self.name!r} has no parameters: it is made by from_python, whose functions take none. Make another "
-                "system of functions that enclose other numbers, or give callbacks made by @twoloop.callback, which "
-                "get the parameters as p"
+                f"{self.name!r} has no parameters: it is made by from_python without them. Give it parameters=p, which "
+                "its functions take as their last argument, or make another system of functions that enclose other "
+                "numbers"
             )
-        p, known = _checked_parameters(parameters), self.functions.p
         if p.shape != known.shape:
             raise ValueError(f"parameters of {self.name!r} must be {known.size} numbers, as they are; given {p.size}")
         other = copy.copy(self)
+        p = np.append(self.functions.p[: self.called_in_python], p)  # the handle of Python functions
         other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
         other.within_bounds, other.checked, other.made = set(), False, {}
         other.description = self.description.with_parameters(p)
@@ -193,6 +195,7 @@ class ConstrainedSystem:
         n_q: int,
         n_c: int,
         n_a: int = 0,
+        parameters: ArrayLike | None = None,
         compile: bool = False,
         bandwidth: int | None = None,
         joints: Sequence[Joint] = (),
@@ -208,6 +211,9 @@ class ConstrainedSystem:
         {callbacks}
         n_a : int
             Number of non-holonomic constraints.
+        parameters : array_like, optional
+            A vector `p` that the functions take as their last argument; those that do without may leave it out.
+            `with_parameters` makes a system of others, of which nothing is compiled again.
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
@@ -248,7 +254,14 @@ class ConstrainedSystem:
         for kind, function in functions.items():
             if not callable(function):
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
-            check_arguments(kind, function)
+        known = parameters is not None
+        taking = frozenset(kind for kind, function in functions.items() if check_arguments(kind, function, known))
+        p = _checked_parameters(() if parameters is None else parameters)
+        if known and not taking:
+            raise ValueError(
+                f"parameters are given, but none of the functions of {name!r} takes them: let those that need them "
+                "have p as their last argument, as in mass(t, q, p), or leave parameters out"
+            )
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
         options: dict[str, Any] = {
             "constant_mass": constant_mass,
@@ -257,20 +270,26 @@ class ConstrainedSystem:
             "name": name,
         }
         if check_flag("compile", compile):
-            compiled: dict[str, Any] = {kind: compile_returning(kind, each) for kind, each in functions.items()}
-            system = cls(**sizes, **options, **compiled)
-            system._returning = functions
+            compiled: dict[str, Any] = {
+                kind: compile_returning(kind, each, kind in taking) for kind, each in functions.items()
+            }
+            system = cls(**sizes, **options, **compiled, parameters=p)
+            system._returning, system._taking = functions, taking
             return system
-        python = PythonFunctions(name, functions)
+        python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
-        system = cls(**sizes, **options, **wrappers, parameters=[python.handle])
-        system._python = python  # the registry holds it weakly
+        system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, p))
+        system._python, system._taking = python, taking  # the registry holds it weakly
         return system
 
     @property
     def python_functions(self) -> dict[str, Any]:
         """The plain Python functions by kind, where it is made of these and they are not compiled."""
         return {} if self._python is None else self._python.functions
+
+    def parameters_for(self, kind: str) -> tuple[Array, ...]:
+        """What a plain function of a kind takes after the state: the parameters, or nothing."""
+        return (self.parameters.copy(),) if kind in self._taking else ()
 
     @property
     def called_in_python(self) -> bool:
@@ -326,7 +345,8 @@ class ConstrainedSystem:
             known = {"q": q, "v": v, "lam": np.ones(self.n_c)}
             arguments = [known[name] for name in KINDS[kind].state]
             copies = [np.array(argument) for argument in arguments]
-            store(kind, self.name, t, function(t, *copies), self.arrays_of(kind)[0])
+            p = self.parameters_for(kind)
+            store(kind, self.name, t, function(t, *copies, *p), self.arrays_of(kind)[0])
             if any((copy != argument).any() for copy, argument in zip(copies, arguments, strict=True)):
                 raise ValueError(
                     f"{kind} of {self.name!r} must not change the arrays that it is given; copy them first"
@@ -354,8 +374,8 @@ class ConstrainedSystem:
         other = memo[id(self)] = copy.copy(self)
         p = self.functions.p.copy()
         if self._python is not None:  # numbers of its own for functions of its own
-            other._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo))
-            p = np.array([other._python.handle], dtype=np.float64)
+            other._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo), self._taking)
+            p[0] = other._python.handle
         other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
         return other
 
@@ -365,6 +385,7 @@ class ConstrainedSystem:
         options |= {"bandwidth": self.bandwidth, "joints": self.joints, "name": self.name}
         if plain:
             options["compile"] = not self.called_in_python
+            options["parameters"] = self.parameters if self._taking else None
         else:
             options |= {"constant_mass": self.constant_mass, "parameters": self.parameters}
         functions = {kind: packed(self.name, kind, function) for kind, function in (plain or self.given).items()}
