@@ -1,11 +1,11 @@
 """What C_q, C_t and Gamma must be, exactly: to be compared with what is given, by no differences."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.scales import sizes
 from twoloop.generate.traced_equations import OF_ROWS, Equations
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Untraceable
@@ -14,6 +14,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 MOST = 50_000  # entries of C_q
+LEAST = 1e-3  # of the largest coordinate, that another counts as in its velocity
 
 
 def exact_derivatives(system: ConstrainedSystem) -> Traced | None:
@@ -41,9 +42,16 @@ def _made(system: ConstrainedSystem) -> Traced | None:
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
     """Rows [t, q, v] of states (t, q, v), with velocities in which each coordinate matters and as fast as these."""
-    random = np.random.default_rng(1)
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
-    size = np.array([sizes(q) for q in positions])
-    generic = size * random.uniform(0.5, 1.5, size.shape) * random.choice((-1.0, 1.0), size.shape)
+    size = np.abs(positions)
+    largest = size.max(axis=1, keepdims=True)
+    generic = np.maximum(size, np.where(largest > 0.0, LEAST * largest, 1.0)) * _factors(*size.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))
     return np.column_stack([times, positions, speed * generic])
+
+
+@cache
+def _factors(n_states: int, n_q: int) -> Array:
+    """Between 0.5 and 1.5, of either sign: always the same."""
+    random = np.random.default_rng(1)
+    return random.uniform(0.5, 1.5, (n_states, n_q)) * random.choice((-1.0, 1.0), (n_states, n_q))

@@ -53,10 +53,12 @@ class Traced:
             forms = {kind: made for kind, made in graph.traced.items() if kind in system.given}
         known = [kind for kind in KINDS if kind in forms and forms[kind].size]
         self.places = [(kind, place) for kind in known for place in np.ndindex(forms[kind].shape)]
+        self.n_of = np.array([forms[kind].size for kind in known], dtype=np.int64)
         self.which = np.array([kind in known for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.trusted = False
+        self._kit: Any = None
         entries = (forms[kind][place] for kind, place in self.places)
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
@@ -107,12 +109,10 @@ class Traced:
             same |= ~finite & ~np.isfinite(traced)
         else:
             same |= ~finite
-        for k, entry in np.argwhere(~same):
-            kind = [place for place, (each, _) in enumerate(self.places) if each == self.places[entry][0]]
-            size = np.nanmax(np.where(np.isfinite(bounds[:, kind]), bounds[:, kind], 0.0))
-            if off[k, entry] <= LOST * size:
-                continue
-            if not off[k, entry] <= CLEAR * size or self._stays(system, states[k], int(entry)):
+        largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
+        size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_of) - self.n_of), self.n_of)  # by kind
+        for k, entry in np.argwhere(~same & ~(off <= LOST * size)):
+            if not off[k, entry] <= CLEAR * size[entry] or self._stays(system, states[k], int(entry)):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
 
@@ -121,8 +121,10 @@ class Traced:
         from twoloop.kernels.evaluation import traced as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
+        if self._kit is None or self._kit.functions is not system.functions:
+            self._kit = Kit(system.functions)
         n_different = direct(kernels.compare)(
-            Kit(system.functions),
+            self._kit,
             self.sizes,
             self.which,
             np.ascontiguousarray(states),

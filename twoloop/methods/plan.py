@@ -1,6 +1,7 @@
 """What a method hands to a run: its plan; and what the methods share."""
 
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -64,8 +65,12 @@ class Plan:
 
     def fresh(self) -> "Plan":
         """The same for another run, with memory of its own."""
-        parts = {name: each.fresh() for name in PARTS if (each := getattr(self, name)) is not None}
-        return replace(self, memory=self.memory.copy(), **parts)
+        other = copy(self)  # `replace` takes ten times as long
+        for name in PARTS:
+            if (part := getattr(self, name)) is not None:
+                object.__setattr__(other, name, part.fresh())
+        object.__setattr__(other, "memory", self.memory.copy())
+        return other
 
 
 def least_tolerance(rtol: float, atol: float) -> float:

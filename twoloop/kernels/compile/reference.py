@@ -78,7 +78,7 @@ class Reference(types.Type):
             array = getattr(values, field)
             if array.ndim != kind.ndim or array.dtype != self.dtypes[field] or not array.flags.c_contiguous:
                 raise TypeError(f"{field} must be a {kind}; given {array.dtype} of shape {array.shape}")
-            words.append(array.__array_interface__["data"][0])
+            words.append(array.ctypes.data)
             words.extend(array.shape)
         for field, signature in self.functions.items():
             function = getattr(values, field)
