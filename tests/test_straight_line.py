@@ -14,6 +14,7 @@ from numba import njit
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.generate import straight_code
+from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import function_of, own_code
@@ -72,20 +73,29 @@ def run_of(problem, compiled):
 def run_from(system, q0, v0, compiled):
     plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
     if compiled:
-        plan = replace(plan, inner=own_code(system, 0.0, q0).inner)
+        own = own_code(system, 0.0, q0)
+        plan = replace(plan, inner=own.inner, numbers=own.numbers.values)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
+
+
+def read_by(graph, outputs):
+    """The numbers that code for some outputs reads."""
+    numbers = Coefficients()
+    list(numbers.structure(graph, outputs.forms))
+    return numbers
 
 
 def compute(graph, outputs, inputs):
     """What code for some outputs gives: whether its conditions hold, and the arrays."""
-    function = function_of(graph, outputs)
+    numbers = read_by(graph, outputs)
+    function = function_of(graph, outputs, numbers)
     filled = tuple(np.full(len(forms), np.nan) for forms in outputs.arrays.values())
 
     @njit
-    def call(inputs, filled):
-        return function(inputs, filled)
+    def call(inputs, values, filled):
+        return function(inputs, values, filled)
 
-    return call(inputs, filled), filled
+    return call(inputs, numbers.values, filled), filled
 
 
 @ending_at_a_reference
@@ -247,13 +257,14 @@ def test_sine_and_cosine_are_right_to_rounding(size):
     graph = Graph()
     (angle,) = graph.inputs(1, False)
     outputs = Outputs({"of": [angle.sine(), angle.cosine()]}, [])
-    function = function_of(graph, outputs)
+    numbers = read_by(graph, outputs)
+    function, values = function_of(graph, outputs, numbers), numbers.values
 
     @njit
     def both(angles, sines, cosines):
         out = np.zeros(2)
         for k in range(angles.size):
-            function((angles[k],), (out,))
+            function((angles[k],), values, (out,))
             sines[k], cosines[k] = out
 
     rng = np.random.default_rng(6)
@@ -367,6 +378,40 @@ def test_other_parameters_are_followed(method, compiled):
         assert abs(result.q[0, -1] - math.cos(math.sqrt(stiffness))) < 1e-8
 
 
+def on_a_circle(radius, stiffness):
+    """A bead on a circle, held by a spring, by functions that enclose numbers."""
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.diag([1.5, 1.5]),
+        force=lambda t, q, v: np.array([-stiffness * (q[0] - 0.3), -9.81 - 0.2 * v[1]]),
+        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - radius * radius)]),
+        jacobian=lambda t, q: q.reshape((1, 2)),
+    )
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853"])
+def test_one_code_serves_all_numbers(method, monkeypatch):
+    made, compile_inner = [], straight_code._inner
+    monkeypatch.setattr(straight_code, "_INNER", {})
+    monkeypatch.setattr(straight_code, "_inner", lambda *given: made.append(1) or compile_inner(*given))
+    for radius, stiffness in ((1.3, 7.0), (0.7, 11.0), (2.1, 3.0)):
+        start = ([radius, 0.0], [0.0, 0.0], method, 1e-9, 1e-9)
+        ends = [
+            solve_dae(on_a_circle(radius, stiffness), (0.0, 1.0), *start, compiled=own).q[:, -1]
+            for own in (True, False)
+        ]
+        assert np.allclose(*ends, rtol=0.0, atol=1e-8)
+    assert len(made) == 1
+
+
+def test_numbers_that_cancel_leave_no_rounding():
+    graph = Graph()
+    x, y = graph.inputs(2, False)
+    assert not ((0.1 * x + 0.2 * y) * 3.0 - 0.3 * x - 0.6 * y).terms
+    assert (1e-12 * x + (0.1 + 0.2) * y - 0.3 * y).terms == {0: 1e-12}
+
+
 def test_a_second_process_compiles_nothing():
     program = (
         "from twoloop import solve_dae\nfrom twoloop.generate import straight_code\n"
@@ -392,7 +437,7 @@ def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(caches, "MOST_KEPT", 2)
     monkeypatch.setattr(straight_code, "sources_folder", lambda: tmp_path)
     monkeypatch.setattr(straight_code, "_INNER", {})
-    for stiffness in (1.0, 2.0, 3.0):
+    for stiffness in (1.0, -1.0, 2.0):  # 1 and -1 stand in the code
         system = ConstrainedSystem(
             n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[stiffness]
         )

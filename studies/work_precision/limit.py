@@ -62,8 +62,9 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     problem = four_bar()
     q, v, p = problem.q0, problem.v0, problem.system.functions.p
     program, _ = program_of(problem.system, 0.0, q, v)
-    equations = own_code(problem.system, 0.0, q).equations
-    accelerations = function_of(equations.graph, equations.there)
+    own = own_code(problem.system, 0.0, q)
+    numbers, equations = own.numbers.values, own.equations
+    accelerations = function_of(equations.graph, equations.there, own.numbers)
     f = problem.system.functions
     kinematics, force = f.kinematics, f.force
 
@@ -71,7 +72,7 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     def evaluations(n: int, q: Array, v: Array, a: Array) -> None:
         for _ in range(n):
             q[0] += 1e-18 * a[0]  # so that no evaluation is left out
-            accelerations((0.0, q, v), (a,))
+            accelerations((0.0, q, v), numbers, (a,))
 
     @numba.njit
     def callbacks(n: int, q: Array, v: Array, p: Array, C: Array, Cq: Array, Ct: Array, Qd: Array, Q: Array) -> None:

@@ -13,12 +13,12 @@ from weakref import WeakMethod
 from llvmlite import ir
 from numba.extending import intrinsic
 
+from twoloop.generate.coefficients import Coefficient, Terms
 from twoloop.kernels.compile.callbacks import VECTOR
 from twoloop.kernels.compile.private import make_array, signature
 from twoloop.kernels.data.common import OPTIONS
 
 Value = Any  # of LLVM: a double, a vector of doubles, an integer or a pointer to doubles
-Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
 FLAGS = tuple(sorted(OPTIONS["fastmath"]))
 DOUBLE, INTEGER, WORD = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
@@ -32,11 +32,20 @@ INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqr
 class Emitter:
     """Appends operations to a function of LLVM.
 
-    Operations are on doubles or on vectors of them. Places in memory are counted in doubles.
+    Operations are on doubles or on vectors of them. Places in memory are counted in doubles. `numbers` points to those
+    that the code reads.
     """
 
-    def __init__(self, builder: ir.IRBuilder):
-        self.builder = builder
+    def __init__(self, builder: ir.IRBuilder, numbers: Value = None):
+        self.builder, self.numbers = builder, numbers
+
+    def known(self, number: float) -> Value:
+        """A number that is known, or read, which never changes."""
+        if not isinstance(number, Coefficient):
+            return DOUBLE(number)
+        value = self.load(self.numbers, number.place)
+        value.set_metadata("invariant.load", self.builder.module.add_metadata([]))
+        return value
 
     def add(self, a: Value, b: Value) -> Value:
         """a + b."""
@@ -60,9 +69,9 @@ class Emitter:
 
     def times(self, factor: float, a: Value) -> Value:
         """A multiple of a number by a known one."""
-        if abs(factor) == 1.0:
+        if factor in (1.0, -1.0):
             return a if factor == 1.0 else self.negative(a)
-        return self.multiply(DOUBLE(factor), a)
+        return self.multiply(self.known(factor), a)
 
     def number(self, integer: Value) -> Value:
         """An integer as a double."""
@@ -110,7 +119,7 @@ class Emitter:
         self.builder.store(value, pointer, align=8 * getattr(value.type, "count", 1))
 
     def vector(self, values: Sequence[Value]) -> Value:
-        """Numbers side by side; one number as it is."""
+        """Coefficients side by side; one number as it is."""
         if len(values) == 1:
             return values[0]
         vector = vector_type(len(values))(ir.Undefined)
@@ -181,7 +190,7 @@ class Quantities:
         """constant + the sum of coefficient * quantity."""
         key = terms, constant
         if key not in self._sums:
-            total = None if constant == 0.0 and terms else DOUBLE(constant)
+            total = None if constant == 0.0 and terms else self._emit.known(constant)
             for quantity, coefficient in terms:
                 value = self.value(quantity)
                 if total is None:
@@ -195,7 +204,7 @@ class Quantities:
 
 
 def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
-    """What numba takes for a function, whose code is written by emit(emitter, *arguments).
+    """What numba takes for a function, whose code is written by emit(emitter, *arguments), `numbers` apart.
 
     Parameters
     ----------
@@ -214,7 +223,8 @@ def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
                 make_array(VECTOR)(context, builder, value).data if kind == VECTOR else value
                 for kind, value in zip(sig.args, values, strict=True)
             ]
-            made = written_by()(Emitter(builder), *plain)  # type: ignore[misc]
+            given = dict(zip(arguments, plain, strict=True))
+            made = written_by()(Emitter(builder, given.pop("numbers", None)), *given.values())  # type: ignore[misc]
             return context.get_dummy_value() if made is None else made
 
         return signature(result, *arguments.values()), generate

@@ -5,10 +5,8 @@ quantities that depend on time and coordinates ("early"); Q may depend on veloci
 G^T lam + M a are written as few products: terms that share a factor are one product.
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,15 +92,6 @@ class SeriesProgram:
     def n_nodes(self) -> int:
         """Number of quantities."""
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
-
-    @cached_property
-    def digest(self) -> str:
-        """That of all its numbers."""
-        digest = hashlib.sha256(repr((self.n_q, self.n_rows)).encode())
-        tables = [each for table in (self.early, self.late) for each in (table.groups, *table.first, *table.second)]
-        for array in (*tables, *self.rows, self.row_places, *self.balance, self.balance_places):
-            digest.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
-        return digest.hexdigest()
 
 
 def series_program(system: ConstrainedSystem) -> SeriesProgram:

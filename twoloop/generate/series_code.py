@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
 
-from twoloop.generate import llvm_code, series_groups
+from twoloop.generate import coefficients, llvm_code, series_groups
+from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import INTEGER, ONE, SLACK, ZERO, Emitter, Quantities, Value, emitted
 from twoloop.generate.series import SeriesProgram
 from twoloop.generate.series_groups import WIDTH, Group, Groups, rounded
@@ -39,6 +41,8 @@ LARGEST = 3000  # operations, which take 6 s to compile; the time grows faster t
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
+Array = NDArray[np.float64]
+
 i8 = types.int64
 
 
@@ -49,9 +53,9 @@ class SeriesCode:
     operation that divides an inverse; a row of zeros; and the rows of orders 0, 1 and so on. A row is X and Y.
     """
 
-    def __init__(self, program: SeriesProgram):
-        self.n, self.n_rows = program.n_q, program.n_rows
-        self.groups = groups = Groups(program)
+    def __init__(self, program: SeriesProgram, numbers: Coefficients):
+        self.n, self.n_rows, self.numbers = program.n_q, program.n_rows, numbers
+        self.groups = groups = Groups(program, numbers)
         self.width, self.first, self.kept = groups.width, groups.first, groups.kept
         self.velocities = rounded(groups.n_early)
         self.inverses = self.velocities + rounded(self.n)
@@ -325,6 +329,7 @@ class CompiledSeries(NamedTuple):
     function: Dispatcher
     code: SeriesCode
     n_kept: int  # numbers in the factors
+    numbers: Array  # what the code reads
 
     def memory_size(self, order: int) -> int:
         """Length of `memory` for series of this order."""
@@ -351,12 +356,15 @@ def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
             f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
             f"it out"
         )
-    key = program.digest + own.digest
-    made: CompiledSeries | None = _COMPILED.get(key)
-    if made is None:
-        code, solution = SeriesCode(program), Solution(own.equations)
-        _COMPILED[key] = made = CompiledSeries(_compile(code, solution, own, key), code, solution.n_kept)
-    return made
+    numbers = Coefficients()
+    code, solution = SeriesCode(program, numbers), Solution(own.equations)
+    structure = [own.digest, program.n_q, program.n_rows, code.groups.structure, solution.n_kept]
+    structure += numbers.structure(solution.graph, solution.solved.forms)
+    key = hashlib.sha256(repr(structure).encode()).hexdigest()
+    function = _COMPILED.get(key)
+    if function is None:
+        _COMPILED[key] = function = _compile(code, solution, own, key)
+    return CompiledSeries(function, code, solution.n_kept, numbers.values)
 
 
 def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Dispatcher:
@@ -366,12 +374,13 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
     from twoloop.kernels.steps import recurrences as series
 
     n, n_rows, n_kept = code.n, code.n_rows, solution.n_kept
-    keep = function_of(own.equations.graph, solution.kept)
-    solve = function_of(solution.graph, solution.solved)
-    arrays, numbers = {"scratch": VECTOR, "series": VECTOR}, {"t": f8, "unit": f8}
-    begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **numbers, state=VECTOR)
-    find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **numbers, order=i8)
-    take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8)
+    keep = function_of(own.equations.graph, solution.kept, own.numbers)
+    solve = function_of(solution.graph, solution.solved, code.numbers)
+    arrays, times = {"scratch": VECTOR, "series": VECTOR}, {"t": f8, "unit": f8}
+    known = {"numbers": VECTOR}
+    begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **times, state=VECTOR, **known)
+    find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **times, order=i8, **known)
+    take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8, **known)
     is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
     BEGIN, ORDER, TARGET = series.N_MEMORY_SCALARS, series.ORDER, series.TARGET
     N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
@@ -387,17 +396,17 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
         place += 2 * n_rows
         kept, scratch = memory[place : place + n_kept], memory[place + n_kept :]
         q, v = state[:n], state[n : 2 * n]
-        own_factors = keep((t, q, v), (kept,))
+        own_factors = keep((t, q, v), f.numbers, (kept,))
         if not own_factors:
             code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-        begin(scratch, series, r, c, lam, t, unit, state)
+        begin(scratch, series, r, c, lam, t, unit, state, f.own_numbers)
         for k in range(1, order):
-            find_order(scratch, series, r, c, t, unit, k)
-            if not own_factors or not solve((r, c, kept), (a, lam)):  # M a + G^T lam = r, G a = c
+            find_order(scratch, series, r, c, t, unit, k, f.own_numbers)
+            if not own_factors or not solve((r, c, kept), f.own_numbers, (a, lam)):  # M a + G^T lam = r, G a = c
                 f.instead(f, w, r, c, t, unit, tolerances, a, lam)
-            take_order(scratch, series, a, lam, unit, k)
+            take_order(scratch, series, a, lam, unit, k, f.own_numbers)
         w.counters[N_EVALUATIONS] += order - 1
         return Attempt(DONE if is_finite(series, order) else NOT_FINITE, 0.0, 0.0)
 
@@ -410,6 +419,6 @@ def _stamp() -> str:
     from twoloop.kernels.data import common
 
     digest = hashlib.sha256(common.stamp("steps.taylor_step").encode())
-    for module in (__file__, series_groups.__file__, llvm_code.__file__):
+    for module in (__file__, series_groups.__file__, llvm_code.__file__, coefficients.__file__):
         digest.update(Path(str(module)).read_bytes())
     return digest.hexdigest()

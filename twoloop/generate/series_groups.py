@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from twoloop.generate.llvm_code import Terms
+from twoloop.generate.coefficients import Coefficients, Terms
 from twoloop.generate.series import SeriesProgram, Sums, Table
 from twoloop.kernels.evaluation.operations import PENDING, SINE
 
@@ -63,10 +63,13 @@ class Groups:
         Quantities that late operations of an order use, and the balance.
     """
 
-    def __init__(self, program: SeriesProgram):
+    def __init__(self, program: SeriesProgram, numbers: Coefficients):
         self.first = 1 + 3 * program.n_q + program.n_rows
         self.n_early = len(program.early.first.column)
-        tables = [_groups(program.early, self.first), _groups(program.late, self.first + self.n_early)]
+        tables = [
+            _groups(program.early, self.first, numbers),
+            _groups(program.late, self.first + self.n_early, numbers),
+        ]
         end = 0
         for width in (4, 2, 1):  # each of them aligned
             for groups in tables:
@@ -76,11 +79,16 @@ class Groups:
                         end += width
         self.early, self.late = tables
         self.width = rounded(end)
-        self.rows = _rows(program.rows, program.row_places.tolist())
-        self.balance = _rows(program.balance, program.balance_places.tolist())
+        self.rows = _rows(program.rows, program.row_places.tolist(), numbers)
+        self.balance = _rows(program.balance, program.balance_places.tolist(), numbers)
         arguments = [each for group in self.late for each in (*group.first, *group.second)]
         terms = [each.terms for each in arguments] + [row.terms for row in self.balance]
         self.kept = {quantity for each in terms for quantity, _ in each}
+
+    @property
+    def structure(self) -> tuple[object, ...]:
+        """All that code for them depends on, the values of its numbers apart."""
+        return self.early, self.late, self.rows, self.balance, self.first
 
 
 def rounded(size: int) -> int:
@@ -96,14 +104,18 @@ def _terms(sums: Sums, rows: Sequence[int]) -> list[Terms]:
     return [tuple(term for term in ((i, c), *more[row]) if term[1] != 0.0) for row, i, c in firsts]
 
 
-def _rows(sums: Sums, places: Sequence[int]) -> list[Row]:
-    return [Row(*each) for each in zip(places, _terms(sums, places), sums.constant.tolist(), strict=True)]
+def _rows(sums: Sums, places: Sequence[int], numbers: Coefficients) -> list[Row]:
+    forms = zip(places, _terms(sums, places), sums.constant.tolist(), strict=True)
+    return [Row(place, *numbers.of(terms, constant)) for place, terms, constant in forms]
 
 
-def _groups(table: Table, quantity: int) -> list[Group]:
+def _groups(table: Table, quantity: int, numbers: Coefficients) -> list[Group]:
     """Those of a table, whose first operation makes this quantity; they have no places yet."""
     first, second = (
-        [Argument(*each) for each in zip(_terms(sums, range(len(sums.column))), sums.constant.tolist(), strict=True)]
+        [
+            Argument(*numbers.of(*each))
+            for each in zip(_terms(sums, range(len(sums.column))), sums.constant.tolist(), strict=True)
+        ]
         for sums in (table.first, table.second)
     )
     groups = []

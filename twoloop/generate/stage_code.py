@@ -37,7 +37,7 @@ class StageCode:
     """
 
     def __init__(self, own: OwnCode, n_stages: int):
-        self.equations, self.n_stages = own.equations, n_stages
+        self.equations, self.numbers, self.n_stages = own.equations, own.numbers, n_stages
         self.n = own.equations.system.n_q
         self.blocks = -(-2 * self.n // WIDTH)
         self.slopes = self.blocks * WIDTH
@@ -84,7 +84,7 @@ class StageCode:
         builder, base, n = emit.builder, emit.aligned(scratch), self.n
         stage = self._sum(emit, base, h, weights, which)
         outputs = self.equations.there
-        written, (a,) = results_of(emit, self.equations.graph, outputs, [t, *stage[: 2 * n]])
+        written, (a,) = results_of(emit, self.equations.graph, outputs, [t, *stage[: 2 * n]], self.numbers)
         holds = conditions_hold(emit, written, outputs, a)
         with builder.if_else(holds) as (then, otherwise):
             with then:
@@ -152,7 +152,8 @@ def _compile(code: StageCode, key: str) -> Dispatcher:
 
     n, s = code.n, code.n_stages
     begin = emitted(code.begin, types.none, scratch=VECTOR, state=VECTOR)
-    stage = emitted(code.stage, types.boolean, scratch=VECTOR, which=i8, weights=VECTOR, t=f8, h=f8, place=VECTOR)
+    known = {"t": f8, "h": f8, "place": VECTOR, "numbers": VECTOR}
+    stage = emitted(code.stage, types.boolean, scratch=VECTOR, which=i8, weights=VECTOR, **known)
     put = emitted(code.put, types.none, scratch=VECTOR, which=i8, place=VECTOR)
     finish = emitted(
         code.finish,
@@ -175,7 +176,7 @@ def _compile(code: StageCode, key: str) -> Dispatcher:
         _, A, b, c, fine, coarse = tableau_of(options)
         begin(scratch, state)
         for j in range(1, s):
-            if stage(scratch, j, A[j], t + c[j] * h, h, new_state):
+            if stage(scratch, j, A[j], t + c[j] * h, h, new_state, f.numbers):
                 w.counters[N_EVALUATIONS] += 1
                 w.counters[N_FACTORIZATIONS] += 1
             else:

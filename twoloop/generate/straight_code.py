@@ -15,7 +15,8 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from twoloop.generate import llvm_code, llvm_trigonometry, straight_line
+from twoloop.generate import coefficients, llvm_code, llvm_trigonometry, straight_line
+from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Choice, Outputs, StraightLine
@@ -45,8 +46,8 @@ FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGE
 class Written:
     """Values of the quantities of a graph, as they are written into a function."""
 
-    def __init__(self, emit: Emitter):
-        self.emit = emit
+    def __init__(self, emit: Emitter, numbers: Coefficients):
+        self.emit, self.numbers = emit, numbers
         self.angles: list[Value] = []  # of sines and cosines
         self._known = Quantities(emit, self._missing)
         self._pairs: dict[Any, tuple[Value, Value]] = {}
@@ -60,7 +61,7 @@ class Written:
 
     def form(self, form: Form) -> Value:
         """The value of a form."""
-        return self._known.sum(tuple(form.terms.items()), form.constant)
+        return self._known.sum(*self.numbers.of_form(form))
 
     def operation(self, quantity: int, kind: int, first: Form, second: Form | None) -> None:
         """Compute a quantity."""
@@ -83,10 +84,10 @@ class Written:
 
 
 def results_of(
-    emit: Emitter, graph: Graph, outputs: Outputs, inputs: Sequence[Value]
+    emit: Emitter, graph: Graph, outputs: Outputs, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Written, list[list[Value]]]:
     """Arrays that code computes from the inputs of a graph, in their order."""
-    written = Written(emit)
+    written = Written(emit, numbers)
     for quantity, value in enumerate(inputs):
         written.define(quantity, value)
     for i in outputs.quantities(graph):
@@ -109,37 +110,37 @@ def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: S
     return holds
 
 
-def function_of(graph: Graph, outputs: Outputs) -> Any:
-    """A function of the inputs, a tuple of numbers and vectors, and of vectors to fill, for code that numba compiles.
+def function_of(graph: Graph, outputs: Outputs, numbers: Coefficients) -> Any:
+    """A function for code that numba compiles: of inputs, of the values of `numbers`, and of vectors to fill.
 
     It returns whether the conditions hold and what it computes is finite, and fills the vectors only then. Numba keeps
     it for ever; what it is written from must live until it is compiled.
     """
-    graph_there, outputs_there = weakref.ref(graph), weakref.ref(outputs)
+    graph_there, outputs_there, numbers_there = weakref.ref(graph), weakref.ref(outputs), weakref.ref(numbers)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def pointer(vectors: Value, k: int) -> Value:
             return make_array(VECTOR)(context, builder, builder.extract_value(vectors, k)).data
 
-        graph, outputs = graph_there(), outputs_there()
-        assert graph is not None and outputs is not None
-        given, filled = arguments
-        emit, inputs = Emitter(builder), []
+        graph, outputs, numbers = graph_there(), outputs_there(), numbers_there()
+        assert graph is not None and outputs is not None and numbers is not None
+        given, values, filled = arguments
+        emit, inputs = Emitter(builder, make_array(VECTOR)(context, builder, values).data), []
         for k, (kind, size) in enumerate(zip(signature.args[0], graph.sizes, strict=True)):
             for j in range(size):
                 is_vector = kind == VECTOR
                 inputs.append(emit.load(pointer(given, k), j) if is_vector else builder.extract_value(given, k))
-        written, results = results_of(emit, graph, outputs, inputs)
+        written, results = results_of(emit, graph, outputs, inputs, numbers)
         holds = conditions_hold(emit, written, outputs, results[0])
         with builder.if_then(holds):
-            for k, values in enumerate(results):
-                for j, value in enumerate(values):
+            for k, array in enumerate(results):
+                for j, value in enumerate(array):
                     emit.store(value, pointer(filled, k), j)
         return holds
 
     @intrinsic
-    def function(typing: Any, given: Any, filled: Any) -> Any:
-        return types.boolean(given, filled), generate
+    def function(typing: Any, given: Any, values: Any, filled: Any) -> Any:
+        return types.boolean(given, values, filled), generate
 
     return function
 
@@ -153,22 +154,26 @@ class OwnCode:
     Attributes
     ----------
     equations : StraightLine
+    numbers : Coefficients
+        What the code reads.
     digest : str
-        Of all that code made of these depends on.
+        Of all that the code depends on, the values of these apart.
     inner : Dispatcher
     """
 
     def __init__(self, equations: StraightLine):
         from twoloop.kernels.data import common
 
-        self.equations = equations
-        digest = hashlib.sha256(repr(list(_described(equations))).encode())
-        for module in (__file__, straight_line.__file__, llvm_code.__file__, llvm_trigonometry.__file__):
-            digest.update(Path(str(module)).read_bytes())
+        self.equations, self.numbers = equations, Coefficients()
+        digest = hashlib.sha256(repr(list(_described(equations, self.numbers))).encode())
+        for module in (straight_line, coefficients, llvm_code, llvm_trigonometry):
+            digest.update(Path(str(module.__file__)).read_bytes())
+        digest.update(Path(__file__).read_bytes())
         self.digest = digest.hexdigest()
         inner = _INNER.get(self.digest)
         if inner is None:
-            _INNER[self.digest] = inner = _inner(equations, (common.stamp("evaluation.calls"), self.digest))
+            watched = common.stamp("evaluation.calls"), self.digest
+            _INNER[self.digest] = inner = _inner(equations, self.numbers, watched)
         self.inner: Dispatcher = inner
 
 
@@ -189,17 +194,15 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
     return made
 
 
-def _described(equations: StraightLine) -> Iterable[Any]:
-    yield equations.system.n_q, equations.choice
+def _described(equations: StraightLine, numbers: Coefficients) -> Iterable[Any]:
+    yield equations.system.n_q, equations.choice.rows, equations.choice.added
     for outputs in (equations.there, equations.closer, equations.nearer, equations.redundant):
         if outputs is not None:
-            yield {name: [form.key for form in forms] for name, forms in outputs.arrays.items()}
-            yield [(one.key, other.key) for one, other in outputs.conditions]
-    for operation in equations.graph.operations:
-        yield None if operation is None else tuple(x.key if isinstance(x, Form) else x for x in operation)
+            yield {name: len(forms) for name, forms in outputs.arrays.items()}, len(outputs.conditions)
+            yield list(numbers.structure(equations.graph, outputs.forms))
 
 
-def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
+def _inner(equations: StraightLine, numbers: Coefficients, watched: tuple[str, str]) -> Dispatcher:
     from twoloop.kernels.compile.linking import KernelCompiler
     from twoloop.kernels.data.common import (
         BY_GENERAL,
@@ -216,7 +219,7 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
     from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 
     options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **OPTIONS}
-    there = function_of(equations.graph, equations.there)
+    there = function_of(equations.graph, equations.there, numbers)
     EVALUATE_THERE, PROJECT = calls.EVALUATE_THERE, calls.PROJECT
     if equations.closer is None or equations.nearer is None:
 
@@ -224,29 +227,32 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
             if task == EVALUATE_THERE:
                 w.counters[N_EVALUATIONS] += 1
                 w.counters[N_FACTORIZATIONS] += 1
-                if there((t, q, v), (a,)):
+                if there((t, q, v), f.numbers, (a,)):
                     return DONE
             w.notes[BY_GENERAL] = 1.0
             return f.general(f, w, task, t, q, v, theta, a, lam)
 
         return compile_kept(evaluating, INNER, watched, **options)
 
-    closer, nearer = (function_of(equations.graph, each) for each in (equations.closer, equations.nearer))
-    redundant, MULTIPLIERS = function_of(equations.graph, equations.redundant), calls.MULTIPLIERS
+    closer, nearer = (function_of(equations.graph, each, numbers) for each in (equations.closer, equations.nearer))
+    redundant, MULTIPLIERS = function_of(equations.graph, equations.redundant, numbers), calls.MULTIPLIERS
     REDUNDANT, TANGENTS = calls.REDUNDANT, calls.TANGENTS
 
     def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
         if task == EVALUATE_THERE:
             w.counters[N_EVALUATIONS] += 1
             w.counters[N_FACTORIZATIONS] += 1
-            if there((t, q, v), (a,)):
+            if there((t, q, v), f.numbers, (a,)):
                 return DONE
         elif task == PROJECT:
             least, before = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED]), np.inf
             for k in range(MAX_INNER):
                 w.counters[N_INNER] += 1
                 w.counters[N_FACTORIZATIONS] += 1
-                fine = closer((t, q, v), (w.x, q)) if k == 0 else nearer((t, q, v), (a, w.x, q, v, lam))
+                if k == 0:
+                    fine = closer((t, q, v), f.numbers, (w.x, q))
+                else:
+                    fine = nearer((t, q, v), f.numbers, (a, w.x, q, v, lam))
                 if not fine:
                     break
                 moved = 0.0
@@ -261,7 +267,7 @@ def _inner(equations: StraightLine, watched: tuple[str, str]) -> Dispatcher:
                 before = max(moved, least)
             w.notes[BY_GENERAL] = 1.0
         elif task == REDUNDANT and w.notes[BY_GENERAL] == 0.0:
-            if redundant((t, q, v), (a,)):
+            if redundant((t, q, v), f.numbers, (a,)):
                 return DONE
             f.general(f, w, TANGENTS, t, q, v, theta, a, lam)  # the rows there, which this code has not left in w
         elif task <= MULTIPLIERS:  # of methods that need a good partition at every step

@@ -51,8 +51,13 @@ class Outputs:
 
     def quantities(self, graph: Graph) -> list[int]:
         """What all of this is made of, inputs apart, in an order in which it can be computed."""
-        forms = [*(form for array in self.arrays.values() for form in array)]
-        return graph.needed_by([*forms, *(form for condition in self.conditions for form in condition)])
+        return graph.needed_by(self.forms)
+
+    @property
+    def forms(self) -> list[Form]:
+        """All of them."""
+        forms = [form for array in self.arrays.values() for form in array]
+        return [*forms, *(form for condition in self.conditions for form in condition)]
 
 
 class Block(NamedTuple):
@@ -73,7 +78,7 @@ class Factors:
     conditions : list of (Form, Form)
         Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
     positive : list of Form
-        Numbers that are positive where the matrix of the first `n` is definite.
+        Coefficients that are positive where the matrix of the first `n` is definite.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Form], size: int, n: int):

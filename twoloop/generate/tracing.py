@@ -24,6 +24,7 @@ from twoloop.kernels.evaluation.operations import (
 )
 
 # the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
+CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding has left of two that cancel, which depends on their values
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
@@ -94,7 +95,7 @@ class Graph:
             if not a.terms:
                 return b.times(a.constant)
         (scale, one), (scale_too, other) = one.normalised(), other.normalised()
-        if other.key < one.key:
+        if other.place < one.place:
             one, other = other, one
         return self.operation(PRODUCT, one, other).times(scale * scale_too)
 
@@ -116,6 +117,11 @@ class Form:
         return (self.constant, *sorted(self.terms.items()))
 
     @property
+    def place(self) -> tuple[Any, ...]:
+        """Its place among others, by values of coefficients only where it has the terms of another."""
+        return tuple(sorted(self.terms)), self.key
+
+    @property
     def late(self) -> bool:
         """Whether it depends on more than time and coordinates."""
         return any(self.graph.late[i] for i in self.terms)
@@ -129,7 +135,7 @@ class Form:
     def normalised(self) -> tuple[float, "Form"]:
         """A factor, and the form over it, whose first coefficient is 1."""
         factor = self.terms[min(self.terms)]
-        return factor, self.times(1.0 / factor)
+        return factor, Form(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
     def _other(self, other: Any) -> "Form":
         if type(other) is not Form:
@@ -146,11 +152,12 @@ class Form:
         terms = dict(self.terms)
         for i, c in other.terms.items():
             total = terms.get(i, 0.0) + c
-            if total == 0.0:
+            if abs(total) <= CANCELLED * abs(c):
                 del terms[i]
             else:
                 terms[i] = total
-        return Form(self.graph, self.constant + other.constant, terms)
+        constant = self.constant + other.constant
+        return Form(self.graph, 0.0 if abs(constant) <= CANCELLED * abs(other.constant) else constant, terms)
 
     __radd__ = __add__
 

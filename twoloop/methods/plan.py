@@ -48,7 +48,11 @@ class Plan:
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
     inner: Any = None  # ... that code; None: the inner loop is the general one
-    own: Any = None  # a part of the step made for the mechanism, and what is called instead where it cannot serve
+    numbers: Any = None  # ... and what it reads
+    own: Any = (
+        None  # a part of the step made for the mechanism, what it reads, and what is called where it cannot serve
+    )
+    own_numbers: Any = None
     instead: Any = None
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself

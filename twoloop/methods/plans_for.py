@@ -58,4 +58,5 @@ def _made(
         raise ValueError(
             f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{constant}"
         )
-    return replace(plan, inner=code.inner, traced=(*plan.traced, code.equations.traced)), interiors
+    traced = (*plan.traced, code.equations.traced)
+    return replace(plan, inner=code.inner, numbers=code.numbers.values, traced=traced), interiors

@@ -129,6 +129,7 @@ class Taylor:
             step=taylor.COMPILED_TAYLOR,
             memory=np.zeros(code.memory_size(highest)),
             own=code.function,
+            own_numbers=code.numbers,
             instead=taylor.solve_order,
             interior=interior,
         )

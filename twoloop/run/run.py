@@ -411,7 +411,7 @@ class Run:
     def _give_way(self) -> None:
         """Go on with the plan that takes over where values of this one are not finite."""
         assert self.plan.substitute is not None
-        self.plan = replace(self.plan.substitute, inner=self.plan.inner)
+        self.plan = replace(self.plan.substitute, inner=self.plan.inner, numbers=self.plan.numbers)
         self.kit = kit_with(self.functions, self.plan)
         self.memory = self.plan.memory.copy()
         self.substituted = True

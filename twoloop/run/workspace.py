@@ -50,7 +50,8 @@ def kit_with(functions: Any, plan: Plan) -> common.Kit:
 
     functions.flags[common.STRAIGHT] = plan.inner is not None
     steps = (plan.step, plan.first, plan.second)
-    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, plan.own, plan.instead)
+    parts = (plan.own, plan.instead, plan.numbers, plan.own_numbers)
+    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, *parts)
 
 
 def workspace(

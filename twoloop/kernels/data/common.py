@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import njit, types
 from numba.extending import typeof_impl
 
@@ -206,13 +207,17 @@ class Step(NamedTuple):
     settle: Any = None
 
 
+NONE = np.zeros(0)
+
+
 class Kit:
     """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
     chooses between two others has these as `first` and `second`. An inner loop made for the mechanism leaves to
     `general` what it does not do itself; `own` is a part of the step made for it, Taylor series or stages, and
-    `instead` what is called where that does not serve.
+    `instead` what is called where that does not serve. `numbers` are those that the inner loop made for the mechanism
+    reads, `own_numbers` those of that part.
     """
 
     def __init__(
@@ -225,9 +230,13 @@ class Kit:
         general: Any = None,
         own: Any = None,
         instead: Any = None,
+        numbers: Any = None,
+        own_numbers: Any = None,
     ):
         self.__dict__.update(functions._asdict())
         self.functions, self.inner, self.general, self.own, self.instead = functions, inner, general, own, instead
+        self.numbers = NONE if numbers is None else numbers
+        self.own_numbers = NONE if own_numbers is None else own_numbers
         self.attempt, self.settle = step or Step()
         self.attempt_first, self.settle_first = first or Step()
         self.attempt_second, self.settle_second = second or Step()
@@ -239,7 +248,11 @@ class Kit:
 
 
 KIT = Reference(
-    "Kit", {"p": VECTOR, "flags": INTEGERS, **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR), strict=True))}
+    "Kit",
+    {
+        **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
+        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR), strict=True)),
+    },
 )
 for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)

@@ -1,0 +1,83 @@
+"""Numbers that code made for a mechanism reads when it runs: one code serves all mechanisms of its structure."""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.tracing import Form, Graph
+
+Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
+
+IN_THE_CODE = (0.0, 1.0, -1.0)  # which take no multiplication, and what differs from these by rounding
+ROUNDING = 8.0 * 2.0**-52
+
+
+class Coefficient(float):
+    """A coefficient that stands at a place in memory; equal to no other, whatever their values are."""
+
+    __slots__ = ("place",)
+    place: int
+
+    def __new__(cls, value: float, place: int) -> "Coefficient":
+        """A number for a place."""
+        made = super().__new__(cls, value)
+        made.place = place
+        return made
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __repr__(self) -> str:
+        return f"number {self.place}"
+
+
+class Coefficients:
+    """The coefficients of forms, in the order in which these are met first; the same form has the same numbers."""
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+        self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """What code reads."""
+        return np.array(self._values, dtype=np.float64)
+
+    def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
+        """Terms and constant with numbers in their places."""
+        key = terms, constant
+        if key not in self._known:
+            self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
+        return self._known[key]
+
+    def of_form(self, form: Form) -> tuple[Terms, float]:
+        """The same of a form."""
+        return self.of(tuple(form.terms.items()), form.constant)
+
+    def structure(self, graph: Graph, forms: Iterable[Form]) -> Iterable[Any]:
+        """What code for these forms depends on, the values of its numbers apart."""
+        forms = list(forms)
+        needed = graph.needed_by(forms)
+        name = {i: k for k, i in enumerate(needed)}
+
+        def told(form: Form) -> Any:
+            terms, constant = self.of_form(form)
+            return [(name.get(i, f"input {i}"), c) for i, c in terms], constant
+
+        yield [told(form) for form in forms]
+        for i in needed:
+            kind, *arguments = graph.operations[i]  # type: ignore[misc]
+            yield kind, [told(each) for each in arguments if isinstance(each, Form)]
+
+    def _number(self, value: float) -> float:
+        near = float(round(value)) if math.isfinite(value) else value
+        if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near):
+            return near
+        self._values.append(value)
+        return Coefficient(value, len(self._values) - 1)
