@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.tracing import Form, Graph
+from twoloop.generate.tracing import Form, Graph, rounded
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
@@ -51,7 +51,7 @@ class Coefficients:
 
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
         """Terms and constant with numbers in their places."""
-        key = terms, constant
+        key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         if key not in self._known:
             self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
         return self._known[key]

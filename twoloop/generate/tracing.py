@@ -52,6 +52,7 @@ class Graph:
         self.running = False  # whether a callback runs on its quantities now ...
         self.refused = ""  # ... and why it cannot, which it may have caught
         self._known: dict[Any, int] = {}
+        self._seen: dict[Any, int] = {}  # factors, in the order in which they came: values have no part in it
 
     def refuse(self, reason: str) -> NoReturn:
         """Leave the callback that runs, and keep the reason."""
@@ -95,9 +96,16 @@ class Graph:
             if not a.terms:
                 return b.times(a.constant)
         (scale, one), (scale_too, other) = one.normalised(), other.normalised()
-        if other.place < one.place:
+        first, second = (self._seen.setdefault(each.key, len(self._seen)) for each in (one, other))
+        if second < first:
             one, other = other, one
         return self.operation(PRODUCT, one, other).times(scale * scale_too)
+
+
+def rounded(number: float) -> float:
+    """To 41 bits, 12 digits."""
+    split = 4097.0 * number
+    return split - (split - number)
 
 
 class Form:
@@ -113,13 +121,8 @@ class Form:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What equal forms have in common."""
-        return (self.constant, *sorted(self.terms.items()))
-
-    @property
-    def place(self) -> tuple[Any, ...]:
-        """Its place among others, by values of coefficients only where it has the terms of another."""
-        return tuple(sorted(self.terms)), self.key
+        """What equal forms have in common, rounding of their coefficients apart."""
+        return (rounded(self.constant), *((i, rounded(self.terms[i])) for i in sorted(self.terms)))
 
     @property
     def late(self) -> bool:
