@@ -119,13 +119,15 @@ def solve_dae(
         Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is looked at about every 0.1 s, but
         not within a step, and for a small compiled system not before a thousand steps.
     check_derivatives : bool
-        Whether C_q, C_t, gamma and tangents are compared with differences, at the first start of a system and at a few
-        states of every run, outside the time that `stats.cpu_time` counts.
+        Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
+        tangents at a few states of every run with exact derivatives, or with differences where callbacks do not run on
+        symbols; outside the time that `stats.cpu_time` counts.
     compiled : bool
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
         "DOP853" and "Adams": two to eight times as fast, after 0.4 to 7 s, which grow with the mechanism, once for
-        the same equations and parameters, as the code is kept on disk. The callbacks must not branch on t, q or v. What
-        near a singular position cannot be trusted to this code is computed without.
+        equations of the same structure, as the code is kept on disk and reads its numbers. For other parameters the
+        equations are only written down again, in hundredths of a second for a planar linkage. The callbacks must not
+        branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.
 
     Returns
     -------
