@@ -178,7 +178,12 @@ def solve_dae(
         )
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     with Interrupts() as interrupts:
-        check_start(system, t0, q0, v0, derivatives=check_derivatives)
+        system.remembered_at(
+            ("start", check_derivatives),
+            t0,
+            (q0, v0),
+            lambda: check_start(system, t0, q0, v0, derivatives=check_derivatives),
+        )
 
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t1, q0, v0)

@@ -55,3 +55,24 @@ def _factors(n_states: int, n_q: int) -> Array:
     """Between 0.5 and 1.5, of either sign: always the same."""
     random = np.random.default_rng(1)
     return random.uniform(0.5, 1.5, (n_states, n_q)) * random.choice((-1.0, 1.0), (n_states, n_q))
+
+
+class Territory:
+    """Where the states of runs of one system were, at which callbacks were compared: a box of [t, q, v]."""
+
+    def __init__(self) -> None:
+        self._runs = 0
+        self._least, self._largest = np.zeros(0), np.zeros(0)
+
+    def covers(self, states: Array) -> bool:
+        """Whether there is nothing new in a run through these states, rows; the 1st, 2nd, 4th, 8th, ... always is."""
+        self._runs += 1
+        anew = self._runs & (self._runs - 1) == 0
+        return not anew and bool((states >= self._least).all() and (states <= self._largest).all())
+
+    def add(self, states: Array) -> None:
+        """Take in the states of a run in which nothing was wrong."""
+        least, largest = states.min(axis=0), states.max(axis=0)
+        if self._least.size:
+            least, largest = np.minimum(least, self._least), np.maximum(largest, self._largest)
+        self._least, self._largest = least, largest

@@ -186,7 +186,7 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
         If its equations cannot be had.
     """
     try:
-        choice = Choice.at(system, t0, q0)
+        choice = system.remembered_at("choice", t0, (q0,), lambda: Choice.at(system, t0, q0))
         made: OwnCode = system.remembered(("code", choice), lambda: OwnCode(StraightLine(system, choice)))
         check(made.equations.traced)
     except Untraceable as error:

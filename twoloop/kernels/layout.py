@@ -1,5 +1,7 @@
 """The workspace of a run, allocated once."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,6 +10,8 @@ from twoloop.kernels.algebra.elimination import index_size, values_size
 from twoloop.kernels.algebra.lapack import N_ROUTINES
 from twoloop.kernels.data.common import N_COUNTERS, N_NOTES, WORK, Work
 from twoloop.kernels.evaluation.kinks import PARTS
+
+WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin
 
 
 def make_work(
@@ -28,57 +32,66 @@ def make_work(
     n_dof = n_q - r_v if reduced else 0
     size = n_q + r_v if augmented else 0
     n_entries = (n_rows + 1) * n_q
-    everything = np.zeros(n_entries + n_q * n_q)
-
-    def integers(n: int) -> Any:
-        return np.zeros(n, dtype=np.int64)
-
-    def sets(r: int) -> list[Any]:
-        return [integers(r), integers(r), integers(n_q - r), integers(index_size(r)), np.zeros(values_size(r))]
-
-    positions = sets(r)
-    velocities = positions if n_a == 0 else sets(r_v)
-    names = ("rows", "dependent", "independent", "index", "values")
-    work = Work(
-        M=everything[n_entries:].reshape((n_q, n_q)),
-        L=np.zeros((n_q, n_q)),
-        G=everything[:n_entries].reshape((n_rows + 1, n_q)),
-        entries=everything[:n_entries],
-        augmented=everything,
-        S=np.zeros((r_v, r_v)),
-        W=np.zeros((r_v, n_q)),
-        A=np.zeros((n_dof, n_dof)),
-        MT=np.zeros((n_q, n_dof)),
-        D=np.zeros((n_q - r_v + 1, r_v)),
-        Gx=np.zeros((n_rows, n_q)),
-        G_of_S=np.full((n_rows, n_q), np.nan),
-        pattern=np.zeros((n_rows, n_q)),
-        mass_pattern=np.zeros((n_q, n_q) if augmented else (0, 0)),
-        places=integers(n_rows + 1 + n_rows * n_q),
-        Gamma_tried=np.zeros((2, n_rows)),
-        rates=np.zeros((PARTS + 1, n_rows)),
-        Q=np.zeros(n_q),
-        x=np.zeros(n_q),
-        y=np.zeros(n_q),
-        C=np.zeros(n_c),
-        Rate=np.zeros(n_rows),
-        Gamma=np.zeros(n_rows),
-        g=np.zeros(n_rows),
-        z=np.zeros(r_v),
-        lam=np.zeros(n_rows),
-        minimum=np.zeros(n_redundant * (r_v + n_redundant + 1)),
-        **dict(zip(names, positions, strict=True)),
-        **{f"{name}_v": array for name, array in zip(names, velocities, strict=True)},
-        index_a=integers(index_size(size)),
-        values_a=np.zeros(values_size(size, may_be_dense=False)),
-        right=np.zeros(2 * size),
-        order=integers(n_q),
-        row_order=integers(n_rows),
-        counters=integers(N_COUNTERS),
-        lapack=integers(N_ROUTINES),
-        predicted=np.zeros(r),
-        notes=np.zeros(N_NOTES),
-        nodes=np.zeros(n_nodes),
-    )
-    table = WORK.table(work)
+    numbers: dict[str, tuple[int, ...]] = {
+        "augmented": (n_entries + n_q * n_q,),
+        "L": (n_q, n_q),
+        "S": (r_v, r_v),
+        "W": (r_v, n_q),
+        "A": (n_dof, n_dof),
+        "MT": (n_q, n_dof),
+        "D": (n_q - r_v + 1, r_v),
+        "Gx": (n_rows, n_q),
+        "G_of_S": (n_rows, n_q),
+        "pattern": (n_rows, n_q),
+        "mass_pattern": (n_q, n_q) if augmented else (0, 0),
+        "Gamma_tried": (2, n_rows),
+        "rates": (PARTS + 1, n_rows),
+        **dict.fromkeys(("Q", "x", "y"), (n_q,)),
+        "C": (n_c,),
+        **dict.fromkeys(("Rate", "Gamma", "g", "lam"), (n_rows,)),
+        "z": (r_v,),
+        "minimum": (n_redundant * (r_v + n_redundant + 1),),
+        "values": (values_size(r),),
+        "values_v": (values_size(r_v),),
+        "values_a": (values_size(size, may_be_dense=False),),
+        "right": (2 * size,),
+        "predicted": (r,),
+        "notes": (N_NOTES,),
+        "nodes": (n_nodes,),
+    }
+    integers: dict[str, tuple[int, ...]] = {
+        "places": (n_rows + 1 + n_rows * n_q,),
+        **{"rows": (r,), "dependent": (r,), "independent": (n_q - r,), "index": (index_size(r),)},
+        **{"rows_v": (r_v,), "dependent_v": (r_v,), "independent_v": (n_q - r_v,), "index_v": (index_size(r_v),)},
+        "index_a": (index_size(size),),
+        "order": (n_q,),
+        "row_order": (n_rows,),
+        "counters": (N_COUNTERS,),
+        "lapack": (N_ROUTINES,),
+    }
+    arrays, addresses = _allocated(numbers, np.float64)
+    of_integers, more = _allocated(integers, np.int64)
+    arrays, addresses = arrays | of_integers, addresses | more
+    everything, begin = arrays["augmented"], addresses["augmented"]
+    arrays["entries"], arrays["G"] = everything[:n_entries], everything[:n_entries].reshape((n_rows + 1, n_q))
+    arrays["M"] = everything[n_entries:].reshape((n_q, n_q))
+    addresses |= {"entries": begin, "G": begin, "M": begin + WORD * n_entries}
+    if n_a == 0:
+        for name in ("rows", "dependent", "independent", "index", "values"):
+            arrays[f"{name}_v"], addresses[f"{name}_v"] = arrays[name], addresses[name]
+    arrays["G_of_S"][:] = np.nan
+    work = Work(**arrays)
+    table = WORK.table(work, addresses)
     return work._replace(table=table, address=table.ctypes.data)
+
+
+def _allocated(shapes: Mapping[str, tuple[int, ...]], dtype: type) -> tuple[dict[str, Any], dict[str, int]]:
+    """Arrays of zeros in one piece of memory, and their addresses: NumPy takes a microsecond to tell that of one."""
+    sizes = {name: math.prod(shape) for name, shape in shapes.items()}
+    everything: Any = np.zeros(sum(-(-size // LINE) * LINE for size in sizes.values()), dtype=dtype)
+    place, begin = 0, everything.ctypes.data
+    arrays, addresses = {}, {}
+    for name, size in sizes.items():
+        arrays[name], addresses[name] = everything[place : place + size].reshape(shapes[name]), begin + WORD * place
+        place += -(-size // LINE) * LINE
+    return arrays, addresses

@@ -26,7 +26,14 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    flags = system.functions.flags.copy()
+    given = ("flags", system.functions.flags.tobytes())
+    flags = system.remembered_at(given, t0, (q0,), lambda: _flags(system, t0, q0)).copy()
+    functions = system.functions._replace(flags=flags)
+    return common.Kit(functions, inner_loop) if plan is None else kit_with(functions, plan)
+
+
+def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+    flags: Array = system.functions.flags.copy()
     mass = system.mass(t0, q0)
     if system.constant_mass:
         flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
@@ -40,8 +47,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     sparse = sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
-    functions = system.functions._replace(flags=flags)
-    return common.Kit(functions, inner_loop) if plan is None else kit_with(functions, plan)
+    return flags
 
 
 def kit_with(functions: Any, plan: Plan) -> common.Kit:
