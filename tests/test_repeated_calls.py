@@ -8,7 +8,7 @@ import pytest
 
 from tests.problems import pendulum
 from twoloop import mechanisms, solve_dae
-from twoloop.generate.exact_derivatives import exact_derivatives, generic_states
+from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.methods.plans_for import MOST
 
 MANY = 4000  # calls of functions; 2400 of the default
@@ -73,3 +73,49 @@ def test_an_error_that_is_nothing_at_the_start_is_seen_later(kind):
     assert f"{kind} of" in exact.wrong(system, generic_states([STATE]))
     result = solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.0, 0.0], rtol=1e-6, atol=1e-6)
     assert result.status.name == "WRONG_DERIVATIVE" and f"{kind} of" in result.message
+
+
+def test_a_run_that_goes_where_none_was_is_compared_there():
+    """A gamma that is wrong from 1 s on, which has no kink that could be seen before."""
+
+    def gamma(t, q, v):
+        return np.array([-(v[0] * v[0] + v[1] * v[1]) * (1.0 + 1e-5 * max(t - 1.0, 0.0) ** 3)])
+
+    def end(t1):
+        return solve_dae(system, (0.0, t1), [0.6, -0.8], [0.0, 0.0], "DOP853", 1e-8, 1e-8).status.name
+
+    system = pendulum(compile=True, gamma=gamma)
+    assert [end(0.9) for _ in range(4)] == ["REACHED_END"] * 4
+    assert end(4.0) == "WRONG_DERIVATIVE"
+    assert end(4.0) == "WRONG_DERIVATIVE"  # what was wrong is not taken in
+
+
+def test_the_box_of_a_session():
+    near, far = np.array([[0.0, 1.0], [1.0, 2.0]]), np.array([[0.5, 3.0]])
+    territory = Territory()
+    looked = []
+    for _ in range(9):
+        looked.append(not territory.covers(near))
+        territory.add(near)
+    assert [k + 1 for k, anew in enumerate(looked) if anew] == [1, 2, 4, 8]
+    assert not territory.covers(far)
+    territory.add(far)
+    assert territory.covers(np.array([[0.7, 2.5]]))
+
+
+def test_only_the_start_of_the_last_call_is_known(monkeypatch):
+    looked = []
+    monkeypatch.setattr("twoloop.solve.check_start", lambda *given, **options: looked.append(1))
+    problem = mechanisms.pendulum()
+    for q0 in (problem.q0, problem.q0, -problem.q0, problem.q0):
+        solve_dae(problem.system, (0.0, 0.1), q0, problem.v0)
+    assert len(looked) == 3
+
+
+def test_a_wrong_start_is_refused_after_a_good_one_and_again():
+    problem = mechanisms.pendulum()
+    run(problem)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="q0 is not consistent"):
+            solve_dae(problem.system, (0.0, 1.0), 1.1 * problem.q0, problem.v0)
+    assert run(problem).success

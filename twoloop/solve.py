@@ -120,8 +120,8 @@ def solve_dae(
         not within a step, and for a small compiled system not before a thousand steps.
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
-        tangents at a few states of every run with exact derivatives, or with differences where callbacks do not run on
-        symbols; outside the time that `stats.cpu_time` counts.
+        tangents at a few states of runs with exact derivatives, or with differences where callbacks do not run on
+        symbols; of a system of compiled callbacks in runs that go where none has been, and the 2nd, 4th, 8th, ....
     compiled : bool
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
         "DOP853" and "Adams": two to eight times as fast, after 0.4 to 7 s, which grow with the mechanism, once for
