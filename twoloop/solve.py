@@ -192,7 +192,8 @@ def solve_dae(
         system, derived = standing_for(given, check)
         code = own_code(system, t0, q0, check) if compiled else None
         plan, interiors = plans_for(system, chosen, float(rtol), float(atol.min()), step_size is not None, code, check)
-        plan = replace(plan, traced=(*plan.traced, *derived))
+        if derived:
+            plan = replace(plan, traced=(*plan.traced, *derived))
         run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
         if step_size is None:
             run.set_sizes(first_step, float(max_step), t1)

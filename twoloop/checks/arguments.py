@@ -1,5 +1,6 @@
 """Checks of what a user gives: each says which argument is wrong, what was given, what was expected, what to do."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+FAR = 1e300  # s: times that need no closer look whether they are finite
 NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
 HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}  # by NumPy's kind
 SHOWN = 120  # characters of what was given, in a message
@@ -116,9 +118,9 @@ def check_indices(name: str, value: Any, n: int) -> list[int]:
 
 def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     """Return start and end, or say what is wrong with them."""
-    span = check_vector("t_span", t_span, 2)
-    t0, t1 = float(span[0]), float(span[1])
-    if not t1 - t0 > NEAR * np.spacing(max(abs(t0), abs(t1))):
+    usual = type(t_span) is tuple and len(t_span) == 2 and all(type(t) in (int, float) and abs(t) < FAR for t in t_span)
+    t0, t1 = map(float, t_span) if usual else check_vector("t_span", t_span, 2).tolist()
+    if not t1 - t0 > NEAR * math.ulp(max(abs(t0), abs(t1))):
         raise ValueError(f"t_span must be (start, end) with end > start; given ({t0!r}, {t1!r})")
     return t0, t1
 

@@ -164,7 +164,9 @@ class Sample:
     def add(self, t: Array, rows: Array) -> None:
         """Take some of the states [q, v, ...] of a part of the run."""
         stride = 1 + len(t) // EACH
-        self.states.append(np.column_stack([t[::stride], rows[::stride, : self.n]]))
+        states = np.empty((-(-len(t) // stride), 1 + self.n))
+        states[:, 0], states[:, 1:] = t[::stride], rows[::stride, : self.n]
+        self.states.append(states)
         if len(self.states) > MOST:
             self.states = self.states[::2]
 

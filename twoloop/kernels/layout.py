@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.elimination import index_size, values_size
 from twoloop.kernels.algebra.lapack import N_ROUTINES
@@ -12,6 +14,25 @@ from twoloop.kernels.data.common import N_COUNTERS, N_NOTES, WORK, Work
 from twoloop.kernels.evaluation.kinks import PARTS
 
 WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin
+
+
+Places = list[tuple[str, int, int, tuple[int, ...]]]  # of arrays in a piece of memory: name, begin, end, shape
+
+
+class Layout(NamedTuple):
+    """Where the arrays of a workspace of some sizes stand, in one piece of memory for numbers and one for integers.
+
+    The table of addresses and shapes is `table` + `of_numbers` times the address of the one + `of_integers` times that
+    of the other.
+    """
+
+    numbers: Places
+    integers: Places
+    n_numbers: int
+    n_integers: int
+    table: NDArray[np.int64]
+    of_numbers: NDArray[np.int64]
+    of_integers: NDArray[np.int64]
 
 
 def make_work(
@@ -25,15 +46,26 @@ def make_work(
     n_nodes: int = 0,
 ) -> Work:
     """Allocate the workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a."""
-    n_rows = n_c + n_a
     r = min(n_c, n_q) if rank is None else rank
-    r_v = min(n_rows, n_q) if rank_v is None else rank_v
+    r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
+    layout = _layout(n_q, n_c, n_a, r, r_v, reduced, augmented, n_nodes)
+    numbers, integers = np.zeros(layout.n_numbers), np.zeros(layout.n_integers, dtype=np.int64)
+    arrays: dict[str, Any] = {name: numbers[a:b].reshape(shape) for name, a, b, shape in layout.numbers}
+    arrays |= {name: integers[a:b].reshape(shape) for name, a, b, shape in layout.integers}
+    arrays["G_of_S"][:] = np.nan
+    table = layout.table + layout.of_numbers * numbers.ctypes.data + layout.of_integers * integers.ctypes.data
+    return Work(**arrays, table=table, address=table.ctypes.data)
+
+
+@cache
+def _layout(n_q: int, n_c: int, n_a: int, r: int, r_v: int, reduced: bool, augmented: bool, n_nodes: int) -> Layout:
+    n_rows = n_c + n_a
     n_redundant = n_rows - r_v
     n_dof = n_q - r_v if reduced else 0
     size = n_q + r_v if augmented else 0
     n_entries = (n_rows + 1) * n_q
     numbers: dict[str, tuple[int, ...]] = {
-        "augmented": (n_entries + n_q * n_q,),
+        "augmented": (n_entries + n_q * n_q,),  # first: others are parts of it
         "L": (n_q, n_q),
         "S": (r_v, r_v),
         "W": (r_v, n_q),
@@ -69,29 +101,30 @@ def make_work(
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
     }
-    arrays, addresses = _allocated(numbers, np.float64)
-    of_integers, more = _allocated(integers, np.int64)
-    arrays, addresses = arrays | of_integers, addresses | more
-    everything, begin = arrays["augmented"], addresses["augmented"]
-    arrays["entries"], arrays["G"] = everything[:n_entries], everything[:n_entries].reshape((n_rows + 1, n_q))
-    arrays["M"] = everything[n_entries:].reshape((n_q, n_q))
-    addresses |= {"entries": begin, "G": begin, "M": begin + WORD * n_entries}
+    of_numbers, n_numbers = _placed(numbers)
+    of_integers, n_integers = _placed(integers)
+    of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (n_rows + 1, n_q))
+    of_numbers["M"] = n_entries, n_entries + n_q * n_q, (n_q, n_q)
     if n_a == 0:
-        for name in ("rows", "dependent", "independent", "index", "values"):
-            arrays[f"{name}_v"], addresses[f"{name}_v"] = arrays[name], addresses[name]
-    arrays["G_of_S"][:] = np.nan
-    work = Work(**arrays)
-    table = WORK.table(work, addresses)
-    return work._replace(table=table, address=table.ctypes.data)
+        of_numbers["values_v"] = of_numbers["values"]
+        for name in ("rows", "dependent", "independent", "index"):
+            of_integers[f"{name}_v"] = of_integers[name]
+    table = np.zeros(WORK.n_words, dtype=np.int64)
+    masks = np.zeros((2, WORK.n_words), dtype=np.int64)
+    for mask, places in zip(masks, (of_numbers, of_integers), strict=True):
+        for name, (begin, _, shape) in places.items():
+            word = WORK.places[name]
+            table[word], mask[word] = WORD * begin, 1
+            table[word + 1 : word + 1 + len(shape)] = shape
+    named = [[(name, *place) for name, place in places.items()] for places in (of_numbers, of_integers)]
+    return Layout(named[0], named[1], n_numbers, n_integers, table, masks[0], masks[1])
 
 
-def _allocated(shapes: Mapping[str, tuple[int, ...]], dtype: type) -> tuple[dict[str, Any], dict[str, int]]:
-    """Arrays of zeros in one piece of memory, and their addresses: NumPy takes a microsecond to tell that of one."""
-    sizes = {name: math.prod(shape) for name, shape in shapes.items()}
-    everything: Any = np.zeros(sum(-(-size // LINE) * LINE for size in sizes.values()), dtype=dtype)
-    place, begin = 0, everything.ctypes.data
-    arrays, addresses = {}, {}
-    for name, size in sizes.items():
-        arrays[name], addresses[name] = everything[place : place + size].reshape(shapes[name]), begin + WORD * place
-        place += -(-size // LINE) * LINE
-    return arrays, addresses
+def _placed(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
+    """Where arrays begin and end, each in a line of the cache of its own, and the length of all."""
+    places, end = {}, 0
+    for name, shape in shapes.items():
+        size = math.prod(shape)
+        places[name] = end, end + size, shape
+        end += -(-size // LINE) * LINE
+    return places, end

@@ -65,10 +65,8 @@ class Reference(types.Type):
         self.n_words += 1
         _define_call(self, field, signature)
 
-    def table(self, values: Any, addresses: Mapping[str, int] | None = None) -> Any:
+    def table(self, values: Any) -> Any:
         """The table, int64, for an object with arrays and functions of these names, which has to outlive it.
-
-        `addresses`: of all arrays, where they are known.
 
         Raises
         ------
@@ -80,7 +78,7 @@ class Reference(types.Type):
             array = getattr(values, field)
             if array.ndim != kind.ndim or array.dtype != self.dtypes[field] or not array.flags.c_contiguous:
                 raise TypeError(f"{field} must be a {kind}; given {array.dtype} of shape {array.shape}")
-            words.append(array.ctypes.data if addresses is None else addresses[field])
+            words.append(array.ctypes.data)
             words.extend(array.shape)
         for field, signature in self.functions.items():
             function = getattr(values, field)
