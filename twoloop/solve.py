@@ -22,6 +22,7 @@ from twoloop.checks.arguments import (
 )
 from twoloop.checks.consistency import check_start
 from twoloop.generate.derived import standing_for
+from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.traced_values import Traced
 from twoloop.methods.plan import Method
@@ -182,7 +183,9 @@ def solve_dae(
             ("start", check_derivatives),
             t0,
             (q0, v0),
-            lambda: check_start(system, t0, q0, v0, derivatives=check_derivatives),
+            lambda: check_start(
+                system, t0, q0, v0, derivatives=check_derivatives, exact=lambda: exact_near(system, t0, q0, v0)
+            ),
         )
 
         def check(traced: Traced) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -29,8 +30,18 @@ class ConstraintWarning(UserWarning):
     """Constraints of a system depend on one another: those left out are checked, and multipliers are not unique."""
 
 
-def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, derivatives: bool = True) -> None:
+def check_start(
+    system: ConstrainedSystem,
+    t0: float,
+    q0: Array,
+    v0: Array,
+    *,
+    derivatives: bool = True,
+    exact: Callable[[], bool] | None = None,
+) -> None:
     """Call every callback once at the start and check shapes, finiteness, rank, consistency and, if asked, derivatives.
+
+    `exact` says whether derivatives are those of what was traced: then they are not compared with differences.
 
     Raises
     ------
@@ -51,7 +62,7 @@ def check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, *, d
         scales = scales_of(system, t0, q0, jacobian)
         Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")
     if derivatives:
-        check_derivatives(system, t0, q0)
+        check_derivatives(system, t0, q0, exact)
     empty = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) == 0.0).tolist()
     if empty:
         raise ValueError(

@@ -14,6 +14,8 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 MOST = 50_000  # entries of C_q
+NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
+TIME = 0.1  # s
 LEAST = 1e-3  # of the largest coordinate, that another counts as in its velocity
 
 
@@ -38,6 +40,19 @@ def _made(system: ConstrainedSystem) -> Traced | None:
     except Untraceable:
         return None
     return Traced(system, equations.graph, forms)
+
+
+def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+    """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to."""
+    made = exact_derivatives(system)
+    if made is None:
+        return False
+    places = [(t + share * TIME, q + share * _factors(1, len(q))[0] * np.maximum(np.abs(q), 1.0)) for share in NEAR]
+    try:
+        with np.errstate(all="ignore"):
+            return made.wrong(system, generic_states([(*place, v) for place in places])) is None
+    except Exception:  # outside what the callbacks are made for
+        return False
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
