@@ -63,3 +63,9 @@ def test_sentences_turn_with_the_rows():
     assert "All are caught" in text(rows)
     rows.loc[1, "caught_by"] = planted_errors.NONE
     assert "2 are caught; no check of those run catches: fault 1." in text(rows)
+
+
+def test_every_run_with_a_fault_has_a_bound_of_its_evaluations():
+    runs = [(fault.problem.name, fault.solver) for fault in all_faults() if fault.problem is not None]
+    assert runs
+    assert [run for run in runs if run[1] not in planted_errors.MOST_EVALUATIONS.get(run[0], {})] == []
