@@ -207,7 +207,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
         "first_calls": first_calls.findings_of(part(rows, first_calls.GROUP)),
     }
     in_angles = part(rows, minimal.GROUP)
-    findings["mixed"] = mixed(part(rows, rivals.GROUP))
+    findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
     findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
@@ -216,23 +216,6 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
-
-
-def mixed(rows: pd.DataFrame) -> dict[str, Any]:
-    """Of how many settings of ours and of rivals the repetitions are means of different numbers of calls, of all.
-
-    factor: what one call alone takes over the mean of several, the median over such settings of ours.
-    """
-    rows = rows[rows["call_s"].notna()]
-    ours = rows[rows["family"] == "two-loop"]
-    sides = ours[ours["calls"] == 1], ours[ours["calls"] > 1]
-    alone, several = (side.groupby(SETTING, dropna=False)["call_s"].median() for side in sides)
-    found: dict[str, Any] = {"factor": float((alone / several).median())}
-    for whose, own in (("ours", rows["family"] == "two-loop"), ("others", rows["family"] != "two-loop")):
-        numbers = rows[own].groupby(SETTING, dropna=False)["calls"].agg(["nunique", "size"])
-        repeated = numbers[numbers["size"] > 1]
-        found[whose] = [int((repeated["nunique"] > 1).sum()), len(repeated)]
-    return found
 
 
 def asked(rows: pd.DataFrame) -> dict[str, Any]:
