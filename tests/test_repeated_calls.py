@@ -2,6 +2,7 @@
 
 import cProfile
 import pstats
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,12 @@ import pytest
 from tests.problems import pendulum
 from twoloop import mechanisms, solve_dae
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
-from twoloop.methods.plans_for import MOST
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.straight_line import Choice, StraightLine
+from twoloop.generate.traced_values import unchecked
+from twoloop.methods.plans_for import MOST, plans_for
+from twoloop.methods.presets import PRESETS
+from twoloop.run.run import Run
 
 MANY = 4000  # calls of functions; 2400 of the default
 
@@ -119,3 +125,25 @@ def test_a_wrong_start_is_refused_after_a_good_one_and_again():
         with pytest.raises(ValueError, match="q0 is not consistent"):
             solve_dae(problem.system, (0.0, 1.0), 1.1 * problem.q0, problem.v0)
     assert run(problem).success
+
+
+def test_a_plan_is_that_of_the_choice_of_its_code():
+    """Codes of two choices may have one structure, and differ in the numbers that they read."""
+    problem = mechanisms.four_bar()
+    choice = Choice.at(problem.system, 0.0, problem.q0)
+    numbers = []
+    for each in (choice, replace(choice, least=10.0 * choice.least), choice):
+        code = OwnCode(StraightLine(problem.system, each))
+        code.equations.traced.trusted = True
+        plan, _ = plans_for(problem.system, PRESETS["DOP853"], 1e-6, 1e-6, False, code, unchecked)
+        numbers.append(plan.numbers)
+    assert np.array_equal(numbers[0], numbers[2]) and not np.array_equal(numbers[0], numbers[1])
+
+
+def test_what_a_method_was_traced_to_is_compared_in_its_first_run(monkeypatch):
+    compared, look = [], Run._check_traces
+    monkeypatch.setattr(Run, "_check_traces", lambda self, *given: compared.append(1) or look(self, *given))
+    problem = mechanisms.four_bar()
+    for method in ("DOP853", "DOP853", "DOP853", "auto", "auto", "auto"):
+        run(problem, method=method)
+    assert len(compared) == 4

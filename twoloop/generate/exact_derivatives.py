@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.scales import sizes
 from twoloop.generate.traced_equations import OF_ROWS, Equations
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Untraceable
@@ -16,7 +17,6 @@ Array = NDArray[np.float64]
 MOST = 50_000  # entries of C_q
 NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
 TIME = 0.1  # s
-LEAST = 1e-3  # of the largest coordinate, that another counts as in its velocity
 
 
 def exact_derivatives(system: ConstrainedSystem) -> Traced | None:
@@ -47,7 +47,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     made = exact_derivatives(system)
     if made is None:
         return False
-    places = [(t + share * TIME, q + share * _factors(1, len(q))[0] * np.maximum(np.abs(q), 1.0)) for share in NEAR]
+    places = [(t + share * TIME, q + share * _factors(1, len(q))[0] * sizes(q)) for share in NEAR]
     try:
         with np.errstate(all="ignore"):
             return made.wrong(system, generic_states([(*place, v) for place in places])) is None
@@ -58,9 +58,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
     """Rows [t, q, v] of states (t, q, v), with velocities in which each coordinate matters and as fast as these."""
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
-    size = np.abs(positions)
-    largest = size.max(axis=1, keepdims=True)
-    generic = np.maximum(size, np.where(largest > 0.0, LEAST * largest, 1.0)) * _factors(*size.shape)
+    generic = np.array([sizes(q) for q in positions]) * _factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))
     return np.column_stack([times, positions, speed * generic])
 

@@ -24,7 +24,7 @@ def plans_for(
     ValueError
         If the method cannot run the system, or does not go with code made for it.
     """
-    key = (id(method), rtol, atol, fixed, None if code is None else code.digest)
+    key = (id(method), rtol, atol, fixed, None if code is None else code.equations.choice)
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
     made = kept.get(key)
     if made is None:

@@ -509,7 +509,8 @@ class Run:
         Compiled ones are not compared again where they were: see Territory.
         """
         states = sample.up_to(last[0])
-        territory = self.system.remembered(("territory", check_derivatives), Territory)
+        compared = (check_derivatives, *map(id, self.traced))  # the system keeps these
+        territory = self.system.remembered(("territory", compared), Territory)
         if territory.covers(states) and not self.system.called_in_python:
             return status, message
         before = status
