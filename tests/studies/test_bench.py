@@ -78,6 +78,21 @@ def test_a_short_run_is_called_several_times_more(kept, timed, calls):
     assert row(kept, ours, case(timed=timed))["calls"] == calls
 
 
+def test_the_first_call_of_a_setting_is_made_again_where_it_may_hold_a_build(kept):
+    counted = []
+
+    def building(case, value, repeat):
+        if case.t_end == T_END:  # not the warm-up
+            counted.append(repeat)
+            spend(0.3 if len(counted) == 1 else 0.01)
+        return ours(case, value, repeat)
+
+    with kept:
+        rows = collect([Run(case(timed=0.1), solver(building), 1e-6, repeats=2)], kept)
+    assert counted == [0, 0, 0, 0, 0, 1, 1, 1, 1]  # the build, the call that says how long one takes, and three; ...
+    assert (rows["call_s"] < 0.3).all() and (rows["calls"] == 3).all()
+
+
 def not_installed():
     error = RuntimeError("foreign is not installed: pip install foreign")
     error.__context__ = ImportError("No module named 'foreign'")
