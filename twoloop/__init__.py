@@ -1,6 +1,8 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0."""
 
 from twoloop.checks.consistency import ConstraintWarning
+from twoloop.ensembles.ensemble import ensemble
+from twoloop.ensembles.runs import Runs
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.methods.bdf import BDF
 from twoloop.methods.dop853 import DOP853
@@ -37,12 +39,14 @@ __all__ = [
     "Newmark",
     "Result",
     "RungeKutta",
+    "Runs",
     "Statistics",
     "Status",
     "Taylor",
     "callback",
     "citation",
     "consistent_state",
+    "ensemble",
     "load",
     "paper_irk",
     "paper_newmark",

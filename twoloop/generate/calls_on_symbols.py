@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.bounds import Rewritten, place_of
+from twoloop.generate.known_numbers import Known, applied, number
 from twoloop.generate.tracing import FUNCTIONS, OPERATORS, Form, Graph, Refusal, Untraceable, operand
 from twoloop.kernels.compile.caches import of_library
 from twoloop.kernels.compile.private import Dispatcher
@@ -67,7 +68,7 @@ def as_forms(graph: Graph, made: Any) -> Any:
         entry = made[place]
         if type(entry) is not Form:
             try:
-                made[place] = Form(graph, float(entry), {})
+                made[place] = Form(graph, number(entry), {})
             except Exception as error:
                 raise Untraceable(f"on symbols its entry {place} is {entry!r}, which is not a number") from error
         elif entry.graph is not graph:
@@ -124,6 +125,13 @@ def _symbol_in(value: Any) -> Form | None:
     return None
 
 
+def _remembers(value: Any) -> bool:
+    """Whether a number, an array or a list of these holds a number that knows its parameters."""
+    if isinstance(value, np.ndarray):
+        value = value.ravel().tolist() if value.dtype == object else ()
+    return any(map(_remembers, value)) if isinstance(value, list | tuple) else type(value) is Known
+
+
 def _refuse(value: Any, does: str) -> None:
     symbol = _symbol_in(value)
     if symbol is not None:
@@ -146,7 +154,8 @@ def _either(known: Any, own: Callable[..., Any]) -> Callable[..., Any]:
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
-            return known(*arguments)
+            remembers = any(type(x) is Known for x in arguments)
+            return applied(known.__name__, *arguments) if remembers else known(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Form):
             return np.frompyfunc(function, len(arguments), 1)(*map(operand, arguments))
         return own(*arguments)
@@ -173,7 +182,7 @@ def _conversion(known: Any) -> Callable[..., Any]:
     """`array` and its kin."""
 
     def function(value: Any, dtype: Any = None, **options: Any) -> Any:
-        if _symbol_in(value) is None:
+        if _symbol_in(value) is None and not _remembers(value):
             return known(value, dtype, **options)
         if not _is_real(dtype):
             _refuse(value, f"makes {np.dtype(dtype).name} of")
@@ -183,7 +192,11 @@ def _conversion(known: Any) -> Callable[..., Any]:
 
 
 def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
-    if _symbol_in(value) is None and not (_is_real(dtype) and np.asarray(value).dtype == np.float64):
+    if (
+        _symbol_in(value) is None
+        and not _remembers(value)
+        and not (_is_real(dtype) and np.asarray(value).dtype == np.float64)
+    ):
         return np.full(shape, value, dtype)
     if not _is_real(dtype):
         _refuse(value, f"makes {np.dtype(dtype).name} of")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.generate.known_numbers import Known, Powers, Record
 from twoloop.generate.tracing import Form, Graph, rounded
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
@@ -16,15 +17,19 @@ ROUNDING = 8.0 * 2.0**-52
 
 
 class Coefficient(float):
-    """A coefficient that stands at a place in memory; equal to no other, whatever their values are."""
+    """A coefficient that stands at a place in memory; equal to no other, whatever their values are.
 
-    __slots__ = ("place",)
+    Those that vary with parameters stand in a place of their own.
+    """
+
+    __slots__ = ("place", "varies")
     place: int
+    varies: bool
 
-    def __new__(cls, value: float, place: int) -> "Coefficient":
+    def __new__(cls, value: float, place: int, varies: bool = False) -> "Coefficient":
         """A number for a place."""
         made = super().__new__(cls, value)
-        made.place = place
+        made.place, made.varies = place, varies
         return made
 
     def __eq__(self, other: object) -> bool:
@@ -34,7 +39,7 @@ class Coefficient(float):
         return id(self)
 
     def __repr__(self) -> str:
-        return f"number {self.place}"
+        return f"{'varying' if self.varies else 'number'} {self.place}"
 
 
 class Coefficients:
@@ -42,6 +47,7 @@ class Coefficients:
 
     def __init__(self) -> None:
         self._values: list[float] = []
+        self._varying: dict[tuple[float, Powers], Known] = {}
         self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
 
     @property
@@ -75,7 +81,20 @@ class Coefficients:
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
             yield kind, [told(each) for each in arguments if isinstance(each, Form)]
 
+    @property
+    def n_varying(self) -> int:
+        """How many vary with parameters."""
+        return len(self._varying)
+
+    def for_parameters(self, record: Record, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Those that vary, for parameters (n_runs, n_p), a row a run."""
+        return record.evaluate(list(self._varying.values()), parameters)
+
     def _number(self, value: float) -> float:
+        if type(value) is Known:
+            made_of = value.scale, value.powers
+            self._varying.setdefault(made_of, value)
+            return Coefficient(value, list(self._varying).index(made_of), varies=True)
         near = float(round(value)) if math.isfinite(value) else value
         if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near):
             return near

@@ -36,13 +36,25 @@ class Emitter:
     that the code reads.
     """
 
+    double: ir.Type = DOUBLE
+    integer: ir.Type = INTEGER
+    bit: ir.Type = ir.IntType(1)
+
     def __init__(self, builder: ir.IRBuilder, numbers: Value = None):
         self.builder, self.numbers = builder, numbers
+
+    def constant(self, value: float) -> Value:
+        """A number that stands in the code."""
+        return self.double(value)
+
+    def whole(self, value: int) -> Value:
+        """An integer that stands in the code, of those that go with numbers."""
+        return self.integer(value)
 
     def known(self, number: float) -> Value:
         """A number that is known, or read, which never changes."""
         if not isinstance(number, Coefficient):
-            return DOUBLE(number)
+            return self.constant(number)
         value = self.load(self.numbers, number.place)
         value.set_metadata("invariant.load", self.builder.module.add_metadata([]))
         return value
@@ -62,6 +74,10 @@ class Emitter:
     def divide(self, a: Value, b: Value) -> Value:
         """a / b."""
         return self.builder.fdiv(a, b, flags=FLAGS)
+
+    def fused(self, a: Value, b: Value, c: Value) -> Value:
+        """a b + c, rounded once."""
+        return self.builder.fma(a, b, c)
 
     def negative(self, a: Value) -> Value:
         """-a."""
@@ -203,7 +219,7 @@ class Quantities:
         return self._sums[key]
 
 
-def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
+def emitted(emit: Callable[..., Any], result: Any, emitter: Callable[..., Emitter] = Emitter, **arguments: Any) -> Any:
     """What numba takes for a function, whose code is written by emit(emitter, *arguments), `numbers` apart.
 
     Parameters
@@ -212,6 +228,7 @@ def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
         Gets vectors as pointers to their first elements; returns the result, None for `types.none`. Numba keeps what
         this returns for ever, so that it holds the method's object weakly: it must live until it is compiled.
     result : numba type
+    emitter : callable
     **arguments : numba types
         Under their names.
     """
@@ -224,7 +241,7 @@ def emitted(emit: Callable[..., Any], result: Any, **arguments: Any) -> Any:
                 for kind, value in zip(sig.args, values, strict=True)
             ]
             given = dict(zip(arguments, plain, strict=True))
-            made = written_by()(Emitter(builder, given.pop("numbers", None)), *given.values())  # type: ignore[misc]
+            made = written_by()(emitter(builder, given.pop("numbers", None)), *given.values())  # type: ignore[misc]
             return context.get_dummy_value() if made is None else made
 
         return signature(result, *arguments.values()), generate

@@ -1,8 +1,6 @@
 """Sine and cosine as LLVM code without a call, so that those of several angles are computed side by side."""
 
-from llvmlite import ir
-
-from twoloop.generate.llvm_code import DOUBLE, INTEGER, Emitter, Value
+from twoloop.generate.llvm_code import Emitter, Value
 
 # sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
 # sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
@@ -28,27 +26,27 @@ COSINES = (
 
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     """Both, right to rounding for angles up to LARGEST_ANGLE."""
-    builder = emit.builder
-    turns = emit.function("rint", builder.fmul(x, DOUBLE(1.0 / HALF_PI[0])))
+    builder, whole = emit.builder, emit.whole
+    turns = emit.function("rint", builder.fmul(x, emit.constant(1.0 / HALF_PI[0])))
     rest = x
     for part in HALF_PI:
-        rest = builder.fma(turns, DOUBLE(-part), rest)
+        rest = emit.fused(turns, emit.constant(-part), rest)
     square = builder.fmul(rest, rest)
-    sine = builder.fma(builder.fmul(square, rest), _polynomial(emit, square, SINES), rest)
-    cosine = builder.fma(square, DOUBLE(-0.5), DOUBLE(1.0))
-    cosine = builder.fma(builder.fmul(square, square), _polynomial(emit, square, COSINES), cosine)
-    quarter = builder.fptosi(turns, INTEGER)
-    odd, following = builder.trunc(quarter, ir.IntType(1)), builder.add(quarter, INTEGER(1))
+    sine = emit.fused(builder.fmul(square, rest), _polynomial(emit, square, SINES), rest)
+    cosine = emit.fused(square, emit.constant(-0.5), emit.constant(1.0))
+    cosine = emit.fused(builder.fmul(square, square), _polynomial(emit, square, COSINES), cosine)
+    quarter = builder.fptosi(turns, emit.integer)
+    odd, following = builder.trunc(quarter, emit.bit), builder.add(quarter, whole(1))
     made = []
     for one, other, number in ((cosine, sine, quarter), (sine, cosine, following)):
-        sign = builder.shl(builder.and_(number, INTEGER(2)), INTEGER(62))
-        bits = builder.bitcast(builder.select(odd, one, other), INTEGER)
-        made.append(builder.bitcast(builder.xor(bits, sign), DOUBLE))
+        sign = builder.shl(builder.and_(number, whole(2)), whole(62))
+        bits = builder.bitcast(builder.select(odd, one, other), emit.integer)
+        made.append(builder.bitcast(builder.xor(bits, sign), emit.double))
     return made[0], made[1]
 
 
 def _polynomial(emit: Emitter, x: Value, coefficients: tuple[float, ...]) -> Value:
-    total: Value = DOUBLE(coefficients[-1])
+    total: Value = emit.constant(coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
-        total = emit.builder.fma(total, x, DOUBLE(coefficient))
+        total = emit.fused(total, x, emit.constant(coefficient))
     return total

@@ -5,13 +5,14 @@ quantities that depend on time and coordinates ("early"); Q may depend on veloci
 G^T lam + M a are written as few products: terms that share a factor are one product.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.generate.known_numbers import Known
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
@@ -94,7 +95,7 @@ class SeriesProgram:
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
 
 
-def series_program(system: ConstrainedSystem) -> SeriesProgram:
+def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesProgram:
     """The program of a system, of callbacks that do not branch on t, q or v.
 
     Raises
@@ -102,7 +103,7 @@ def series_program(system: ConstrainedSystem) -> SeriesProgram:
     Untraceable
         Naming the callback, and why its equations cannot be had.
     """
-    equations, n, n_rows = Equations(system), system.n_q, system.n_c + system.n_a
+    equations, n, n_rows = Equations(system, parameters), system.n_q, system.n_c + system.n_a
     graph, v = equations.graph, equations.v
     a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
     mass, force = equations.of("mass"), equations.of("force")
@@ -242,9 +243,15 @@ def _sums(forms: list[Form], place: dict[int, int]) -> Sums:
     more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
     return Sums(
         np.array([each[0][0] for each in terms], dtype=np.int64),
-        np.array([each[0][1] for each in terms], dtype=float),
-        np.array([form.constant for form in forms], dtype=float),
+        _numbers(each[0][1] for each in terms),
+        _numbers(form.constant for form in forms),
         np.array([each[0] for each in more], dtype=np.int64),
         np.array([each[1] for each in more], dtype=np.int64),
-        np.array([each[2] for each in more], dtype=float),
+        _numbers(each[2] for each in more),
     )
+
+
+def _numbers(values: Iterable[float]) -> Array:
+    """An array of floats, or of objects where some know their parameters."""
+    values = list(values)
+    return np.array(values, dtype=object if any(type(each) is Known for each in values) else float)

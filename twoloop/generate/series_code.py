@@ -10,7 +10,7 @@ put together in registers, and the newest coefficients come last in the sums.
 
 import hashlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -376,8 +376,9 @@ def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Di
     n, n_rows, n_kept = code.n, code.n_rows, solution.n_kept
     keep = function_of(own.equations.graph, solution.kept, own.numbers)
     solve = function_of(solution.graph, solution.solved, code.numbers)
-    arrays, times = {"scratch": VECTOR, "series": VECTOR}, {"t": f8, "unit": f8}
-    known = {"numbers": VECTOR}
+    arrays: dict[str, Any] = {"scratch": VECTOR, "series": VECTOR}
+    times: dict[str, Any] = {"t": f8, "unit": f8}
+    known: dict[str, Any] = {"numbers": VECTOR}
     begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **times, state=VECTOR, **known)
     find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **times, order=i8, **known)
     take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8, **known)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate import coefficients, llvm_code, llvm_trigonometry, straight_line
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import DOUBLE, ONE, ZERO, Emitter, Quantities, Value
+from twoloop.generate.llvm_code import Emitter, Quantities, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Choice, Outputs, StraightLine
 from twoloop.generate.traced_values import Check, unchecked
@@ -72,7 +72,7 @@ class Written:
         elif kind == SUM:
             value = x
         elif kind == RECIPROCAL:
-            value = emit.divide(ONE, x)
+            value = emit.divide(emit.constant(1.0), x)
         elif kind in (SINE, COSINE):
             if first.key not in self._pairs:
                 self.angles.append(x)
@@ -99,12 +99,13 @@ def results_of(
 
 def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: Sequence[Value]) -> Value:
     """Whether what was written holds: its conditions, angles that are not too large, and values that are finite."""
-    builder, total = emit.builder, ZERO
+    builder, zero = emit.builder, emit.constant(0.0)
+    total = zero
     for value in values:  # what is not finite becomes NaN
-        total = emit.add(total, emit.multiply(value, ZERO))
-    holds = builder.fcmp_ordered("==", total, ZERO)
+        total = emit.add(total, emit.multiply(value, zero))
+    holds = builder.fcmp_ordered("==", total, zero)
     pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
-    pairs += [(DOUBLE(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
+    pairs += [(emit.constant(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
     for one, other in pairs:
         holds = builder.and_(holds, builder.fcmp_ordered(">", one, other))
     return holds

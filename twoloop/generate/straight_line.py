@@ -183,6 +183,8 @@ class StraightLine:
     system : ConstrainedSystem
     choice : Choice
         What numbers decide.
+    parameters : array of float or Known, optional
+        In the place of its own.
 
     Attributes
     ----------
@@ -206,8 +208,8 @@ class StraightLine:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: "Choice"):
-        self.equations = Equations(system)
+    def __init__(self, system: ConstrainedSystem, choice: "Choice", parameters: Any = None):
+        self.equations = Equations(system, parameters)
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing = Form(self.graph, 0.0, {})
         n, n_a, (self.q, self.v) = system.n_q, system.n_a, (self.equations.q, self.equations.v)

@@ -23,6 +23,8 @@ class Equations:
     Parameters
     ----------
     system : ConstrainedSystem
+    parameters : array of float or Known, optional
+        In the place of its own.
 
     Attributes
     ----------
@@ -32,8 +34,9 @@ class Equations:
     q, v : list of Form (n_q,)
     """
 
-    def __init__(self, system: ConstrainedSystem):
+    def __init__(self, system: ConstrainedSystem, parameters: Any = None):
         self.system, self.graph = system, Graph()
+        self.parameters = system.parameters if parameters is None else parameters
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._made: dict[str, Any] = {}
@@ -66,14 +69,14 @@ class Equations:
 
     def _traced(self, kind: str, v: Sequence[Form]) -> Any:
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
-        out, shape, p = out.astype(object), out.shape, system.parameters.copy()
+        out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
         if out.size:
             try:
                 if not system.called_in_python:
                     trace(getattr(system.functions, kind), self.t, *arrays, p, out)
                 elif kind in system.python_functions:
-                    function, more = system.python_functions[kind], system.parameters_for(kind)
+                    function, more = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
                     out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
                 out = as_forms(graph, out)
                 if out.shape != shape:

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from twoloop.generate.known_numbers import function_of_number, number
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -26,6 +27,9 @@ from twoloop.kernels.evaluation.operations import (
 # the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
 CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding has left of two that cancel, which depends on their values
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
+
+# of numbers
+SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
@@ -102,10 +106,11 @@ class Graph:
         return self.operation(PRODUCT, one, other).times(scale * scale_too)
 
 
-def rounded(number: float) -> float:
+def rounded(value: float) -> float:
     """To 41 bits, 12 digits."""
-    split = 4097.0 * number
-    return split - (split - number)
+    value = float(value)
+    split = 4097.0 * value
+    return split - (split - value)
 
 
 class Form:
@@ -142,7 +147,7 @@ class Form:
 
     def _other(self, other: Any) -> "Form":
         if type(other) is not Form:
-            return Form(self.graph, float(other), {})
+            return Form(self.graph, number(other), {})
         if other.graph is not self.graph:
             graph = self.graph if self.graph.running else other.graph
             graph.refuse("it uses t, q or v of another call, which it has kept")
@@ -196,7 +201,7 @@ class Form:
             return _each(base, lambda x: x**self)
         if base <= 0.0:
             self.graph.refuse(f"it raises {base!r} to a power that depends on t, q or v")
-        return (self * math.log(base)).exponential()
+        return (self * LOG(base)).exponential()
 
     def __pow__(self, exponent: Any) -> Any:
         if type(exponent) is not Form and isinstance(exponent, np.ndarray):
@@ -231,21 +236,21 @@ class Form:
 
     def square_root(self) -> "Form":
         """The square root."""
-        return self._function(SQUARE_ROOT, math.sqrt)
+        return self._function(SQUARE_ROOT, ROOT)
 
     def exponential(self) -> "Form":
         """exp x."""
-        return self._function(EXPONENTIAL, math.exp)
+        return self._function(EXPONENTIAL, EXP)
 
     def sine(self) -> "Form":
         """sin x; sine and cosine are made together, as each needs the other."""
-        self._function(COSINE, math.cos)
-        return self._function(SINE, math.sin)
+        self._function(COSINE, COS)
+        return self._function(SINE, SIN)
 
     def cosine(self) -> "Form":
         """cos x."""
-        self._function(SINE, math.sin)
-        return self._function(COSINE, math.cos)
+        self._function(SINE, SIN)
+        return self._function(COSINE, COS)
 
     def value(self) -> "Form":
         """The same as a multiple of one quantity, or as a number."""
@@ -257,13 +262,13 @@ class Form:
     def logarithm(self) -> "Form":
         """log x, whose derivative is x' / x."""
         if not self.terms:
-            return Form(self.graph, math.log(self.constant), {})
+            return Form(self.graph, LOG(self.constant), {})
         return self.graph.operation(LOGARITHM, self, self)
 
     def arctangent(self) -> "Form":
         """atan x, whose derivative is x' / (1 + x^2)."""
         if not self.terms:
-            return Form(self.graph, math.atan(self.constant), {})
+            return Form(self.graph, ATAN(self.constant), {})
         return self.graph.operation(ARCTANGENT, self, self * self + 1.0)
 
     def _branches(self, *_: Any) -> Any:

@@ -26,6 +26,15 @@ FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states
 PADDED = 8  # operations of a table are a multiple of this
 
 
+def compiled_order(rtol: float, atol: float) -> int:
+    """The order that tolerances ask for of code made for a mechanism."""
+    return _order(rtol, atol, LEAST_COMPILED, PER_DIGIT_COMPILED)
+
+
+def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
+    return math.ceil(least + per_digit * max(-math.log10(least_tolerance(rtol, atol)), 0.0))
+
+
 @dataclass(frozen=True)
 class Taylor:
     """The Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
@@ -99,10 +108,10 @@ class Taylor:
         if program is None:
             raise ValueError("Taylor() knows no system yet: take for_system(system), as solve_dae does")
         order = self.order
-        if order is None:
-            digits = -math.log10(least_tolerance(rtol, atol))
-            least, per_digit = (LEAST, PER_DIGIT) if self.code is None else (LEAST_COMPILED, PER_DIGIT_COMPILED)
-            order = FIXED if fixed else math.ceil(least + per_digit * max(digits, 0.0))
+        if order is None and fixed:
+            order = FIXED
+        elif order is None:
+            order = compiled_order(rtol, atol) if self.code is not None else _order(rtol, atol, LEAST, PER_DIGIT)
         highest = order + 1
         widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
         plan = Plan(

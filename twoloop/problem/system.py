@@ -289,7 +289,11 @@ class ConstrainedSystem:
 
     def parameters_for(self, kind: str) -> tuple[Array, ...]:
         """What a plain function of a kind takes after the state: the parameters, or nothing."""
-        return (self.parameters.copy(),) if kind in self._taking else ()
+        return (self.parameters.copy(),) if self.takes_parameters(kind) else ()
+
+    def takes_parameters(self, kind: str) -> bool:
+        """Whether a plain function of a kind takes the parameters as its last argument."""
+        return kind in self._taking
 
     @property
     def called_in_python(self) -> bool:

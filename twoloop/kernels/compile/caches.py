@@ -83,6 +83,17 @@ def compile_kept(
     return dispatcher
 
 
+def is_kept(
+    function: Callable[..., Any], signature: Any, watched: tuple[str, str], folder: Path, **options: Any
+) -> bool:
+    """Whether `compile_kept` would find the machine code of a function on the disk."""
+    dispatcher = njit(**options)(named_apart(function, watched))
+    try:
+        return _Cache(dispatcher.py_func, *watched, "", folder).has(signature, dispatcher.targetctx)
+    except RuntimeError:
+        return False
+
+
 class Newest(dict[str, Any]):
     """What was made for single mechanisms, by digests: the newest MOST_HELD, as a sweep makes one for each run."""
 
@@ -161,6 +172,10 @@ class _Cache(FunctionCache):
         if found is None and self._announcement:
             say_once(self._announcement)
         return found
+
+    def has(self, sig: Any, target_context: Any) -> bool:
+        """Whether there is a file for a signature."""
+        return self._cache_file._path(self._index_key(sig, target_context.codegen())).exists()
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:

@@ -1,0 +1,244 @@
+"""Ensembles: what lanes make of many runs is what single runs make of them, and what they cannot do is made singly."""
+
+import numpy as np
+import pytest
+
+import twoloop
+from tests.problems import pendulum, pendulum_state
+from twoloop import ConstrainedSystem, Status, ensemble, mechanisms, solve_dae
+
+SPAN, TOLERANCE = (0.0, 2.0), 1e-8
+
+
+def pendulums(n_runs, python=False):
+    """Pendulums of mass, length and gravity of their own, from angles of their own, with a drag."""
+    random = np.random.default_rng(4)
+    parameters = np.column_stack([random.uniform(0.5, 2.0, n_runs), random.uniform(0.5, 1.5, n_runs)])
+    parameters = np.column_stack([parameters, random.uniform(5.0, 12.0, n_runs)])
+    angles = random.uniform(0.3, 2.0, n_runs)
+    q = parameters[:, 1:2] * np.column_stack([np.sin(angles), -np.cos(angles)])
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=lambda t, q, p: p[0] * np.eye(2),
+        force=lambda t, q, v, p: np.array([-0.1 * v[0], -0.1 * v[1] - p[0] * p[2]]),
+        constraint=lambda t, q, p: np.array([0.5 * (q @ q - p[1] ** 2)]),
+        jacobian=lambda t, q: q[None, :],
+        gamma=lambda t, q, v: np.array([-(v @ v)]),
+        parameters=parameters[0],
+        compile=not python,
+        name="pendulum",
+    )
+    return system, q, np.zeros_like(q), parameters
+
+
+@pytest.fixture(scope="module")
+def made():
+    system, q, v, parameters = pendulums(40)
+    times = np.linspace(*SPAN, 9)
+    runs = ensemble(system, SPAN, q, v, parameters=parameters, rtol=TOLERANCE, atol=TOLERANCE, t_eval=times)
+    return system, q, v, parameters, times, runs
+
+
+def single(made, run, tolerance=1e-11):
+    system, q, v, parameters, times, _ = made
+    own = system.with_parameters(parameters[run])
+    return solve_dae(own, SPAN, q[run], v[run], method="DOP853", rtol=tolerance, atol=tolerance, t_eval=times)
+
+
+@pytest.fixture(autouse=True)
+def builds(monkeypatch):
+    """Lanes are compiled however few runs there are."""
+    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
+
+
+def test_runs_are_those_of_another_method_one_by_one(made):
+    *_, times, runs = made
+    assert runs.q.shape == runs.v.shape == (40, 2, 9) and (runs.t == times).all()
+    assert runs.success.all() and (runs.status == Status.REACHED_END).all() and len(runs) == 40
+    assert runs.singly.tolist() == [True] + 39 * [False] and (runs.n_steps > 3).all()
+    for run in (0, 1, 7, 39):
+        known = single(made, run)
+        assert np.abs(runs.q[run] - known.q).max() < 1e-6 and np.abs(runs.v[run] - known.v).max() < 1e-6
+
+
+def test_every_state_is_on_its_own_constraints(made):
+    _, _, _, parameters, _, runs = made
+    C = 0.5 * ((runs.q**2).sum(axis=1) - parameters[:, 1:2] ** 2)
+    assert np.abs(C).max() < 1e-13 and np.abs((runs.q * runs.v).sum(axis=1)).max() < 1e-12
+
+
+def test_runs_depend_neither_on_threads_nor_on_their_order_nor_on_one_another(made):
+    system, q, v, parameters, times, runs = made
+    order = np.random.default_rng(0).permutation(40)
+    given = {"rtol": TOLERANCE, "atol": TOLERANCE, "t_eval": times}
+    other = ensemble(system, SPAN, q[order], v[order], parameters=parameters[order], threads=1, **given)
+    lanes = ~runs.singly[order] & ~other.singly
+    assert lanes.sum() == 38 and np.abs(other.q[lanes] - runs.q[order][lanes]).max() < 1e-13
+    few = ensemble(system, SPAN, q[:5], v[:5], parameters=parameters[:5], **given)
+    assert np.abs(few.q[1:] - runs.q[1:5]).max() < 1e-12
+
+
+def test_without_times_start_and_end_are_stored(made):
+    system, q, v, parameters, _, runs = made
+    ends = ensemble(system, SPAN, q, v, parameters=parameters, rtol=TOLERANCE, atol=TOLERANCE)
+    assert ends.t.tolist() == [0.0, 2.0] and (ends.q[:, :, 0] == q).all()
+    assert np.abs(ends.q[:, :, 1] - runs.q[:, :, -1]).max() < 1e-12
+
+
+def test_one_start_serves_all_parameters_and_one_set_of_parameters_all_starts():
+    problem = mechanisms.four_bar()
+    system, start = problem.system, (problem.q0, problem.v0)
+    runs = ensemble(system, (0.0, 0.5), np.tile(start[0], (9, 1)), start[1])
+    known = solve_dae(system, (0.0, 0.5), *start, rtol=1e-11, atol=1e-11)
+    assert runs.singly.sum() == 1 and np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-7
+    parameters = np.tile(system.parameters, (3, 1))
+    assert len(ensemble(system, (0.0, 0.1), *start, parameters=parameters)) == 3
+    assert len(ensemble(system, (0.0, 0.1), *start)) == 1
+
+
+def test_plain_python_functions_of_parameters_go_in_lanes():
+    system, q, v, parameters = pendulums(9, python=True)
+    runs = ensemble(system, SPAN, q, v, parameters=parameters)
+    compiled = ensemble(pendulums(9)[0], SPAN, q, v, parameters=parameters)
+    assert runs.singly.sum() == 1 and np.abs(runs.q - compiled.q)[1:].max() < 1e-12
+
+
+BRANCHING = {
+    "a branch": lambda t, q, v, p: np.array([0.0, -9.81 if q[0] > 0.5 else -p[2]]),
+    "a number made of a parameter": lambda t, q, v, p: np.array([0.0, -float(p[2])]),
+    "a branch on a parameter": lambda t, q, v, p: np.array([0.0, -p[2] if p[2] < 8.0 else -5.0]),
+    "a parameter rounded": lambda t, q, v, p: np.array([0.0, -np.round(p[2])]),
+}
+
+
+@pytest.mark.parametrize("force", BRANCHING.values(), ids=BRANCHING)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_what_lanes_cannot_see_is_found_and_made_singly(force, compiled):
+    _, q, v, parameters = pendulums(24)
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=force,
+        constraint=lambda t, q, p: np.array([0.5 * (q @ q - p[1] ** 2)]),
+        jacobian=lambda t, q: q[None, :],
+        parameters=parameters[0],
+        compile=compiled,
+    )
+    runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
+    assert runs.success.all()
+    for run in range(24):
+        own = system.with_parameters(parameters[run])
+        known = solve_dae(own, (0.0, 1.0), q[run], v[run], method="DOP853", rtol=1e-10, atol=1e-10)
+        assert np.abs(runs.q[run, :, -1] - known.q[:, -1]).max() < 1e-6
+
+
+def test_what_cannot_go_in_lanes_says_why(made):
+    system, q, v, parameters, *_ = made
+    knife = mechanisms.knife_edge()
+    runs = ensemble(knife.system, (0.0, 0.1), np.tile(knife.q0, (2, 1)), knife.v0)
+    assert runs.singly.all() and "nonholonomic" in runs.message
+    runs = ensemble(system, (0.0, 0.1), q[:3], v[:3], parameters=parameters[:3], method="DOP853")
+    assert runs.singly.all() and "DOP853 does not go in lanes" in runs.message
+
+    def low(t, q, v):
+        return q[1] + 0.2
+
+    low.terminal = True
+    runs = ensemble(system, SPAN, q[:3], v[:3], parameters=parameters[:3], events=low)
+    assert runs.singly.all() and "events" in runs.message and (runs.status == Status.EVENT).any()
+    assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()
+
+
+def test_a_few_runs_do_not_wait_for_a_compiler(made, monkeypatch):
+    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 0.0)
+    monkeypatch.setattr("twoloop.generate.lane_code.OwnLanes.seconds_to_build", 10.0)
+    system, q, v, parameters, *_ = made
+    runs = ensemble(system, (0.0, 0.1), q[:3], v[:3], parameters=parameters[:3])
+    assert runs.singly.all() and "to compile them would take longer" in runs.message
+
+
+def test_runs_through_a_singular_position_are_made_singly():
+    problem = mechanisms.n_four_bar()
+    runs = ensemble(problem.system, (0.0, 2.0), np.tile(problem.q0, (3, 1)), problem.v0)
+    known = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0)
+    assert np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-6
+
+
+def test_forces_that_are_short_or_sudden_are_seen():
+    def gust(t, q, v, p):
+        return np.array([40.0 * np.exp(-(((t - p[2]) / 0.02) ** 2)) - 0.3 * v[0] * (v @ v + 1e-2) ** 0.5, -9.81])
+
+    _, q, v, parameters = pendulums(17)
+    parameters[:, 2] = np.linspace(0.2, 1.8, 17)
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=gust,
+        constraint=lambda t, q, p: np.array([0.5 * (q @ q - p[1] ** 2)]),
+        jacobian=lambda t, q: q[None, :],
+        parameters=parameters[0],
+        compile=True,
+    )
+    runs = ensemble(system, SPAN, q, v, parameters=parameters)
+    assert (~runs.singly).sum() > 8
+    for run in range(17):
+        own = system.with_parameters(parameters[run])
+        options = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10, "max_step": 0.005}
+        known = solve_dae(own, SPAN, q[run], v[run], **options)
+        assert np.abs(runs.q[run, :, -1] - known.q[:, -1]).max() < 1e-5
+
+
+def test_a_drive_goes_in_lanes():
+    problem = mechanisms.driven_slider_crank()
+    runs = ensemble(problem.system, (0.0, 1.0), np.tile(problem.q0, (9, 1)), problem.v0)
+    known = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, rtol=1e-11, atol=1e-11)
+    assert runs.singly.sum() == 1 and np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-7
+
+
+def test_redundant_rows_go_in_lanes():
+    problem = mechanisms.redundant_slider_crank()
+    with pytest.warns(twoloop.ConstraintWarning):
+        runs = ensemble(problem.system, (0.0, 0.5), np.tile(problem.q0, (9, 1)), problem.v0)
+        known = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, rtol=1e-11, atol=1e-11)
+    assert runs.singly.sum() == 1 and np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"q0": np.zeros((2, 3))}, r"q0 must have shape \(2,\) or \(n_runs, 2\); given shape \(2, 3\)"),
+        ({"parameters": np.zeros(3)}, r"parameters must have shape \(n_runs, 3\); given shape \(3,\)"),
+        ({"parameters": np.ones((3, 3))}, "a row for each run; rows given: q0 40, v0 40, parameters 3"),
+        ({"v0": np.full((40, 2), np.nan)}, "v0 must be finite; row 0 is not"),
+        ({"t_span": (1.0, 0.0)}, "t_span"),
+        ({"rtol": -1.0}, "rtol must be positive"),
+        ({"threads": 0}, "threads"),
+        ({"method": "Euler"}, "method must be one of"),
+        ({"t_eval": [3.0]}, "t_eval"),
+    ],
+)
+def test_wrong_input_is_named(made, changed, says):
+    system, q, v, parameters, *_ = made
+    given = {"t_span": SPAN, "q0": q, "v0": v, "parameters": parameters} | changed
+    with pytest.raises(ValueError, match=says):
+        ensemble(system, given.pop("t_span"), given.pop("q0"), given.pop("v0"), **given)
+
+
+@pytest.mark.parametrize("which", ["q0", "v0"])
+def test_a_start_off_the_constraints_is_named(made, which):
+    system, q, v, parameters, *_ = made
+    starts = {"q0": q.copy(), "v0": v.copy()}
+    starts[which][7] += 0.1 * q[7]
+    with pytest.raises(ValueError, match=f"run 7: {which} is not consistent"):
+        ensemble(system, SPAN, starts["q0"], starts["v0"], parameters=parameters)
+
+
+def test_a_lane_that_fails_says_what_a_single_run_says():
+    q, v, _ = pendulum_state(0.0)
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 - 1e3 * np.sqrt(0.5 - t)]), compile=True)
+    runs = ensemble(system, (0.0, 1.0), np.tile(q, (3, 1)), v)
+    assert (runs.status < 0).all() and not runs.success.any() and np.isnan(runs.q[:, :, -1]).all()
+    assert set(runs.messages) == {0, 1, 2} and "0 of 3 runs" in runs.message

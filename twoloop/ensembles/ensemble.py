@@ -1,0 +1,207 @@
+"""ensemble: thousands of runs of one system, with parameters and starts of their own, in lanes and threads."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks.arguments import check_positive, check_real, check_size, check_span, check_times, check_tolerance
+from twoloop.ensembles.in_lanes import LaneRuns, Starts, threads_of
+from twoloop.ensembles.runs import Runs
+from twoloop.generate.tracing import Untraceable
+from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.result.result import Result
+from twoloop.solve import check_method, solve_dae
+
+Array = NDArray[np.float64]
+
+IN_LANES = ("auto", "Taylor")  # methods that go in lanes
+AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds ...
+CALL = 1e-3  # s of a call of solve_dae beside its steps
+
+
+def ensemble(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    *,
+    parameters: ArrayLike | None = None,
+    rtol: float = 1e-8,
+    atol: ArrayLike = 1e-8,
+    t_eval: ArrayLike | None = None,
+    method: str = "auto",
+    events: Any = None,
+    threads: int | None = None,
+) -> Runs:
+    """Integrate many runs of one system, each with parameters and a start of its own.
+
+    Runs go through machine code made for the system, one in each lane of the processor's vectors, by Taylor series with
+    steps of their own, which are checked as those of a single run; a lane whose run has ended takes the next one. All
+    parameters go through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run:
+    a run that comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other
+    methods. The first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of
+    each other run is compared with what was found there (of 64 runs where callbacks are plain Python).
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    t_span : (float, float)
+        Start and end of all runs, s.
+    q0, v0 : array_like (n_q,) or (n_runs, n_q)
+        Consistent starts (see `consistent_states`): one for all runs, or one for each.
+    parameters : array_like (n_runs, n_p), optional
+        Of each run, in the place of `system.parameters`. None: these.
+    rtol, atol, t_eval, events
+        As for `solve_dae`; t_eval None: states are stored at the start and the end.
+    method : str or method object
+        "auto" and "Taylor" go in lanes.
+    threads : int, optional
+        None: one for each core that this process may use. Results do not depend on it.
+
+    Returns
+    -------
+    Runs
+        A run that fails is told by its status, and its states are NaN from where it stopped.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong, naming it, or a start is not consistent, naming the run.
+    """
+    check_system(system)
+    t0, t1 = check_span(t_span)
+    chosen = check_method(method)
+    check_positive("rtol", rtol)
+    tolerance = check_tolerance("atol", atol, system.n_q)
+    times = np.array([t0, t1]) if t_eval is None else check_times(t_eval, t0, t1, None)
+    n_threads = threads_of(None if threads is None else check_size("threads", threads, 1))
+    starts = _starts(system, t0, q0, v0, parameters)
+    n_runs = len(starts.q)
+    q, v = np.full((2, n_runs, system.n_q, len(times)), np.nan)
+    status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
+    options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": chosen, "events": events}
+    messages: dict[int, str] = {}
+
+    def single(run: int) -> Result:
+        result = _alone(system, starts, run, (t0, t1), options)
+        q[run, :, : len(result.t)], v[run, :, : len(result.t)] = result.q, result.v
+        q[run, :, len(result.t) :], v[run, :, len(result.t) :] = np.nan, np.nan
+        status[run], n_steps[run] = int(result.status), result.stats.n_accepted or 0
+        if not result.success:
+            messages[run] = result.message
+        return result
+
+    first = single(0)  # which checks the system, derivatives and all
+    in_lanes, why = np.zeros(n_runs, dtype=bool), ""
+    if n_runs > 1:
+        try:
+            if events is not None:
+                raise Untraceable("events are looked for in single runs only")
+            if method not in IN_LANES:
+                raise Untraceable(f"{chosen.name} does not go in lanes")
+            if (first.stats.n_jacobians or 0) > 0:
+                raise Untraceable("the motion is stiff, and the first run was made by Newton's method")
+            lanes = LaneRuns(system, starts)
+            singly = n_runs * (first.stats.cpu_time + CALL)
+            if lanes.own.seconds_to_build > singly:
+                raise Untraceable(f"to compile them would take longer than these runs, about {singly:.2g} s")
+            in_lanes = _in_lanes(lanes, t1, times, options, n_threads, (q, v, n_steps))
+        except Untraceable as reason:
+            why = str(reason)
+    for run in np.flatnonzero(~in_lanes).tolist():
+        if run > 0:
+            single(run)
+    return Runs(times, q, v, status, n_steps, ~in_lanes, _message(status, in_lanes, why), messages)
+
+
+def _in_lanes(
+    lanes: LaneRuns,
+    t1: float,
+    times: Array,
+    options: dict[str, Any],
+    threads: int,
+    out: tuple[Array, Array, Any],
+) -> NDArray[np.bool_]:
+    """Which runs were made in lanes; the first is there already, and tells whether lanes agree with it."""
+    q, v, n_steps = out
+    system, starts = lanes.system, lanes.starts
+    for name, off in zip(("q0", "v0"), lanes.off(), strict=True):
+        for run in np.flatnonzero(~(off <= AT_ROUNDING)).tolist():
+            _check_start(system, starts, run, name)
+    within = times[times > starts.t0]
+    ends = within if within.size and within[-1] == t1 else np.append(within, t1)
+    new_q, new_v = np.full((2, len(starts.q), system.n_q, len(ends)), np.nan)
+    rtol, atol = options["rtol"], options["atol"]
+    made, steps, at_end = lanes.make(t1, ends, rtol, atol, threads, new_q, new_v)
+    fine = (made == 1) & np.isfinite(new_q).all(axis=(1, 2))
+    last = np.ascontiguousarray(new_q[:, :, -1]), np.ascontiguousarray(new_v[:, :, -1])
+    fine[lanes.disagree(t1, float(atol.min()), fine, *last, at_end)] = False
+    fine[0] = False
+    n = len(within)
+    q[fine, :, len(times) - n :], v[fine, :, len(times) - n :] = new_q[fine, :, :n], new_v[fine, :, :n]
+    if n < len(times):
+        q[fine, :, 0], v[fine, :, 0] = starts.q[fine], starts.v[fine]
+    n_steps[fine] = steps[fine]
+    return fine
+
+
+def _alone(
+    system: ConstrainedSystem, starts: Starts, run: int, span: tuple[float, float], options: dict[str, Any]
+) -> Result:
+    own = _own(system, starts, run)
+    try:
+        return solve_dae(own, span, starts.q[run], starts.v[run], **options)
+    except ValueError as error:
+        raise ValueError(f"run {run}: {error}") from error
+
+
+def _own(system: ConstrainedSystem, starts: Starts, run: int) -> ConstrainedSystem:
+    same = np.array_equal(starts.parameters[run], system.parameters)
+    return system if same else system.with_parameters(starts.parameters[run])
+
+
+def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str) -> None:
+    """Raise unless the start of a run is consistent."""
+    from twoloop.checks.consistency import check_start
+
+    try:
+        check_start(_own(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
+    except ValueError as error:
+        raise ValueError(f"run {run}: {error}s for many starts at once, twoloop.consistent_states") from error
+
+
+def _starts(system: ConstrainedSystem, t0: float, q0: Any, v0: Any, parameters: Any) -> Starts:
+    """Rows for all runs, or what is wrong with them."""
+    given = {"q0": check_real("q0", q0), "v0": check_real("v0", v0)}
+    sizes = {"q0": system.n_q, "v0": system.n_q, "parameters": system.parameters.size}
+    if parameters is not None:
+        given["parameters"] = check_real("parameters", parameters)
+    several = {}
+    for name, array in given.items():
+        n = sizes[name]
+        least = 2 if name == "parameters" else 1
+        if array.ndim not in (least, 2) or array.shape[-1] != n or array.shape[0] == 0:
+            alone = "" if name == "parameters" else f"({n},) or "
+            raise ValueError(f"{name} must have shape {alone}(n_runs, {n}); given shape {array.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite; row {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
+        if array.ndim == 2:
+            several[name] = len(array)
+    if len(set(several.values())) > 1:
+        told = ", ".join(f"{name} {count}" for name, count in several.items())
+        raise ValueError(f"q0, v0 and parameters must have a row for each run; rows given: {told}")
+    n_runs = next(iter(several.values()), 1)
+    q, v = (np.array(np.broadcast_to(given[name], (n_runs, sizes[name]))) for name in ("q0", "v0"))
+    p = given.get("parameters", np.broadcast_to(system.parameters, (n_runs, sizes["parameters"])))
+    return Starts(t0, q, v, np.array(p))
+
+
+def _message(status: Any, in_lanes: Any, why: str) -> str:
+    failed, singly = int((status < 0).sum()), int((~in_lanes).sum())
+    said = f"{len(status) - failed} of {len(status)} runs reached the end or an event"
+    if why:
+        return f"{said}; none went in lanes: {why}."
+    return f"{said}; {singly} made singly: the first, which checks the system, and those that lanes cannot do."

@@ -1,0 +1,163 @@
+"""Runs of one system in lanes: blocks of runs, taken by threads; what is left to single runs, and why."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.lane_code import OwnLanes
+from twoloop.generate.on_arrays import OnArrays
+from twoloop.generate.straight_line import Choice
+from twoloop.methods.taylor import compiled_order
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+PLACES = 100  # of a run, at least as many at which the equations are looked at
+SMALLEST, LARGEST = 64, 4096  # runs of a block; numbers of all of a block's runs are made at once
+FOR_EACH = 4  # blocks for each thread, so that all end at about the same time
+AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
+SAMPLE = 64  # runs that are compared where callbacks are called in Python
+GENERIC = 16  # runs of which generic parameters are a mean
+
+
+@dataclass
+class Starts:
+    """Starts of runs, a row each, at t0."""
+
+    t0: float
+    q: Array
+    v: Array
+    parameters: Array
+
+
+class LaneRuns:
+    """The code of a system for lanes, and what it makes of many runs.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    starts : Starts
+
+    Raises
+    ------
+    Untraceable
+        Saying why lanes cannot do it.
+    """
+
+    def __init__(self, system: ConstrainedSystem, starts: Starts):
+        self.system, self.starts = system, starts
+        generic = _generic(starts.parameters)
+        varying = np.flatnonzero((starts.parameters != starts.parameters[:1]).any(axis=0)).tolist()
+        choice = Choice.at(system.with_parameters(starts.parameters[0]) if varying else system, starts.t0, starts.q[0])
+        key = ("lanes", choice, generic.tobytes(), tuple(varying))
+        self.own: OwnLanes = system.remembered(key, lambda: OwnLanes(system, choice, generic, varying))
+
+    def off(self) -> tuple[Array, Array]:
+        """max|C| and max|C_q v + C_t| of the starts, over what rounding may leave of their terms."""
+        starts, equations = self.starts, self.own.code.equations.equations
+        arrays = OnArrays(equations.graph, self.own.record, starts.parameters)
+        kinds = [equations.of(kind) for kind in ("constraint", "jacobian", "constraint_rate")]
+        C, G, rate = arrays.evaluate(kinds, starts.t0, starts.q, starts.v)
+        faster = np.einsum("rij,rj->ri", G, starts.v) + rate
+        of_q = np.einsum("rij,rj->ri", np.abs(G), np.abs(starts.q))
+        of_v = np.einsum("rij,rj->ri", np.abs(G), np.abs(starts.v)) + np.abs(rate)
+        return _largest(C, of_q), _largest(faster, of_v)
+
+    def make(
+        self, t1: float, times: Array, rtol: float, atol: Array, threads: int, out_q: Array, out_v: Array
+    ) -> tuple[Integers, Integers, Array]:
+        """Make all runs: 1 for each that was made and 0 for each that is left, steps, and a and lam at the end."""
+        n_runs = len(self.starts.q)
+        status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
+        ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
+        size = int(np.clip(n_runs // (FOR_EACH * threads), SMALLEST, LARGEST))
+        blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
+
+        def block(rows: slice) -> None:
+            self._make(rows, t1, times, rtol, atol, (out_q[rows], out_v[rows], ends[rows]), status[rows], n_steps[rows])
+
+        if threads == 1 or len(blocks) == 1:
+            for rows in blocks:
+                block(rows)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(block, blocks))
+        return status, n_steps, ends
+
+    def _make(
+        self,
+        rows: slice,
+        t1: float,
+        times: Array,
+        rtol: float,
+        atol: Array,
+        out: tuple[Array, Array, Array],
+        status: Integers,
+        n_steps: Integers,
+    ) -> None:
+        from twoloop.kernels import lanes
+
+        starts, code = self.starts, self.own.code
+        n, n_rows, order = code.n, code.n_rows, compiled_order(rtol, float(atol.min())) + 1
+        numbers = self.own.numbers(starts.parameters[rows])
+        room = _aligned(lanes.places(n, n_rows, code.n_numbers, order)[-1] + code.scratch_size(order), lanes.LANES)
+        redundant = bool(code.equations.redundant.conditions)
+        settings = np.array([n, n_rows, order, redundant], dtype=np.int64)
+        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
+        kept = np.zeros((3 * n + n_rows) * lanes.LANES)
+        given = np.ascontiguousarray(starts.q[rows]), np.ascontiguousarray(starts.v[rows])
+        lanes.advance_lanes(
+            self.own.function, settings, control, times, numbers, *given, *out, status, n_steps, room, kept
+        )
+
+    def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
+        """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""
+        from twoloop.kernels.agreement import disagreement
+        from twoloop.kernels.data.common import Kit
+
+        system, n = self.system, self.system.n_q
+        which = np.flatnonzero(made)
+        if system.called_in_python:
+            which = which[:: 1 + len(which) // SAMPLE]
+        if which.size == 0:
+            return []
+        own = system.with_parameters(self.starts.parameters[0]) if system.parameters.size else system
+        sizes = np.array([n, system.n_c, int(system.called_in_python)], dtype=np.int64)
+        room, worst = np.zeros(n * (n + 1) + system.n_c * (n + 3)), np.zeros(len(which))
+        arrays = self.starts.parameters, q, v, ends[:, :n], ends[:, n:]
+        chosen = (np.ascontiguousarray(each[which]) for each in arrays)
+        disagreement(Kit(own.functions), sizes, t1, AGREES, atol, *chosen, room, worst)
+        return which[~(worst <= 1.0)].tolist()
+
+
+def _generic(parameters: Array) -> Array:
+    """Parameters between those of some runs, which no rule but a linear one of all of them binds."""
+    rows = parameters[:: max(1, len(parameters) // GENERIC)]
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
+    between: Array = np.where((rows == rows[:1]).all(axis=0), rows[0], weights @ rows / weights.sum())
+    return between
+
+
+def _largest(values: Array, terms: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off: Array = np.where(values == 0.0, 0.0, np.abs(values) / (np.finfo(float).eps * terms))
+    return off.max(axis=1, initial=0.0)
+
+
+def _aligned(vectors: int, lanes: int) -> Array:
+    """Zeros whose address a vector of all lanes may have."""
+    size = 8 * lanes
+    room = np.zeros(vectors * lanes + lanes)
+    first = -room.ctypes.data % size // 8
+    return room[first : first + vectors * lanes]
+
+
+def threads_of(wanted: int | None) -> int:
+    """How many threads: those that are wanted, else one for each core that this process may use."""
+    if wanted is not None:
+        return wanted
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

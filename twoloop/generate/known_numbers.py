@@ -1,0 +1,284 @@
+"""Numbers that remember how they were made of parameters, so that equations traced once hold for other values of these.
+
+A `Known` is a float with which callbacks compute as with any other; what they make of it is one again. What is traced
+decides by values (what cancels, which forms are equal), so these must be generic ones.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Powers = tuple[tuple[int, float], ...]  # atoms and their exponents: a product; empty for 1
+
+CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding leaves of two that cancel
+NUMBERS = (int, float, np.number)
+FUNCTIONS = {
+    name: getattr(np, name)
+    for name in (
+        "sin",
+        "cos",
+        "tan",
+        "sqrt",
+        "exp",
+        "log",
+        "arctan",
+        "sinh",
+        "cosh",
+        "tanh",
+        "absolute",
+        "hypot",
+        "power",
+    )
+}
+NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
+
+
+class Record:
+    """What numbers were made of: atoms, which are parameters, sums of products of atoms, or functions of these.
+
+    Parameters
+    ----------
+    values : sequence of float
+        Of all parameters, generic ones where these vary.
+    varying : sequence of int
+        Which of them do.
+    """
+
+    def __init__(self, values: Sequence[float], varying: Iterable[int]):
+        self.atoms: list[Any] = [None] * len(values)
+        self._places: dict[Any, int] = {}
+        self.parameters = np.empty(len(values), dtype=object)
+        self.parameters[:] = [float(value) for value in values]
+        for place in varying:
+            self.parameters[place] = Known(float(values[place]), self, 1.0, ((place, 1.0),))
+
+    def atom(self, definition: Any) -> Powers:
+        """The power of a sum or a function, the one known before if there is one."""
+        if definition not in self._places:
+            self._places[definition] = len(self.atoms)
+            self.atoms.append(definition)
+        return ((self._places[definition], 1.0),)
+
+    def terms(self, number: float) -> dict[Powers, float]:
+        """A number as a sum of products."""
+        if type(number) is not Known:
+            return {(): number} if number else {}
+        (place, exponent), *others = number.powers
+        definition = self.atoms[place]
+        if others or exponent != 1.0 or definition is None or definition[0] != "sum":
+            return {number.powers: number.scale}
+        return {powers: number.scale * c for powers, c in definition[1]}
+
+    def on(self, parameters: Array) -> Callable[[float], Any]:
+        """A function that gives what a number is for other parameters (n_runs, n_p): (n_runs,), or one for all."""
+        atoms: dict[int, Any] = {}
+        products: dict[Powers, Any] = {(): 1.0}
+
+        def product(powers: Powers) -> Any:
+            if powers not in products:
+                total = None
+                for place, exponent in powers:
+                    factor = atom(place) if exponent == 1.0 else atom(place) ** exponent
+                    total = factor if total is None else total * factor
+                products[powers] = total
+            return products[powers]
+
+        def atom(place: int) -> Any:
+            if place not in atoms:
+                definition = self.atoms[place]
+                if definition is None:
+                    atoms[place] = parameters[:, place]
+                elif definition[0] == "sum":
+                    atoms[place] = sum(c * product(powers) for powers, c in definition[1])
+                else:
+                    atoms[place] = FUNCTIONS[definition[0]](*(c * product(powers) for powers, c in definition[1]))
+            return atoms[place]
+
+        def value(number: float) -> Any:
+            if type(number) is not Known:
+                return number
+            with np.errstate(all="ignore"):
+                return number.scale * product(number.powers)
+
+        return value
+
+    def evaluate(self, numbers: Sequence[float], parameters: Array) -> Array:
+        """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
+        value = self.on(parameters)
+        made = np.empty((len(parameters), len(numbers)))
+        for k, each in enumerate(numbers):
+            made[:, k] = value(each)
+        return made
+
+
+class Known(float):
+    """A float, and the product of atoms that it is a multiple of."""
+
+    __slots__ = ("powers", "record", "scale")
+    record: Record
+    scale: float
+    powers: Powers
+
+    def __new__(cls, value: float, record: Record, scale: float, powers: Powers) -> "Known":
+        """A number of a record."""
+        made = super().__new__(cls, value)
+        made.record, made.scale, made.powers = record, scale, powers
+        return made
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
+        name = NAMES.get(ufunc.__name__, ufunc.__name__)
+        if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
+            plain = (float(each) if type(each) is Known else each for each in inputs)
+            return getattr(ufunc, method)(*plain, **options)
+        made = np.frompyfunc(lambda *given: applied(name, *given), len(inputs), 1)(*map(_operand, inputs))
+        if out is None:
+            return made
+        out[0][...] = made
+        return out[0]
+
+    def __neg__(self) -> "Known":
+        return Known(-float(self), self.record, -self.scale, self.powers)
+
+    def __pos__(self) -> "Known":
+        return self
+
+    def __abs__(self) -> Any:
+        return applied("absolute", self)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return float, (float(self),)
+
+    def __copy__(self) -> "Known":
+        return self
+
+    def __deepcopy__(self, memo: Any) -> "Known":
+        return self
+
+
+def _sum(one: float, other: float) -> float:
+    record = _record(one, other)
+    terms, value = record.terms(one), float(one) + float(other)
+    for powers, c in record.terms(other).items():
+        total = terms.get(powers, 0.0) + c
+        if abs(total) <= CANCELLED * abs(c):
+            terms.pop(powers, None)
+        else:
+            terms[powers] = total
+    if len(terms) < 2:
+        ((powers, c),) = terms.items() or (((), 0.0),)
+        return Known(value, record, c, powers) if powers else c
+    (_, scale), *_ = items = sorted(terms.items())
+    return Known(value, record, scale, record.atom(("sum", tuple((powers, c / scale) for powers, c in items))))
+
+
+def _product(one: float, other: float) -> float:
+    record, scale = _record(one, other), 1.0
+    powers: dict[int, float] = {}
+    for each in (one, other):
+        if type(each) is Known:
+            scale *= each.scale
+            for place, exponent in each.powers:
+                powers[place] = powers.get(place, 0.0) + exponent
+        else:
+            scale *= each
+    left = tuple(sorted((place, exponent) for place, exponent in powers.items() if exponent))
+    return Known(float(one) * float(other), record, scale, left) if left and scale else scale
+
+
+def _power(one: float, exponent: float) -> float:
+    if type(exponent) is Known or exponent != math.floor(
+        exponent
+    ):  # the root of a square is no product: it has no sign
+        return _function("power", one, exponent)
+    assert isinstance(one, Known)
+    if exponent == 0.0:
+        return 1.0
+    powers = tuple((place, exponent * own) for place, own in one.powers)
+    return Known(float(one) ** exponent, one.record, one.scale**exponent, powers)
+
+
+_OPERATIONS: dict[str, Callable[[float, float], float]] = {
+    "add": _sum,
+    "subtract": lambda one, other: _sum(one, -other),
+    "multiply": _product,
+    "divide": lambda one, other: _product(one, _power(other, -1.0) if type(other) is Known else 1.0 / other),
+    "power": _power,
+}
+
+
+def _record(*numbers: float) -> Record:
+    return next(each.record for each in numbers if type(each) is Known)
+
+
+def applied(name: str, *arguments: Any) -> Any:
+    """A function, by its name in NumPy or `math`, of numbers: a Known one if one of these is."""
+    name = NAMES.get(name, name)
+    if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol, which goes by its own rules
+        one, other = arguments
+        return _WITH_SYMBOLS[name](one, other)
+    numbers = [each if type(each) is Known else float(each) for each in arguments]
+    if not any(type(each) is Known for each in numbers):
+        return float(getattr(np, name)(*numbers))
+    if name in _OPERATIONS:
+        return _OPERATIONS[name](*numbers)
+    return _function(name, *numbers)
+
+
+def _function(name: str, *numbers: float) -> Known:
+    record = _record(*numbers)
+    made = tuple((each.powers, each.scale) if isinstance(each, Known) else ((), each) for each in numbers)
+    return Known(float(FUNCTIONS[name](*map(float, numbers))), record, 1.0, record.atom((name, made)))
+
+
+_WITH_SYMBOLS: dict[str, Callable[[Any, Any], Any]] = {
+    "add": lambda x, y: x + y,
+    "subtract": lambda x, y: x - y,
+    "multiply": lambda x, y: x * y,
+    "divide": lambda x, y: x / y,
+    "power": lambda x, y: x**y,
+    "hypot": lambda x, y: (x * x + y * y) ** 0.5,
+}
+
+
+def _operator(name: str, swapped: bool) -> Callable[[Known, Any], Any]:
+    def operate(self: Known, other: Any) -> Any:
+        pair = (other, self) if swapped else (self, other)
+        if issubclass(type(other), np.ndarray):
+            return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
+        if not issubclass(type(other), NUMBERS):  # by type(), as a symbol refuses isinstance
+            return NotImplemented
+        return _OPERATIONS[name](*(each if type(each) is Known else float(each) for each in pair))
+
+    return operate
+
+
+for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
+    setattr(Known, f"__{_symbol}__", _operator(_name, False))
+    setattr(Known, f"__r{_symbol}__", _operator(_name, True))
+for _name in FUNCTIONS.keys() - {"hypot", "power"}:
+    setattr(Known, _name, lambda self, name=_name: applied(name, self))  # NumPy calls them on arrays of objects
+
+
+def _operand(value: Any) -> Any:
+    """What NumPy takes elementwise without asking `Known` again."""
+    if issubclass(type(value), np.ndarray):
+        return value.astype(object)
+    made = np.empty((), dtype=object)
+    made[()] = value
+    return made
+
+
+def number(value: Any) -> float:
+    """A coefficient of a form: a Known one as it is, any other as a float."""
+    return value if type(value) is Known else float(value)
+
+
+def function_of_number(name: str) -> Callable[[float], float]:
+    """A function of `math` that keeps what a number is made of."""
+    plain = getattr(math, name)
+    return lambda x: applied(name, x) if type(x) is Known else plain(x)

@@ -1,0 +1,77 @@
+"""Traced equations in numbers for many states and parameters at once, by NumPy."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.known_numbers import Record
+from twoloop.generate.tracing import Form, Graph
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    LOGARITHM,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+)
+
+Array = NDArray[np.float64]
+
+FUNCTIONS: dict[int, Callable[[Any], Any]] = {
+    RECIPROCAL: lambda x: 1.0 / x,
+    SQUARE_ROOT: np.sqrt,
+    EXPONENTIAL: np.exp,
+    SINE: np.sin,
+    COSINE: np.cos,
+    LOGARITHM: np.log,
+    ARCTANGENT: np.arctan,
+}
+
+
+class OnArrays:
+    """Values of forms for runs, one after another along the first axis.
+
+    Parameters
+    ----------
+    graph : Graph
+    record : Record
+        Of the numbers in its forms.
+    parameters : ndarray (n_runs, n_p)
+    """
+
+    def __init__(self, graph: Graph, record: Record, parameters: Array):
+        self.graph, self.parameters, self._number = graph, parameters, record.on(parameters)
+
+    def evaluate(self, arrays: Iterable[Any], t: float, *states: Array) -> list[Array]:
+        """Arrays of forms as (n_runs, ...), at a time and states (n_runs, n) whose numbers are the graph's inputs."""
+        arrays = list(arrays)
+        values: dict[int, Any] = {0: t}
+        for state in states:
+            values |= dict(zip(range(len(values), len(values) + state.shape[1]), state.T, strict=True))
+
+        def value(form: Form) -> Any:
+            total = self._number(form.constant)
+            for i, c in form.terms.items():
+                total = total + self._number(c) * values[i]
+            return total
+
+        forms = [form for array in arrays for form in array.flat]
+        with np.errstate(all="ignore"):
+            for i in self.graph.needed_by(forms):
+                kind, first, second = self.graph.operations[i]  # type: ignore[misc]
+                x = value(first)
+                if kind == PRODUCT:
+                    assert second is not None
+                    x = x * value(second)
+                values[i] = FUNCTIONS[kind](x) if kind in FUNCTIONS else x
+            made = []
+            for array in arrays:
+                out = np.empty((len(self.parameters), *array.shape))
+                for place in np.ndindex(array.shape):
+                    out[(slice(None), *place)] = value(array[place])
+                made.append(out)
+        return made

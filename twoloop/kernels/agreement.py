@@ -1,0 +1,73 @@
+"""What callbacks say of states that other code has found: how far the equations of motion are from holding there."""
+
+import numpy as np
+from numba import types
+
+from twoloop.kernels.compile.callbacks import VECTOR, f8
+from twoloop.kernels.data.common import GAMMA_GIVEN, INTEGERS, KIT, compiled, kernel
+
+TABLE = types.float64[:, ::1]
+
+
+@compiled
+def _off(value, allowed):
+    """A residual over what is allowed."""
+    if not np.isfinite(value):
+        return np.inf
+    return abs(value) / allowed if allowed > 0.0 else 0.0
+
+
+@kernel(types.void(KIT, INTEGERS, f8, f8, f8, TABLE, TABLE, TABLE, TABLE, TABLE, VECTOR, VECTOR))
+def disagreement(f, sizes, t, share, atol, parameters, q, v, a, lam, room, worst):
+    """Of each run the largest residual of C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q over `share`.
+
+    That is a share of the terms of a row, beside which positions and velocities may be off by `atol`.
+    parameters : (n_runs, n_p), from sizes[2] on in p; room : (n (n + 1) + n_c (n + 3),).
+    """
+    n, n_c, first = sizes[0], sizes[1], sizes[2]
+    M, Q = room[: n * n].reshape((n, n)), room[n * n : n * n + n]
+    place = n * n + n
+    G = room[place : place + n_c * n].reshape((n_c, n))
+    place += n_c * n
+    C, rate, gamma = room[place : place + n_c], room[place + n_c : place + 2 * n_c], room[place + 2 * n_c :]
+    gamma_given = f.flags[GAMMA_GIVEN] == 1
+    for k in range(q.shape[0]):
+        room[:] = 0.0
+        for j in range(parameters.shape[1]):
+            f.p[first + j] = parameters[k, j]
+        f.mass(t, q[k], f.p, M)
+        f.force(t, q[k], v[k], f.p, Q)
+        f.constraint(t, q[k], f.p, C)
+        f.jacobian(t, q[k], f.p, G)
+        f.constraint_rate(t, q[k], f.p, rate)
+        if gamma_given:
+            f.gamma(t, q[k], v[k], f.p, gamma)
+        far, fast, largest = 0.0, 0.0, 0.0
+        for j in range(n):
+            far, fast = max(far, abs(q[k, j])), max(fast, abs(v[k, j]))
+        for i in range(n_c):
+            row, faster, off, terms = 0.0, rate[i], -gamma[i], abs(gamma[i])
+            for j in range(n):
+                row += abs(G[i, j])
+                faster += G[i, j] * v[k, j]
+                off += G[i, j] * a[k, j]
+                terms += abs(G[i, j] * a[k, j])
+            largest = max(largest, _off(C[i], row * (share * far + atol)))
+            largest = max(largest, _off(faster, row * (share * fast + atol) + share * abs(rate[i])))
+            if gamma_given:
+                largest = max(largest, _off(off, share * terms + row * atol))
+        size = 0.0
+        for j in range(n):
+            size = max(size, abs(Q[j]))
+            for m in range(n):
+                size = max(size, abs(M[j, m] * a[k, m]))
+            for i in range(n_c):
+                size = max(size, abs(G[i, j] * lam[k, i]))
+        for j in range(n):
+            total = -Q[j]
+            for m in range(n):
+                total += M[j, m] * a[k, m]
+            for i in range(n_c):
+                total += G[i, j] * lam[k, i]
+            largest = max(largest, _off(total, share * size))
+        worst[k] = largest
