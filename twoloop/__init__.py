@@ -1,7 +1,9 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0."""
 
 from twoloop.checks.consistency import ConstraintWarning
+from twoloop.ensembles.consistent_states import consistent_states
 from twoloop.ensembles.ensemble import ensemble
+from twoloop.ensembles.integrator import Integrator
 from twoloop.ensembles.runs import Runs
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.methods.bdf import BDF
@@ -35,6 +37,7 @@ __all__ = [
     "ConstrainedSystem",
     "ConstraintWarning",
     "Drawing",
+    "Integrator",
     "Joint",
     "Newmark",
     "Result",
@@ -46,6 +49,7 @@ __all__ = [
     "callback",
     "citation",
     "consistent_state",
+    "consistent_states",
     "ensemble",
     "load",
     "paper_irk",

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_positive, check_real, check_size, check_span, check_times, check_tolerance
-from twoloop.ensembles.in_lanes import LaneRuns, Starts, threads_of
+from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
+from twoloop.ensembles.in_lanes import LaneRuns, threads_of
 from twoloop.ensembles.runs import Runs
+from twoloop.ensembles.starts import AT_ROUNDING, Starts, all_starts, system_of
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
@@ -18,7 +19,6 @@ from twoloop.solve import check_method, solve_dae
 Array = NDArray[np.float64]
 
 IN_LANES = ("auto", "Taylor")  # methods that go in lanes
-AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds ...
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 
 
@@ -78,7 +78,7 @@ def ensemble(
     tolerance = check_tolerance("atol", atol, system.n_q)
     times = np.array([t0, t1]) if t_eval is None else check_times(t_eval, t0, t1, None)
     n_threads = threads_of(None if threads is None else check_size("threads", threads, 1))
-    starts = _starts(system, t0, q0, v0, parameters)
+    starts = all_starts(system, t0, q0, v0, parameters)
     n_runs = len(starts.q)
     q, v = np.full((2, n_runs, system.n_q, len(times)), np.nan)
     status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
@@ -151,16 +151,11 @@ def _in_lanes(
 def _alone(
     system: ConstrainedSystem, starts: Starts, run: int, span: tuple[float, float], options: dict[str, Any]
 ) -> Result:
-    own = _own(system, starts, run)
+    own = system_of(system, starts, run)
     try:
         return solve_dae(own, span, starts.q[run], starts.v[run], **options)
     except ValueError as error:
         raise ValueError(f"run {run}: {error}") from error
-
-
-def _own(system: ConstrainedSystem, starts: Starts, run: int) -> ConstrainedSystem:
-    same = np.array_equal(starts.parameters[run], system.parameters)
-    return system if same else system.with_parameters(starts.parameters[run])
 
 
 def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str) -> None:
@@ -168,35 +163,9 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str)
     from twoloop.checks.consistency import check_start
 
     try:
-        check_start(_own(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
+        check_start(system_of(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
     except ValueError as error:
         raise ValueError(f"run {run}: {error}s for many starts at once, twoloop.consistent_states") from error
-
-
-def _starts(system: ConstrainedSystem, t0: float, q0: Any, v0: Any, parameters: Any) -> Starts:
-    """Rows for all runs, or what is wrong with them."""
-    given = {"q0": check_real("q0", q0), "v0": check_real("v0", v0)}
-    sizes = {"q0": system.n_q, "v0": system.n_q, "parameters": system.parameters.size}
-    if parameters is not None:
-        given["parameters"] = check_real("parameters", parameters)
-    several = {}
-    for name, array in given.items():
-        n = sizes[name]
-        least = 2 if name == "parameters" else 1
-        if array.ndim not in (least, 2) or array.shape[-1] != n or array.shape[0] == 0:
-            alone = "" if name == "parameters" else f"({n},) or "
-            raise ValueError(f"{name} must have shape {alone}(n_runs, {n}); given shape {array.shape}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} must be finite; row {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
-        if array.ndim == 2:
-            several[name] = len(array)
-    if len(set(several.values())) > 1:
-        told = ", ".join(f"{name} {count}" for name, count in several.items())
-        raise ValueError(f"q0, v0 and parameters must have a row for each run; rows given: {told}")
-    n_runs = next(iter(several.values()), 1)
-    q, v = (np.array(np.broadcast_to(given[name], (n_runs, sizes[name]))) for name in ("q0", "v0"))
-    p = given.get("parameters", np.broadcast_to(system.parameters, (n_runs, sizes["parameters"])))
-    return Starts(t0, q, v, np.array(p))
 
 
 def _message(status: Any, in_lanes: Any, why: str) -> str:

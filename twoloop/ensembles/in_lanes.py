@@ -2,11 +2,11 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
 from twoloop.generate.lane_code import OwnLanes
 from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.straight_line import Choice
@@ -21,17 +21,6 @@ SMALLEST, LARGEST = 64, 4096  # runs of a block; numbers of all of a block's run
 FOR_EACH = 4  # blocks for each thread, so that all end at about the same time
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
 SAMPLE = 64  # runs that are compared where callbacks are called in Python
-GENERIC = 16  # runs of which generic parameters are a mean
-
-
-@dataclass
-class Starts:
-    """Starts of runs, a row each, at t0."""
-
-    t0: float
-    q: Array
-    v: Array
-    parameters: Array
 
 
 class LaneRuns:
@@ -50,9 +39,8 @@ class LaneRuns:
 
     def __init__(self, system: ConstrainedSystem, starts: Starts):
         self.system, self.starts = system, starts
-        generic = _generic(starts.parameters)
-        varying = np.flatnonzero((starts.parameters != starts.parameters[:1]).any(axis=0)).tolist()
-        choice = Choice.at(system.with_parameters(starts.parameters[0]) if varying else system, starts.t0, starts.q[0])
+        generic, varying = generic_parameters(starts.parameters)
+        choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         key = ("lanes", choice, generic.tobytes(), tuple(varying))
         self.own: OwnLanes = system.remembered(key, lambda: OwnLanes(system, choice, generic, varying))
 
@@ -63,9 +51,7 @@ class LaneRuns:
         kinds = [equations.of(kind) for kind in ("constraint", "jacobian", "constraint_rate")]
         C, G, rate = arrays.evaluate(kinds, starts.t0, starts.q, starts.v)
         faster = np.einsum("rij,rj->ri", G, starts.v) + rate
-        of_q = np.einsum("rij,rj->ri", np.abs(G), np.abs(starts.q))
-        of_v = np.einsum("rij,rj->ri", np.abs(G), np.abs(starts.v)) + np.abs(rate)
-        return _largest(C, of_q), _largest(faster, of_v)
+        return over_rounding(C, G, starts.q), over_rounding(faster, G, starts.v, rate)
 
     def make(
         self, t1: float, times: Array, rtol: float, atol: Array, threads: int, out_q: Array, out_v: Array
@@ -117,7 +103,6 @@ class LaneRuns:
     def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
         """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""
         from twoloop.kernels.agreement import disagreement
-        from twoloop.kernels.data.common import Kit
 
         system, n = self.system, self.system.n_q
         which = np.flatnonzero(made)
@@ -125,27 +110,11 @@ class LaneRuns:
             which = which[:: 1 + len(which) // SAMPLE]
         if which.size == 0:
             return []
-        own = system.with_parameters(self.starts.parameters[0]) if system.parameters.size else system
-        sizes = np.array([n, system.n_c, int(system.called_in_python)], dtype=np.int64)
         room, worst = np.zeros(n * (n + 1) + system.n_c * (n + 3)), np.zeros(len(which))
         arrays = self.starts.parameters, q, v, ends[:, :n], ends[:, n:]
         chosen = (np.ascontiguousarray(each[which]) for each in arrays)
-        disagreement(Kit(own.functions), sizes, t1, AGREES, atol, *chosen, room, worst)
+        disagreement(*kit_to_write(system), t1, AGREES, atol, *chosen, room, worst)
         return which[~(worst <= 1.0)].tolist()
-
-
-def _generic(parameters: Array) -> Array:
-    """Parameters between those of some runs, which no rule but a linear one of all of them binds."""
-    rows = parameters[:: max(1, len(parameters) // GENERIC)]
-    weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
-    between: Array = np.where((rows == rows[:1]).all(axis=0), rows[0], weights @ rows / weights.sum())
-    return between
-
-
-def _largest(values: Array, terms: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off: Array = np.where(values == 0.0, 0.0, np.abs(values) / (np.finfo(float).eps * terms))
-    return off.max(axis=1, initial=0.0)
 
 
 def _aligned(vectors: int, lanes: int) -> Array:

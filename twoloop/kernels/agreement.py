@@ -71,3 +71,25 @@ def disagreement(f, sizes, t, share, atol, parameters, q, v, a, lam, room, worst
                 total += G[i, j] * lam[k, i]
             largest = max(largest, _off(total, share * size))
         worst[k] = largest
+
+
+@kernel(types.void(KIT, INTEGERS, f8, TABLE, TABLE, VECTOR, VECTOR))
+def violation(f, sizes, t, parameters, q, room, worst):
+    """Of each position the largest |C| over |C_q| |q|.
+
+    room : (n_c (n + 1),).
+    """
+    n, n_c, first = sizes[0], sizes[1], sizes[2]
+    C, G = room[:n_c], room[n_c:].reshape((n_c, n))
+    for k in range(q.shape[0]):
+        room[:] = 0.0
+        for j in range(parameters.shape[1]):
+            f.p[first + j] = parameters[k, j]
+        f.constraint(t, q[k], f.p, C)
+        f.jacobian(t, q[k], f.p, G)
+        worst[k] = 0.0
+        for i in range(n_c):
+            terms = 0.0
+            for j in range(n):
+                terms += abs(G[i, j] * q[k, j])
+            worst[k] = max(worst[k], _off(C[i], terms))

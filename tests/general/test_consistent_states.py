@@ -1,0 +1,87 @@
+"""Many guesses put on the constraints at once: each is what consistent_state makes of it."""
+
+import numpy as np
+import pytest
+
+from twoloop import ConstrainedSystem, consistent_state, consistent_states, mechanisms
+
+
+def guesses(problem, n, far=0.02):
+    random = np.random.default_rng(2)
+    q = problem.q0 + far * random.uniform(-1.0, 1.0, (n, problem.system.n_q))
+    return q, random.uniform(-1.0, 1.0, q.shape)
+
+
+NAMES = ("four_bar", "spatial_slider_crank", "driven_slider_crank", "redundant_slider_crank", "knife_edge", "heavy_top")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_is_what_one_by_one_gives(name):
+    problem = getattr(mechanisms, name)()
+    q, v = guesses(problem, 5)
+    made_q, made_v = consistent_states(problem.system, 0.1, q, v)
+    for run in range(5):
+        own_q, own_v = consistent_state(problem.system, 0.1, q[run], v[run])
+        assert np.abs(made_q[run] - own_q).max() < 1e-12 and np.abs(made_v[run] - own_v).max() < 1e-11
+
+
+def test_parameters_of_their_own_and_coordinates_that_are_kept():
+    problem = mechanisms.four_bar()
+    system, random = problem.system, np.random.default_rng(5)
+    parameters = system.parameters * random.uniform(0.97, 1.03, (30, 4))
+    speeds = np.zeros(9)
+    speeds[8] = 2.0
+    q, v = consistent_states(system, 0.0, problem.q0, speeds, parameters=parameters, keep=[8])
+    assert (q[:, 8] == problem.q0[8]).all() and (v[:, 8] == 2.0).all()
+    for run in (0, 11, 29):
+        own = system.with_parameters(parameters[run])
+        known = consistent_state(own, 0.0, problem.q0, speeds, keep=[8])
+        assert np.abs(q[run] - known[0]).max() < 1e-12 and np.abs(v[run] - known[1]).max() < 1e-11
+        assert np.abs(own.constraint(0.0, q[run])).max() < 1e-14
+
+
+def test_callbacks_that_cannot_be_traced_go_one_by_one():
+    def circle(t, q, p):
+        return np.array([q @ q - (p[0] if q[0] < 5.0 else 2.0) ** 2])
+
+    system = ConstrainedSystem.from_python(
+        n_q=2, n_c=1, mass=np.eye(2), force=lambda t, q, v: np.zeros(2), constraint=circle, parameters=[1.0]
+    )
+    random = np.random.default_rng(0)
+    parameters, q = random.uniform(0.9, 1.1, (4, 1)), np.array([0.7, 0.8])
+    made, _ = consistent_states(system, 0.0, q, np.zeros(2), parameters=parameters)
+    assert np.abs(np.linalg.norm(made, axis=1) - parameters[:, 0]).max() < 1e-12
+
+
+def test_a_guess_that_is_too_far_is_named():
+    problem = mechanisms.four_bar()
+    q, v = guesses(problem, 3)
+    q[1] = 0.0
+    with pytest.raises(ValueError, match="guess 1: "):
+        consistent_states(problem.system, 0.0, q, v)
+
+
+def test_a_guess_that_does_not_say_on_which_assembly_it_is_is_refused():
+    system = mechanisms.pendulum().system  # a circle: with x = 0.99995 two places, y = 0.01 and -0.01
+    q = np.array([[0.6, 0.7], [0.99995, 1e-3]])
+    with pytest.raises(ValueError, match="guess 1: q does not say on which assembly"):
+        consistent_states(system, 0.0, q, np.zeros(2), keep=[0])
+    found, _ = consistent_states(system, 0.0, q[:1], np.zeros(2), keep=[0])
+    assert np.abs(found - [[0.6, 0.8]]).max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"q": np.zeros((2, 3))}, r"q must have shape \(9,\) or \(n_runs, 9\)"),
+        ({"v": np.zeros((2, 9))}, "q, v and parameters must have a row for each run; rows given: q 3, v 2"),
+        ({"keep": [9]}, "keep must hold indices from 0 to 8"),
+        ({"t": np.inf}, "t must be finite"),
+    ],
+)
+def test_wrong_input_is_named(changed, says):
+    problem = mechanisms.four_bar()
+    q, v = guesses(problem, 3)
+    given = {"t": 0.0, "q": q, "v": v, "keep": None} | changed
+    with pytest.raises(ValueError, match=says):
+        consistent_states(problem.system, given["t"], given["q"], given["v"], keep=given["keep"])

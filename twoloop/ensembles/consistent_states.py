@@ -1,0 +1,185 @@
+"""consistent_states: many guesses put on the constraints at once."""
+
+from __future__ import annotations  # ArrayLike stays a word in help()
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks.arguments import check_finite, check_indices
+from twoloop.ensembles.starts import (
+    AT_ROUNDING,
+    Starts,
+    all_starts,
+    generic_parameters,
+    kit_to_write,
+    over_rounding,
+    system_of,
+)
+from twoloop.generate.known_numbers import Record
+from twoloop.generate.on_arrays import OnArrays
+from twoloop.generate.traced_equations import Equations
+from twoloop.generate.tracing import Untraceable
+from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.run.projection import consistent_state
+
+Array = NDArray[np.float64]
+
+MOST_ITERATIONS = 12
+STRAIGHT = 0.25  # of a displacement: how far its projection may end from where C_q sends it
+SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, that counts ...
+LEAST = 1e-15  # ... and what is added to it, so that it has an inverse
+AT_ONCE = 2000  # guesses whose matrices are in memory together
+
+
+def consistent_states(
+    system: ConstrainedSystem,
+    t: float,
+    q: ArrayLike,
+    v: ArrayLike,
+    *,
+    parameters: ArrayLike | None = None,
+    keep: Sequence[int] | None = None,
+) -> tuple[Array, Array]:
+    """Project many guesses onto the constraints, each by the least change, as `consistent_state` does with one.
+
+    Guesses that are near the constraints are moved together, by Gauss-Newton on the equations that the callbacks were
+    traced to; each result is compared with what the callbacks themselves say. The others, and systems whose callbacks
+    cannot be traced, go through `consistent_state` one by one.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    t : float
+        Time, s.
+    q, v : array_like (n_q,) or (n_runs, n_q)
+        Guesses: one for all, or one for each.
+    parameters : array_like (n_runs, n_p), optional
+        Of each, in the place of `system.parameters`.
+    keep : sequence of int, optional
+        Coordinates that stay as given, position and velocity. None: all may move.
+
+    Returns
+    -------
+    q, v : ndarray (n_runs, n_q)
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong, or a guess cannot be projected: as `consistent_state`, and which.
+    """
+    check_system(system)
+    t = check_finite("t", t)
+    starts = all_starts(system, t, q, v, parameters, ("q", "v"))
+    kept = [] if keep is None else check_indices("keep", keep, system.n_q)
+    fine = np.zeros(len(starts.q), dtype=bool)
+    made_q, made_v = starts.q.copy(), starts.v.copy()
+    for begin in range(0, len(fine), AT_ONCE):
+        rows = slice(begin, begin + AT_ONCE)
+        part = Starts(t, starts.q[rows], starts.v[rows], starts.parameters[rows])
+        try:
+            made_q[rows], made_v[rows], fine[rows] = _together(system, part, kept)
+        except Untraceable:
+            break
+    fine &= _off(system, starts, made_q) <= AT_ROUNDING * np.finfo(float).eps
+    for run in np.flatnonzero(~fine).tolist():
+        try:
+            found = consistent_state(system_of(system, starts, run), t, starts.q[run], starts.v[run], keep=keep)
+        except ValueError as error:
+            raise ValueError(f"guess {run}: {error}") from error
+        made_q[run], made_v[run] = found
+    return made_q, made_v
+
+
+def _off(system: ConstrainedSystem, starts: Starts, q: Array) -> Array:
+    """What the callbacks say of positions: the largest |C| over its terms."""
+    from twoloop.kernels.agreement import violation
+
+    worst = np.zeros(len(q))
+    violation(*kit_to_write(system), starts.t0, starts.parameters, q, np.zeros(system.n_c * (system.n_q + 1)), worst)
+    return worst
+
+
+def _together(system: ConstrainedSystem, starts: Starts, kept: list[int]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Positions and velocities, and which of them may be taken."""
+    equations = _Rows(system, starts, [j for j in range(system.n_q) if j not in kept])
+    q, fine = equations.gauss_newton(starts.q)
+    fine &= equations.on_one_assembly(q, q - starts.q)
+    v = starts.v.copy()
+    G, rate = equations.of("rows", q), equations.of("rates", q)
+    v[:, equations.free] += _least_change(G[:, :, equations.free], -(np.einsum("rij,rj->ri", G, v) + rate))
+    return q, v, fine & np.isfinite(v).all(axis=1)
+
+
+class _Rows:
+    """The constraints of guesses, and their derivatives by coordinates that may move."""
+
+    def __init__(self, system: ConstrainedSystem, starts: Starts, free: list[int]):
+        generic, varying = generic_parameters(starts.parameters)
+        record = Record(generic.tolist(), varying)
+        equations = Equations(system, record.parameters)
+        self._forms = {
+            "constraint": equations.of("constraint"),
+            "jacobian": equations.of("jacobian"),
+            "rows": np.vstack([equations.of("jacobian"), equations.of("nonholonomic")]),
+            "rates": np.concatenate([equations.of("constraint_rate"), equations.of("nonholonomic_rate")]),
+        }
+        self._arrays = OnArrays(equations.graph, record, starts.parameters)
+        self.t, self.v, self.free = starts.t0, starts.v, free
+
+    def of(self, kind: str, q: Array) -> Array:
+        """Values at positions (n_runs, n_q)."""
+        return self._arrays.evaluate([self._forms[kind]], self.t, q, self.v)[0]
+
+    def gauss_newton(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Positions on the constraints, each by steps of least change, and which of them are there."""
+        q, fine, there = q.copy(), np.ones(len(q), dtype=bool), np.zeros(len(q), dtype=bool)
+        for _ in range(MOST_ITERATIONS):
+            G, C = self.of("jacobian", q), self.of("constraint", q)
+            change = _least_change(G[:, :, self.free], -C)
+            fine &= np.isfinite(change).all(axis=1)
+            move = fine & ~there
+            q[:, self.free] += np.where(move[:, None], change, 0.0)
+            if (there | ~fine).all():
+                break
+            there |= over_rounding(C, G, q) <= AT_ROUNDING  # after the change, which is applied to the last bit
+        return q, fine & there
+
+    def on_one_assembly(self, found: Array, moved: Array) -> NDArray[np.bool_]:
+        """Whether other guesses that are as far off lead where C_q sends them, so that there is no other assembly."""
+        G, free = self.of("jacobian", found)[:, :, self.free], self.free
+        unit, _ = _unit_rows(G)
+        fine: NDArray[np.bool_] = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
+        unit[~fine] = 0.0
+        far, weakest = np.abs(moved).max(axis=1, keepdims=True), np.zeros_like(found)
+        if G.shape[1] == 0:
+            return fine
+        values, vectors = np.linalg.eigh(unit @ unit.transpose(0, 2, 1))
+        fine &= values[:, 0] > SINGULAR
+        weakest[:, free] = np.einsum("rij,ri->rj", unit, vectors[:, :, 0])
+        weakest *= far / np.maximum(np.abs(weakest).max(axis=1, keepdims=True), LEAST)
+        for way in (-2.0 * moved, weakest, -weakest):
+            again, there = self.gauss_newton(found + way)
+            expected = found + way
+            expected[:, free] += _least_change(G, -np.einsum("rij,rj->ri", G, way[:, free]))
+            apart = np.abs(again - expected).max(axis=1)
+            fine &= there & (apart <= STRAIGHT * np.abs(way).max(axis=1))
+        return fine
+
+
+def _least_change(G: Array, values: Array) -> Array:
+    """The smallest x with G x = values of each run; not finite, or large, where rows depend on one another."""
+    unit, norms = _unit_rows(G)
+    gram = unit @ unit.transpose(0, 2, 1)
+    gram[~np.isfinite(gram).all(axis=(1, 2))] = np.nan
+    with np.errstate(all="ignore"):
+        x = np.linalg.solve(gram + LEAST * np.eye(G.shape[1]), (values / norms)[:, :, None])
+    return (unit.transpose(0, 2, 1) @ x)[:, :, 0]
+
+
+def _unit_rows(G: Array) -> tuple[Array, Array]:
+    """Rows of length 1, and how long they are."""
+    norms = np.linalg.norm(G, axis=2)
+    norms[norms == 0.0] = 1.0
+    return G / norms[:, :, None], norms

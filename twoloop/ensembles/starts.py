@@ -1,0 +1,89 @@
+"""Starts and parameters of many runs: what is given for all or for each, checked, and one row a run."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_real
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
+GENERIC = 16  # runs of which generic parameters are a mean
+
+
+@dataclass
+class Starts:
+    """Starts of runs at t0, a row each."""
+
+    t0: float
+    q: Array
+    v: Array
+    parameters: Array
+
+
+def all_starts(
+    system: ConstrainedSystem, t0: float, q0: Any, v0: Any, parameters: Any, names: tuple[str, str] = ("q0", "v0")
+) -> Starts:
+    """Rows for all runs.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Naming the argument.
+    """
+    given = {name: check_real(name, value) for name, value in zip(names, (q0, v0), strict=True)}
+    sizes = {**dict.fromkeys(names, system.n_q), "parameters": system.parameters.size}
+    if parameters is not None:
+        given["parameters"] = check_real("parameters", parameters)
+    several = {}
+    for name, array in given.items():
+        n = sizes[name]
+        least = 2 if name == "parameters" else 1
+        if array.ndim not in (least, 2) or array.shape[-1] != n or array.shape[0] == 0:
+            alone = "" if name == "parameters" else f"({n},) or "
+            raise ValueError(f"{name} must have shape {alone}(n_runs, {n}); given shape {array.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite; row {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
+        if array.ndim == 2:
+            several[name] = len(array)
+    if len(set(several.values())) > 1:
+        told = ", ".join(f"{name} {count}" for name, count in several.items())
+        raise ValueError(f"{names[0]}, {names[1]} and parameters must have a row for each run; rows given: {told}")
+    n_runs = next(iter(several.values()), 1)
+    q, v = (np.array(np.broadcast_to(given[name], (n_runs, system.n_q)), order="C") for name in names)
+    p = given.get("parameters", np.broadcast_to(system.parameters, (n_runs, sizes["parameters"])))
+    return Starts(t0, q, v, np.array(p, order="C"))
+
+
+def system_of(system: ConstrainedSystem, starts: Starts, run: int) -> ConstrainedSystem:
+    """The system with the parameters of a run."""
+    same = np.array_equal(starts.parameters[run], system.parameters)
+    return system if same else system.with_parameters(starts.parameters[run])
+
+
+def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
+    """The callbacks with parameters of their own that a kernel may write, and n_q, n_c and the place of the first."""
+    from twoloop.kernels.data.common import Kit
+
+    own = system.with_parameters(system.parameters) if system.parameters.size else system
+    return Kit(own.functions), np.array([system.n_q, system.n_c, int(system.called_in_python)], dtype=np.int64)
+
+
+def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
+    """Parameters between those of some runs, bound by no rule but a linear one of all, and which of them vary."""
+    rows = parameters[:: max(1, len(parameters) // GENERIC)]
+    varying = np.flatnonzero((parameters != parameters[:1]).any(axis=0)).tolist()
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
+    return np.where((parameters == parameters[:1]).all(axis=0), rows[0], weights @ rows / weights.sum()), varying
+
+
+def over_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> Array:
+    """The largest of some values G x + rate, or of constraints, over what rounding may leave of its terms."""
+    terms = np.einsum("...ij,...j->...i", np.abs(rows), np.abs(state)) + np.abs(rate)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off: Array = np.where(values == 0.0, 0.0, np.abs(values) / (np.finfo(float).eps * terms))
+    return off.max(axis=-1, initial=0.0)
