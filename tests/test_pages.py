@@ -30,6 +30,19 @@ def names(tmp_path_factory):
     return known
 
 
+def test_many_runs(tmp_path, monkeypatch):
+    mpl.use("Agg")
+    known = {}
+    monkeypatch.chdir(tmp_path)
+    for block in blocks("docs/many_runs.md"):
+        exec(block, known)
+    assert known["runs"].success.all() and known["q0"].shape == (2000, 9)
+    assert known["result"].success and known["again"].success
+    assert np.ptp(known["high"] - known["low"]) > 1e-3
+    for picture in ("tolerances.png", "workspace.png"):
+        assert (tmp_path / picture).stat().st_size > 5000
+
+
 def test_dense_output(names):
     assert names["state"].q.shape == (9, 10_001)
     assert np.isfinite(names["state"].lam).all()
