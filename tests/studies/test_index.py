@@ -178,9 +178,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     }
     text = front(tmp_path, [case()], honesty=honesty)
     assert "under 15 kinds of sharp everyday forces" in text and "on 20 other traps" in text
-    assert (
-        "on 2 mechanisms, with parameters drawn after our last repair, in 1 of 30 runs of the default" in text
-    )
+    assert "on 2 mechanisms, with parameters drawn after our last repair, in 1 of 30 runs of the default" in text
     theirs = "8 of 30 of other projects' solvers (1 of these off by over 1e-3). With the parameters on which ours"
     assert f"6 of 30 of our other methods and {theirs}" in text
     assert "traps, it is so in 0 of 50, 3 of 50 (the forces alone), 5 of 50 and 7 of 50 ([honesty]" in text
