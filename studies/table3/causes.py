@@ -118,7 +118,7 @@ def readings(rows: pd.DataFrame) -> list[dict[str, Any]]:
         runs = runs[runs["err_in"] == ERR_IN].set_index("err_out").reindex(TOLERANCES)
         if runs["status"].eq("REACHED_END").all():
             apart = np.log(runs["n_evaluations"].to_numpy(float) / PAPER_IRK[-1])
-            # of the standard deviation: the factor between both is free
+            # about its mean, as the factor between both is free
             found.append({"over": what, "rms": float(np.std(apart)), "astray": bool(runs["astray"].iloc[0])})
     return found
 
