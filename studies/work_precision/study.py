@@ -174,7 +174,7 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 
 def ready(findings: dict[str, Any]) -> dict[str, str]:
     """The tables of the report."""
-    first = ["solver", "built by", "first call (s)", "later call (ms)", "pays from run"]
+    first = ["solver", "first call (s)", "later call (ms)", "pays from run"]
     return {
         "scaling": scaling.pivot(findings["scaling"]),
         "first": table(first, first_calls.lines(findings["first_calls"])),
