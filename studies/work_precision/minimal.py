@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from references.minimal.equations import MAKE
-from studies.bench import adaptive, headline, tables
+from studies.bench import adaptive, headline
 from studies.bench.collector import REPEATS, Run
 from studies.bench.end_states import case_of
 from studies.bench.solvers import CATALOGUE, MINIMAL
@@ -45,17 +45,10 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
 
 
 def at_error(rows: pd.DataFrame, others: pd.DataFrame, error: float) -> dict[str, Any]:
-    """How the best of ours with constraints stands beside the cheapest in minimal coordinates (`rows`) at one error.
-
-    Its ratio is the time in minimal coordinates over its own; `over_loop` is that over what our fastest spends in its
-    own loop, without the rest of the call.
-    """
+    """How the best of ours with constraints stands beside the cheapest in minimal coordinates (`rows`) at one error."""
     ours = others[others["family"] == "two-loop"]
     found = headline.of_error(pd.concat([ours, rows], ignore_index=True), error)[headline.BEST]
-    time = found["rival"]["call_s"]
-    loops = [tables.time_for(own, error, "inside_s") for _, own in ours.groupby("solver")]
-    loop = min((time for time in loops if not np.isnan(time)), default=None)
-    return found | {"error": error, "over_loop": None if loop is None or time is None else time / loop}
+    return found | {"error": error}
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
@@ -64,8 +57,7 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     for name, own in rows.groupby("case", sort=False) if len(rows) else ():
         others = everywhere[everywhere["case"] == name]
         made.append({"case": str(name), "at": [at_error(own, others, error) for error in ERRORS]})
-    every = [at for each in made for at in each["at"]]
-    pairs = [at for at in every if at["ratio"] is not None]
+    pairs = [at for each in made for at in each["at"] if at["ratio"] is not None]
     verdicts, ratios = [each["verdict"] for each in pairs], [each["ratio"] for each in pairs]
     found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}
     asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)] if len(rows) else pd.DataFrame({"error_q": []})
@@ -76,7 +68,5 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
         for name, own in (wrong.groupby("solver", sort=False) if len(wrong) else ())
     ]
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
-    loops = [at["over_loop"] for at in every if at["over_loop"] is not None]
-    found["over_loop"] = float(np.median(loops)) if loops else None
     sizes = (min(ratios), float(np.median(ratios)), max(ratios)) if ratios else (None, None, None)
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))

@@ -269,9 +269,7 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert (
-        "right on 17, only ours on 1, only others on 0, none on 2. On the other 1 only ours are" in text
-    )
+    assert "right on 17, only ours on 1, only others on 0, none on 2. On the other 1 only ours are" in text
     assert "1 of 500 of ours, 57 of 300 of others" in text
     planted = {"n": 73, "missed": ["x"], "mutants": None}
     assert "catch 72 of 73 planted faults ([planted errors]" in screen(tmp_path, planted_errors=planted)

@@ -39,7 +39,6 @@ def test_our_best_is_compared_with_the_cheapest_in_minimal_coordinates(time, ver
     assert at["solver"] == "auto, compiled"
     assert found["n"] == 1 and {f"n_{name}": n for name, n in verdicts.items()}.items() <= found.items()
     assert found["least"] == found["median"] == found["most"] == pytest.approx(time)
-    assert found["over_loop"] == pytest.approx(4.0 * time)  # of a call of 1 s
 
 
 def test_without_rows_nothing_is_said():
@@ -52,7 +51,7 @@ def test_without_rows_nothing_is_said():
 @pytest.mark.parametrize(
     ("time", "said"),
     [
-        (0.5, "always faster than our best with constraints: it takes 0.50 to 0.50 times as long, in the median"),
+        (0.5, "always faster than our best with constraints: it takes 0.50 to 0.50 times as long, in the median 0.50."),
         (3.0, "by hand. That is never faster than our best with constraints: it takes 3.0 to"),
     ],
 )
