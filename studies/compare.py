@@ -18,6 +18,7 @@ from studies.bench.store import Output
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
 
+GROUP = "compare"
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
 REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
@@ -61,7 +62,7 @@ def runs_of(case: Case, solvers: Iterable[str], quick: bool) -> list[Run]:
         if quick:
             own = (case.tolerances or ())[:6:2]  # a case that has its own has loose ones
             values = own or QUICK if solver.setting == "tol" else values[:2]
-        runs += [Run(case, solver, value, "compare", 1 if quick else REPEATS) for value in values]
+        runs += [Run(case, solver, value, GROUP, 1 if quick else REPEATS) for value in values]
     return runs
 
 

@@ -171,7 +171,7 @@ def test_a_link_is_followed(tmp_path):
     [("ann", [], True, True), ("ann", ["bob"], True, False), ("staff", [], True, False), ("ann", [], False, False)],
 )
 def test_the_group_of_one_user_alone_may_write(tmp_path, monkeypatch, name, members, primary, private):
-    """Distributions with umask 0002 give each user such a group: it is refused neither once nor for ever."""
+    """Distributions with umask 0002 give each user such a group: it is never refused."""
     import grp
     import pwd
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI
-from studies.beam.runs import DIFFERENCES, EXUDYN, PAPER, TARGETS, by_tip
+from studies.beam.runs import EXUDYN, PAPER, TARGETS, by_tip
 from studies.beam.sensitivity import MESH
 from studies.bench import tables
 from studies.bench.cases.beam import SOFT, STIFF
@@ -72,7 +72,7 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     ranked = tables.ranking(runs, error)
     seconds = dict(zip(ranked["solver"], ranked["call_s"], strict=True)) if len(ranked) else {}
     found: dict[str, Any] = {"error": error, "best": tables.best(ranked)}
-    found |= {**tables.of_both(ranked), "differences_s": seconds.get(DIFFERENCES), "paper_s": seconds.get(PAPER)}
+    found |= tables.of_both(ranked)
     found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
     ida, newmark = (
         min((seconds[name] for name in names if name in seconds), default=None)

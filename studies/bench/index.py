@@ -2,7 +2,6 @@
 
 import importlib
 import json
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -148,27 +147,6 @@ def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     return list(groups.values())
 
 
-def overall(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Solvers that are the cheapest of all at any error of any entry, and at how many; the most frequent first.
-
-    Errors at which ours and others are not told apart count for neither.
-    """
-    chosen: Counter[str] = Counter()
-    for pick in (pick for entry in entries for pick in entry["picks"]):
-        chosen[pick["solver"]] += len(pick["accuracies"]) - len(pick["undecided"])
-    return [{"solver": solver, "n": n} for solver, n in chosen.most_common() if n]
-
-
-def per_evaluation(entries: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
-    """CPU times of an evaluation in µs in the table's first class, by what calls the mechanism."""
-    times: dict[str, list[float]] = {"compiled": [], "Python": []}
-    first = [at for entry in entries if entry["class"] == entries[0]["class"] for at in entry["at"]]
-    for best in (at[which] for at in first for which in WHOSE):
-        if best and best["n_evaluations"]:
-            times[best["called_from"]].append(1e6 * best["call_s"] / best["n_evaluations"])
-    return times
-
-
 def _render(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
     default = found["work_precision"]["default"] if "work_precision" in found else ""
     entries = classes(found)
@@ -185,16 +163,13 @@ def first_screen(folder: Path, quick: bool) -> str:
         names = ("compare.html",) if name == "compare_page" else (f"{name}.md", f"{name}.png")
         files = [each for each in names if (folder / each).is_file()]
         studies.append({"name": name, "about": about, "file": files[0] if files else None})
-    figure = (folder / "energy_cost.png").is_file()
     found = findings(folder)
     entries = classes(found)
-    more = {"studies": studies, "energy_figure": figure, "times": per_evaluation(entries), "overall": overall(entries)}
+    more: dict[str, Any] = {"studies": studies}
     told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
     more["drifting"] = any(best["drifts"] for best in told)
-    more["n_undecided"] = sum(at["undecided"] for entry in entries for at in entry["at"])
-    more["n_errors"] = sum(len(entry["at"]) for entry in entries)
+    more["from_python"] = any(best["called_from"] == "Python" for best in told)
     more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
-    more["ida_over"] = [over for entry in entries for over in entry["ida_over"]]
     return _render("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
 
 

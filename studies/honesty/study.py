@@ -36,16 +36,7 @@ TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right 
 TRUTH_LIMIT = 10.0  # s that one of them may take
 AGREE = 1e-7  # how far the two may differ
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "said so", "WRONG AND SILENT", "HANG", "not run"
-UNASKED = "wrong and silent, never asked"  # shown of those that are the same, bit for bit, as without the trap
-SHORT = {
-    HANG: "**hang**",
-    SILENT: "**silent**",
-    UNASKED: "**silent** (force never seen)",
-    SAID: "said",
-    RIGHT: "right",
-    NOT_RUN: "–",
-}
-ORDER = (HANG, SILENT, UNASKED, SAID, RIGHT, NOT_RUN)  # in which those of the mechanisms of a trap are shown
+OUTCOMES = (HANG, SILENT, SAID, RIGHT, NOT_RUN)
 UNCONTROLLED = "no error was estimated"  # what the message of a successful run says of steps without error control
 REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, to a solver: no run
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
@@ -216,7 +207,7 @@ def unasked(rows: pd.DataFrame) -> pd.Series:
 
 def counts_of(rows: pd.DataFrame) -> dict[str, int]:
     """Runs, and how many of them had each outcome."""
-    return {"n": len(rows)} | {what: int((rows["outcome"] == what).sum()) for what in ORDER if what != UNASKED}
+    return {"n": len(rows)} | {what: int((rows["outcome"] == what).sum()) for what in OUTCOMES}
 
 
 def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
@@ -249,13 +240,18 @@ def parts_of(rows: pd.DataFrame) -> dict[str, pd.Series]:
 def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
     ran = rows[rows["outcome"] != NOT_RUN]
-    found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": []}
-    found["solvers"] = totals(rows)
-    for family, own in ran.groupby("trap", sort=False):
-        counts = {whose: counts_of(own[which]) for whose, which in parts_of(own).items()}
-        found["families"].append({"family": str(family)} | counts)
-    found["mechanisms"] = [str(name) for name in ran["mechanism"].unique()]
-    return found | {whose: counts_of(ran[which]) for whose, which in parts_of(ran).items()}
+    found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": of_traps(ran)}
+    return found | {"solvers": totals(rows), "mechanisms": [str(name) for name in ran["mechanism"].unique()]}
+
+
+def of_traps(ran: pd.DataFrame) -> list[dict[str, Any]]:
+    """Of each trap, whose runs had which outcome, and which solvers as they come were wrong and silent, or hung."""
+    found = []
+    for trap, own in ran.groupby("trap", sort=False):
+        line = {whose: counts_of(own[which]) for whose, which in parts_of(own).items()}
+        bad = own[own["outcome"].isin((SILENT, HANG)) & ~own["solver"].str.endswith(LIMITED)]
+        found.append({"trap": str(trap), "silent": list(dict.fromkeys(bad["solver"])), **line})
+    return found
 
 
 def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
@@ -273,7 +269,6 @@ def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
         wrong = ran["outcome"].isin((SILENT, HANG))
         line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
         line["gross"] = int((wrong & ~(ran["error"].astype(float) <= EXACT)).sum())
-        line |= {"n_mistakes": int((ran["group"] == MISTAKE).sum()), "n_forces": int((ran["group"] == FORCE).sum())}
         found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
     return found
 
@@ -287,62 +282,28 @@ def bad_in(rows: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
 
 def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes on traps that lie in a model, a motion or a setting."""
-    names, trap_names = list(dict.fromkeys(rows["solver"])), list(dict.fromkeys(rows["trap"]))
-    found: dict[str, Any] = {"n_traps": len(trap_names), "n_cells": int((rows["outcome"] != NOT_RUN).sum())}
-    found["cells"], shown = [], rows["outcome"].mask(unasked(rows), UNASKED)
-    for trap in trap_names:
-        line = {"trap": trap}
-        for name in names:
-            these = shown[(rows["trap"] == trap) & (rows["solver"] == name)].tolist()
-            line[name] = [what for what in ORDER if what in these]
-        found["cells"].append(line)
-    for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
-        alike = [[outcome], [NOT_RUN]]
-        found[key] = [each["trap"] for each in found["cells"] if all(each[name] in alike for name in names)]
-    found["one_says_so"] = []
-    for each in found["cells"]:
-        said = [name for name in names if each[name] == [SAID]]
-        if len(said) == 1 and all(each[name] in ([RIGHT], [NOT_RUN]) for name in names if name not in said):
-            found["one_says_so"].append({"trap": each["trap"], "solver": said[0]})
-    found |= {"solvers": names, "looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
     ran = rows[rows["outcome"] != NOT_RUN]
-    found["missed_by_all"] = [
-        str(trap) for trap, own in ran.groupby("trap", sort=False) if own["outcome"].isin((SILENT, HANG)).all()
-    ]
-    found["counts"] = {name: counts_of(rows[rows["solver"] == name]) for name in names}
-    found["unasked"] = int(unasked(rows).sum())
-    found |= {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
-    for whose in ("ours", "limited"):
-        found[f"{whose}_traps"] = list(dict.fromkeys(line["trap"] for line in found[f"{whose}_bad"]))
-    return found
+    found: dict[str, Any] = {"n_traps": rows["trap"].nunique(), "n_cells": len(ran), "traps": of_traps(ran)}
+    alike = {str(trap): set(own["outcome"]) for trap, own in ran.groupby("trap", sort=False)}
+    for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
+        found[key] = [trap for trap, outcomes in alike.items() if outcomes == {outcome}]
+    found["missed_by_all"] = [trap for trap, outcomes in alike.items() if outcomes <= {SILENT, HANG}]
+    found["counts"] = {str(name): counts_of(own) for name, own in rows.groupby("solver", sort=False)}
+    found |= {"looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
+    return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
 
 
-def outcomes(found: dict[str, Any], names: Sequence[str], without: set[str]) -> str:
-    """A line for each trap, a column for each solver."""
-    short = [name.removesuffix(OURS).removesuffix(LIMITED) for name in names]
-    lines = [
-        [each["trap"], *("/".join(SHORT[what] for what in each[name]) for name in names)]
-        for each in found["cells"]
-        if each["trap"] not in without
-    ]
-    return table(["trap", *short], lines)
+def table_of(found: Sequence[dict[str, Any]], what: str, named: bool = False) -> str:
+    """Outcomes of ours and of others on each trap; `named`: and which of them were silent."""
 
+    def told(counts: dict[str, int]) -> str:
+        return f"{counts[SILENT] + counts[HANG]}/{counts[SAID]}/{counts[RIGHT]}" if counts["n"] else "–"
 
-def told(counts: dict[str, int] | None) -> str:
-    """Outcomes under forces in a cell."""
-    return "/".join(str(counts[what]) for what in (SILENT, SAID, RIGHT)) if counts and counts["n"] else "–"
-
-
-def of_solvers(parts: Sequence[dict[str, dict[str, Any]]]) -> list[list[str]]:
-    """Lines of the table of solvers under forces, those that are always right in one."""
-    lines, always = [], []
-    for name in parts[0]:
-        counts = [part.get(name) for part in parts]
-        if all(each is None or each["n"] == each[RIGHT] for each in counts):
-            always.append(name.replace(OURS, ""))
-        else:
-            lines.append([name.replace(OURS, ""), *map(told, counts)])
-    return [*lines, [", ".join(always), *["all right"] * len(parts)]] if always else lines
+    lines = [[line["trap"], told(line["ours"]), told(line["others"])] for line in found]
+    if named:
+        names = ("; ".join(line["silent"]).replace(OURS, "") for line in found)
+        lines = [[*line, each or "–"] for line, each in zip(lines, names, strict=True)]
+    return table([what, "ours", "others", *(["silent"] if named else [])], lines)
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
@@ -350,26 +311,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     found = findings_of(rows)
     output.save_findings(found)
     figures.save(honesty_picture.picture(found["held_out"]["solvers"], PARTS), output, "honesty")
-    alike = {*found["all_say_so"], *found["all_right"], *(each["trap"] for each in found["one_says_so"])}
-    as_they_come = [name for name in found["solvers"] if not name.endswith(LIMITED)]
-    ready = {"cells": outcomes(found, as_they_come, alike)}
-    with_max_step = [name for name in found["solvers"] if name.endswith(LIMITED)]
-    calm = {each["trap"] for each in found["cells"]} - set(found["limited_traps"])
-    ready["limited"] = outcomes(found, with_max_step, calm) if found["limited_traps"] else ""
-    asked = [name for name, counts in found["input"]["counts"].items() if counts[NOT_RUN] < counts["n"]]
-    ready["input"] = outcomes(found["input"], asked, set())
-    both = found["forces"], found["held_out"]
-    whose = {"ours": "ours", "others": "others", "limited": "others, max_step"}
-    held = {each["family"]: each for each in both[1]["families"]}
-    ready["forces"] = table(
-        ["force", *(f"{part}: {words}" for part in ("held out", "first") for words in whose.values())],
-        [
-            [each["family"], *(told(part.get(who)) for part in (held.get(each["family"], {}), each) for who in whose)]
-            for each in both[0]["families"]
-        ],
-    )
-    by_solver = [{each["solver"]: each for each in part["solvers"]} for part in reversed(both)]
-    ready["solvers"] = table(["solver", "held out", "first set"], of_solvers(by_solver))
+    alike = {*found["all_say_so"], *found["all_right"]}
+    ready = {"forces": table_of(found["held_out"]["families"], "force")}
+    ready["mistakes"] = table_of([line for line in found["traps"] if line["trap"] not in alike], "trap", True)
     output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
 
 

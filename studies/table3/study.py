@@ -191,7 +191,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
     found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
     for name, cell in (("irk", irk), ("newmark", newmark)):
-        found |= {f"{name}_s": cell["call_s"], f"{name}_error": cell["error_q"]}
+        found[f"{name}_s"] = cell["call_s"]
         cells = first[first["group"] == cell["group"]]
         for what in ("lost", "astray"):
             bad = cells[cells[what].astype(bool)]["err_out"].unique()

@@ -3,7 +3,7 @@
 A part of `studies.work_precision`. The process has an empty folder of caches, but for the kernels of twoloop, which are
 compiled once an installation; the callbacks of the ready mechanisms are compiled anew. It loads the packages by a run
 on another mechanism. CPU time, with that of compilers, is from the making of the mechanism, which compiles its
-callbacks, until the end of the call that a user writes.
+callbacks, until the end of the call.
 """
 
 import importlib
@@ -36,14 +36,7 @@ from studies.work_precision import rivals
 from twoloop import mechanisms
 
 GROUP = "first call"
-BUILT_BY = {  # whose code a first call waits for; nothing is built for the others
-    **dict.fromkeys(COMPILED, "ours, LLVM"),
-    HEYOKA: "heyoka, LLVM",
-    **dict.fromkeys((CVODE_C, IDA_C), "ours for it, numba"),
-    DIFFRAX: "JAX, XLA",
-    "IDAS, CasADi": "CasADi",
-}
-BUILDING = tuple(BUILT_BY)
+BUILDING = (*COMPILED, HEYOKA, CVODE_C, IDA_C, DIFFRAX, "IDAS, CasADi")  # for whom code is built
 MECHANISMS = {  # and how each is made
     "four-bar": "four_bar",
     "SUNDIALS slider-crank": "sundials_slider_crank",
@@ -137,7 +130,7 @@ def pays_from(line: Any, default: Any) -> float | None:
 
 
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """By solver: the first call and a later one over the mechanisms (least, median, most), and when building pays."""
+    """By solver: the first call and a later one, medians over the mechanisms, and when building pays."""
     if "first_call_s" not in rows:
         return []
     told = rows[rows["first_call_s"].notna()]
@@ -146,8 +139,7 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     for solver, own in told.groupby("solver", sort=False):
         tol = float(own["tol"].iloc[0])
         line: dict[str, Any] = {"solver": solver, "tol": tol, "n": len(own), "pays": [], "never": 0}
-        for what in ("first_call_s", "call_s"):
-            line[what] = [float(own[what].min()), float(own[what].median()), float(own[what].max())]
+        line |= {what: float(own[what].median()) for what in ("first_call_s", "call_s")}
         for _, row in own[own["case"].isin(default.index)].iterrows():
             pays = None if solver == DEFAULT else pays_from(row, default.loc[row["case"]])
             line["pays"] += [] if pays is None else [pays]
@@ -163,16 +155,7 @@ def lines(found: list[dict[str, Any]]) -> Iterator[list[Any]]:
         from_run = "–" if not pays else "–".join(dict.fromkeys(f"{n:.0f}" for n in (pays[0], pays[-1])))
         never = f"never on {line['never']}" if line["never"] else ""
         said = ", ".join(text for text in ("" if not pays else from_run, never) if text)
-        low, middle, high = line["first_call_s"]
-        yield [
-            f"`{line['solver']}`",
-            BUILT_BY.get(line["solver"], "nothing"),
-            middle,
-            low,
-            high,
-            1e3 * line["call_s"][1],
-            said or "–",
-        ]
+        yield [f"`{line['solver']}`", line["first_call_s"], 1e3 * line["call_s"], said or "–"]
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ A part of `studies.work_precision`.
 """
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import pandas as pd
@@ -36,19 +37,16 @@ def of_default(rows: pd.DataFrame, compiled: bool) -> dict[str, Any]:
     Over all mechanisms and decades that any of these reaches.
     """
     default = next(name for name in COMPILED if COMPILED[name] == DEFAULT) if compiled else DEFAULT
-    own, pairs = rows[(rows["family"] == "two-loop") & (rows["solver"].isin(list(COMPILED)) == compiled)], []
-    for case, runs in own.groupby("case", sort=False):
-        for error in rivals.DECADES:
-            ranked = tables.ranking(runs, error)
-            if not ranked.empty:
-                mine = ranked[ranked["solver"] == default]["call_s"]
-                over = float(mine.iloc[0] / ranked["call_s"].iloc[0]) if len(mine) else None
-                pairs.append({"case": str(case), "error": error, "over": over, "best": ranked["solver"].iloc[0]})
-    reached = [pair for pair in pairs if pair["over"] is not None]
-    found: dict[str, Any] = {"solver": default, "compiled": compiled, "limit": DEFAULT_OVER, "n": len(pairs)}
-    found["n_unreached"] = len(pairs) - len(reached)
-    found["n_within"] = sum(pair["over"] <= DEFAULT_OVER for pair in reached)
-    return found | {"worst": max(reached, key=lambda pair: float(pair["over"]), default=None)}
+    own, over = rows[(rows["family"] == "two-loop") & (rows["solver"].isin(list(COMPILED)) == compiled)], []
+    for (_, runs), error in product(own.groupby("case", sort=False), rivals.DECADES):
+        ranked = tables.ranking(runs, error)
+        if not ranked.empty:
+            mine = ranked[ranked["solver"] == default]["call_s"]
+            over.append(float(mine.iloc[0] / ranked["call_s"].iloc[0]) if len(mine) else None)
+    reached = [each for each in over if each is not None]
+    found = {"solver": default, "compiled": compiled, "limit": DEFAULT_OVER, "n": len(over)}
+    found |= {"n_unreached": len(over) - len(reached), "worst": max(reached, default=None)}
+    return found | {"n_within": sum(each <= DEFAULT_OVER for each in reached)}
 
 
 def _long(known: Sequence[Case], rows: pd.DataFrame) -> dict[str, Any] | None:

@@ -4,9 +4,10 @@ Errors are those at the end of the reference, which is known there to more digit
 `studies.work_precision`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -31,9 +32,8 @@ from twoloop.mechanisms import Problem, Reference
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
 SHOWN = DECADES[::2]  # at which the four-bars are judged
-IN_TABLE = 1e-6  # the error in the tables of all mechanisms
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
-AHEAD = {"heyoka": 2.0, "python": 8.0, "compiled": 4.0}  # aimed at on the four-bars, by kind of rival
+AHEAD = {"heyoka": 2, "rivals called from Python": 8, "other compiled rivals": 4}  # aimed at on the four-bars
 HEADLINE = "four-bar"
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
@@ -132,18 +132,6 @@ def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     return found | {key: best[key] for key in ("ratio", "verdict")}
 
 
-def of_solver(name: str, rows: pd.DataFrame) -> dict[str, Any]:
-    """What a solver's line says: how many mechanisms, how far it leaves the constraints."""
-    ran = rows[rows["error_q"].notna()]
-    found = {
-        "solver": name,
-        "family": rows["family"].iloc[0],
-        "mechanisms": int(ran["case"].nunique()),
-    }
-    drifts = ran["violation_q"].dropna().astype(float)
-    return found | {"violation": float(drifts.max()) if len(drifts) else None}
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Ratios of the fastest rival to the fastest of ours by mechanism and decade, and what of the goals holds."""
     by_case = {str(name): own for name, own in rows.groupby("case", sort=False)}
@@ -160,7 +148,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["singular_ahead"] = best.count("ahead")
     found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
-    found["worst"] = min(every, key=lambda at: at["ratio"]) if every else None
     found |= {"down_to": DOWN_TO, "n_behind_down_to": sum(at["error"] >= 0.5 * DOWN_TO for at in behind)}
     found["n_clear"] = sum(
         all(at["verdict"] != "behind" for at in each["at"] if at["error"] >= 0.5 * DOWN_TO) for each in made
@@ -169,8 +156,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
     found["put"] = put(rows)
-    found["solvers"] = [of_solver(str(name), own) for name, own in rows.groupby("solver", sort=False)]
-    return found | {"four_bar": [_four_bar(name, by_case[name]) for name in GEOMETRIES if name in by_case]}
+    return found | {"aims": aims(by_case[name] for name in GEOMETRIES if name in by_case)}
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:
@@ -182,62 +168,30 @@ def put(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {"counts": tables.LEAST}
 
 
-def _four_bar(name: str, rows: pd.DataFrame) -> dict[str, Any]:
-    """On a four-bar, ours ahead of heyoka, of those called from Python, and of those called from compiled code."""
-    kinds: dict[str, Callable[[pd.DataFrame], pd.Series]] = {
-        "heyoka": lambda ranked: ranked["solver"] == HEYOKA,
-        "python": lambda ranked: ranked["called_from"] == "Python",
-        "compiled": lambda ranked: (ranked["called_from"] == "compiled") & (ranked["solver"] != HEYOKA),
-    }
-    found: dict[str, Any] = {"case": name} | {kind: [] for kind in kinds}
-    for error in SHOWN:
+def aims(geometries: Iterable[pd.DataFrame]) -> list[dict[str, Any]]:
+    """Of each kind of rival least and largest time of its fastest over that of our fastest, on the four-bars."""
+    ratios: dict[str, list[float]] = {kind: [] for kind in AHEAD}
+    for rows, error in product(geometries, SHOWN):
         ranked = tables.ranking(rows, error)
-        if ranked.empty or not (ranked["family"] == "two-loop").any():
+        if ranked.empty:
             continue
-        own, others = ranked[ranked["family"] == "two-loop"], ranked[ranked["family"] != "two-loop"]
-        for kind, chosen in kinds.items():
-            some = others[chosen(others)] if len(others) else others
-            if len(some):
-                line = {"error": error, "ratio": float(some["call_s"].iloc[0] / own["call_s"].iloc[0])}
-                found[kind].append(line | {"solver": some["solver"].iloc[0], "ours": own["solver"].iloc[0]})
-    return found
-
-
-def goal_lines(found: dict[str, Any]) -> Iterator[list[Any]]:
-    """Of the table of goals: kind of rival, how far ahead ours was to be, least and largest ratio on each four-bar."""
-    names = {"heyoka": "heyoka", "python": "called from Python", "compiled": "other compiled"}
-    for kind, wanted in AHEAD.items():
-        yield [names[kind], f"{wanted:g}", *(_goal(geometry[kind], wanted) for geometry in found["four_bar"])]
-
-
-def _goal(compared: list[dict[str, Any]], wanted: float) -> str:
-    if not compared:
-        return "–"
-    ratios = [at["ratio"] for at in compared]
-    missed = [power(at["error"]) for at in compared if at["ratio"] < wanted]
-    text = "–".join(dict.fromkeys((number(min(ratios)), number(max(ratios)))))
-    if not missed:
-        return text
-    return f"{text}, missed" + ("" if len(missed) == len(ratios) else f" at {', '.join(missed)}")
-
-
-def lines(found: dict[str, Any], error: float = IN_TABLE) -> Iterator[list[Any]]:
-    """Of the table of ratios: mechanism, then default, compiled default and best of ours at an error.
-
-    Mechanisms that ours alone reach are left out.
-    """
-    for each in found["mechanisms"]:
-        if each["case"] not in found["alone"]:
-            standing = next(at["standing"] for at in each["at"] if at["error"] == error)
-            yield [each["case"], *(cell(side) for side in standing.values())]
+        ours = ranked["family"] == "two-loop"
+        own, others = ranked[ours]["call_s"], ranked[~ours]
+        heyoka, python = others["solver"] == HEYOKA, others["called_from"] == "Python"
+        for kind, which in zip(AHEAD, (heyoka, python, ~heyoka & ~python), strict=True):
+            times = others[which]["call_s"]
+            if len(own) and len(times):
+                ratios[kind].append(float(times.iloc[0] / own.iloc[0]))
+    told = {kind: {"least": min(found), "most": max(found)} for kind, found in ratios.items() if found}
+    return [{"rivals": kind, "wanted": AHEAD[kind]} | each for kind, each in told.items()]
 
 
 def cell(found: dict[str, Any]) -> str:
-    """A ratio: bold if ours is behind, in brackets where it is undecided; or who gets there."""
+    """A ratio, in brackets where it is undecided; or who gets there."""
     if found["ratio"] is None:
-        return {"alone": "ours", "unasked": "ours", "missed": "others", "none": "–"}[found["verdict"]]
+        return {"alone": "ours", "unasked": "ours", "missed": "others", "none": ""}[found["verdict"]]
     text = number(found["ratio"])
-    return {"behind": f"**{text}**", "undecided": f"({text})"}.get(found["verdict"], text)
+    return f"({text})" if found["verdict"] == "undecided" else text
 
 
 def picture(rows: pd.DataFrame) -> Figure:
@@ -266,14 +220,13 @@ def heat_map(found: dict[str, Any]) -> Figure:
         shown = np.array([[each["ratio"] or np.nan for each in line] for line in standings], dtype=float)
         image = axes.imshow(shown, norm=LogNorm(0.1, 10.0), cmap=colours, aspect="auto")
         for (i, j), value in np.ndenumerate(shown):
-            if np.isfinite(value):
-                dark = "white" if abs(np.log10(value)) > 0.6 else "black"
-                text = number(value) if standings[i][j]["verdict"] != "undecided" else f"({number(value)})"
-                axes.text(j, i, text, ha="center", va="center", fontsize=6, color=dark)
+            color = "white" if abs(np.log10(value)) > 0.6 else "black"  # black on the grey of those without a ratio
+            axes.text(j, i, cell(standings[i][j]), ha="center", va="center", fontsize=6, color=color)
         axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
         axes.set(title=name, xlabel="error at the end (m, rad)")
-    figure.suptitle("Time of the fastest rival over ours (blue: ours ahead; in brackets: undecided)", fontsize=10)
+    told = "blue: ours ahead; in brackets: undecided; a word: only these get there"
+    figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
     figure.colorbar(image, ax=panels, label="ratio")
     return figure

@@ -151,7 +151,7 @@ def exponent(n: Any, cost: Any) -> float | None:
 
 
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """By family and method: cost of a step and an evaluation at the smallest and the largest size, the exponents."""
+    """By family and method: how the cost of a step grows with the size, what an evaluation takes at the largest."""
     found = []
     for (family, method), own in rows.groupby(["case", "solver"], sort=False):
         middle = own.groupby("n")[["step_us", "evaluation_us"]].median().dropna(subset=["step_us"])
@@ -160,11 +160,8 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
             continue
         sizes = [int(n) for n in middle.index]
         line: dict[str, Any] = {"family": family, "method": method, "sizes": [sizes[0], sizes[-1]], "failed": ""}
-        for what in ("step", "evaluation"):
-            costs = middle[f"{what}_us"].to_numpy(float)
-            line |= {what: [float(costs[0]), float(costs[-1])], f"{what}_exponent": exponent(sizes, costs)}
-        line["evaluations"] = dict(zip(map(str, sizes), middle["evaluation_us"].astype(float), strict=True))
-        found.append(line)
+        line["step_exponent"] = exponent(sizes, middle["step_us"])
+        found.append(line | {"evaluation_us": float(middle["evaluation_us"].iloc[-1])})
     return found
 
 
@@ -174,10 +171,3 @@ def pivot(found: list[dict[str, Any]]) -> str:
     cells = {(line["family"], line["method"]): line["step_exponent"] if line["sizes"] else "failed" for line in found}
     lines = [[family, *(cells.get((family, method), "–") for method in methods)] for family in families]
     return table(["mechanism", *methods], lines)
-
-
-def evaluations(found: list[dict[str, Any]]) -> str:
-    """A table: microseconds of an evaluation on the chain of rigid bars, by number of bars and method."""
-    lines = {line["method"]: line["evaluations"] for line in found if line["family"] == RIGID and line["sizes"]}
-    sizes = list(dict.fromkeys(n for costs in lines.values() for n in costs))
-    return table(["bars", *lines], [[n, *(costs.get(n, "–") for costs in lines.values())] for n in sizes])

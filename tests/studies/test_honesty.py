@@ -133,19 +133,16 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
+        tables = dict.fromkeys(("mistakes", "forces"), "")
         return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
 
-    assert "None of ours is silent" in text(rows) and "All that are run are right: a; b." in text(rows)
-    assert "run but one are right" not in text(rows)
+    assert "None of ours is silent" in text(rows) and "All runs are right: a; b." in text(rows)
     rows.loc[3, "outcome"] = honesty.SAID
-    told = text(rows)
-    assert "All that are run but one are right, and it says so: b (LSODA, index 1)." in told and "are right: a." in told
+    assert "All runs are right: a." in text(rows)
     rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
     told = text(rows)
     assert "- Of ours 1 run is silent or hangs: b." in told
-    assert "run but one are right" not in told
-    assert "All that are run are right: a." in told and "All that are run say so" not in told
+    assert "All runs are right: a." in told and "All runs say so" not in told
     assert "No solver notices: b" in told
 
 
@@ -175,18 +172,18 @@ def rows_of_forces(wrong=()):
 
 def told_of_forces(rows):
     found = honesty.findings_of(rows)
-    tables = dict.fromkeys(("cells", "limited", "input", "forces", "solvers"), "")
+    tables = dict.fromkeys(("mistakes", "forces"), "")
     return found, render("honesty", found, tables, stamp="stamp", quick=False)
 
 
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces())
     none = dict.fromkeys(("wrong", "unasked", "gross", "refused"), 0)
-    assert found["trust"]["default"] == none | {"n": 2, "n_mistakes": 1, "n_forces": 1}
+    assert found["trust"]["default"] == none | {"n": 2}
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
     wrong = {"default": 0, "compiled": 1, "ours": 1, "others": 1, "limited": 0}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
-    assert "| the default, compiled | 0 of 0 | 0 | 1 of 2 | 0 | 0 | 0 |" in text
+    assert "| the default, compiled | 0 of 0 | 0 | 1 of 2 | 0 | 0 |" in text
     assert "| other projects' solvers as they come | 0 of 0 | 0 | 1 of 2 | 0 | 0 |" in text
     assert "| the same with max_step | 0 of 0 | 0 | 0 of 2 | 0 | 0 |" in text
     line = found["forces"]["families"][0]
@@ -199,7 +196,8 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     found, text = told_of_forces(rows)
     assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
-    assert found["cells"][0][OURS] == [honesty.UNASKED] and found["unasked"] == 2
+    assert found["traps"][0]["silent"] == [OURS, THEIRS]
+    assert "| a | 1/0/2 | 1/0/0 | auto; LSODA, index 1 |" in honesty.table_of(found["traps"], "trap", True)
     assert "- Of ours 1 run is silent or hangs: a." in text and "None of ours is silent, and" not in text
 
 
@@ -221,7 +219,7 @@ def test_a_refusal_is_no_run(message):
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert "| the default, compiled | 0 of 0 | 0 | 0 of 1 | 0 | 0 | 1 |" in text
+    assert "| the default, compiled | 0 of 0 | 0 | 0 of 1 | 0 | 0 |" in text and "1 of the default, compiled," in text
 
 
 def test_what_a_refusal_says_is_what_is_said():
@@ -261,7 +259,7 @@ def test_forces_held_out_are_others_and_counted_apart():
     apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
     found, text = told_of_forces(pd.concat([rows_of_forces(), apart], ignore_index=True))
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "| auto | gust | pendulum | 1e-9 |" in text and "were drawn after the repairs" in text
+    assert "| auto | gust | pendulum | 1e-9 |" in text and "have a seed of their own" in text
 
 
 def test_checks_of_the_input_are_counted_apart():
@@ -269,7 +267,7 @@ def test_checks_of_the_input_are_counted_apart():
     found, text = told_of_forces(pd.concat([rows_of_forces(), line], ignore_index=True))
     assert {name: each["wrong"] for name, each in found["trust"].items()} == dict.fromkeys(found["trust"], 0)
     assert found["n_traps"] == 1 and found["input"]["n_traps"] == 1
-    assert "6 of 6 runs of ours" in text and "2 of 2 of others" in text
+    assert "6 of 6 runs of ours" in text and "2 of 2 of others (inconsistent positions)" in text
 
 
 def test_a_force_has_a_known_end_and_all_presets_are_asked():
@@ -286,17 +284,3 @@ def test_forces_are_on_three_mechanisms():
     assert len({name for name, _ in made}) >= 15
     for bodies in ("pendulum", "bars", "slider_in_space"):
         assert ("gust of 3 ms", bodies) in made
-
-
-def test_solvers_that_are_always_right_share_a_line():
-    right = {"n": 4, honesty.SILENT: 0, honesty.SAID: 0, honesty.RIGHT: 4}
-    wrong = {"n": 4, honesty.SILENT: 1, honesty.SAID: 0, honesty.RIGHT: 3}
-    parts = [
-        {"a (two-loop)": right, "b": wrong, "c": right, "d": right},
-        {"a (two-loop)": right, "b": right, "d": wrong},
-    ]
-    assert honesty.of_solvers(parts) == [
-        ["b", "1/0/3", "0/0/4"],
-        ["d", "0/0/4", "1/0/3"],
-        ["a, c", "all right", "all right"],
-    ]

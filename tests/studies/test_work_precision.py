@@ -1,6 +1,5 @@
-"""The comparison of all mechanisms: what is dominated, what the default costs, a quick run."""
+"""The comparison of all mechanisms: what the default costs, a quick run."""
 
-import pandas as pd
 import pytest
 
 from studies.bench import cases
@@ -13,18 +12,6 @@ def made(*lines):
     return rows(*lines).assign(case="crane", astray=False)
 
 
-def test_dominated_is_who_costs_more_at_every_error_on_every_case():
-    table = made(("a", 1e-3, 1.0), ("b", 1e-3, 3.0), ("c", 1e-5, 9.0)).assign(tol=0.1)
-    found = {line["solver"]: (line["by"], line["factor"]) for line in work_precision.dominated(table, (1e-2,))}
-    assert found == {"b": ("a", pytest.approx(3.0)), "c": ("a", pytest.approx(9.0))}
-    worst = work_precision.dominated(table, (1e-2,))[0]
-    assert (worst["case"], worst["error"], worst["call_s"], worst["by_s"]) == ("crane", 1e-2, 3.0, 1.0)
-    both = work_precision.dominated(table, (1e-2, 1e-4))
-    assert [line["solver"] for line in both] == ["b"]  # c alone reaches 1e-4
-    other = pd.concat([table, made(("a", 1e-3, 5.0), ("b", 1e-3, 4.0)).assign(case="robot")])
-    assert "b" not in [line["solver"] for line in work_precision.dominated(other, (1e-2,))]
-
-
 def test_the_default_is_judged_by_the_rows():
     table = made(("auto", 1e-5, 4.0), ("Gauss12", 1e-5, 1.0))
     assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(4.0)
@@ -32,22 +19,6 @@ def test_the_default_is_judged_by_the_rows():
     assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(1.0)
     nothing = work_precision.class_of(table, 1e-9)
     assert nothing["error"] == 1e-9 and all(nothing[key] is None for key in ("ours", "others", "ida", "default_over"))
-
-
-def test_what_beats_the_default_beats_it_at_every_error_that_it_reaches():
-    table = made(("auto", 1e-5, 4.0), ("Gauss12", 1e-5, 1.0), ("BDF", 1e-3, 0.5), ("LSODA", 1e-5, 2.0))
-    table.loc[3, "family"] = "SciPy"
-    at = [work_precision.class_of(table, error) for error in (1e-2, 1e-4, 1e-9)]
-    assert work_precision.before_default(at, "ours") == ["Gauss12"]  # BDF does not reach 1e-4
-    assert work_precision.before_default(at, "others") == ["LSODA"]
-    assert work_precision.before_default(at[2:], "ours") == []
-
-
-def test_of_each_solver_out_of_phase_the_finest_setting_is_found():
-    table = made(("a", 0.5, 1.0), ("a", 0.3, 2.0), ("b", 1e-3, 1.0)).assign(tol=[1e-2, 1e-3, 1e-3], h=float("nan"))
-    table["astray"] = [True, True, False]
-    found = {"solver": "a", "setting": "tol", "value": 1e-3, "error_q": 0.3, "call_s": 2.0}
-    assert work_precision.out_of_phase(table) == [found]
 
 
 def test_cases_are_found_by_listing_the_folder():
