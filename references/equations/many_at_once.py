@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from references.equations.expressions import Expressions, functions_of
+from references.heyoka.taylor import LARGEST_UNROLLED
 from twoloop.problem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -70,7 +71,9 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
     def solve(tol: float) -> Array:
         if tol not in made:
             start = states[groups[0]].T.copy()
-            made[tol] = heyoka.taylor_adaptive_batch(motion, start, tol=tol, fast_math=True)
+            made[tol] = heyoka.taylor_adaptive_batch(
+                motion, start, tol=tol, fast_math=True, compact_mode=n > LARGEST_UNROLLED
+            )
         integrator, ends = made[tol], np.full((len(states), n), np.nan)
         for group in groups:
             integrator.set_time(0.0)

@@ -16,7 +16,8 @@ from studies.bench.takes import takes
 # claims and compare_page read the others' rows
 STUDIES = (
     *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam", "validation"),
-    *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "claims"),
+    *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "ensembles"),
+    "claims",
     "compare_page",
 )
 CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen

@@ -37,6 +37,7 @@ TIMED = (
     "violation",
     "symbolic_size",
     "sweep_linkages",
+    "ensembles",
     "ablation",
 )
 WHOLE_CALL = "whole call"  # what their times are of, in their findings

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from studies.bench import figures, study
 from studies.bench.cli import StudyError
-from studies.bench.render import number, power, render, table
+from studies.bench.render import render, table
 from studies.bench.store import Output, sources
-from studies.sweep_linkages import many_runs
 from twoloop import Result, sweep
 from twoloop.mechanisms import Problem, four_bar
 
@@ -24,7 +23,6 @@ Array = NDArray[np.float64]
 SEED = 2016
 N_RUNS, N_QUICK = 10_000, 20
 N_SCALING, N_SCALING_QUICK = 1_000, 10
-N_MANY, N_MANY_QUICK = 100, 4
 SPAN = (0.0, 6.0)
 RANGES = {"L1": (0.8, 1.5), "L2": (1.0, 2.0), "L3": (0.8, 1.6), "ground": (2.0, 3.0), "theta3": (-1.0, 1.0)}
 AT_REST = 1e-4  # of the largest velocity of a run: below it the linkage has turned back
@@ -108,10 +106,6 @@ def make(output: Output) -> pd.DataFrame:
         row = {"group": "scaling", "parallel": parallel, "workers": workers, "n_runs": len(timed)}
         parts.append(pd.DataFrame([row | {"wall": time.perf_counter() - began}]))
     kept.unlink()
-    several = many_runs.assembled(linkage, drawn(N_RUNS if not quick else N_QUICK), N_MANY_QUICK if quick else N_MANY)
-    # diffrax takes ten seconds to compile: not for a quick run
-    names = (many_runs.SWEEP, many_runs.SINGLE, many_runs.HEYOKA, *(() if quick else (many_runs.DIFFRAX,)))
-    parts.append(pd.DataFrame(many_runs.rows_of(linkage, several, SPAN[1], names, quick)))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -143,7 +137,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "return": _quantiles(returned) if len(periodic) else None,
         "n_scaling": int(scaling["n_runs"].iloc[0]),
         "ratios": ratios,
-        "many": many_runs.findings_of(rows),
         "asked": SCALES,
         "scales": ratios["processes"] >= SCALES if "processes" in ratios else None,
     }
@@ -173,12 +166,6 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     scaling = rows[rows["group"] == "scaling"]
     cells = [(row["parallel"], int(row["workers"]), row["wall"]) for _, row in scaling.iterrows()]
     ready = {"scaling": table(["workers are", "number", "wall-clock time (s)"], cells)}
-    many = found["many"] or {"at": [], "ways": []}
-    lines = [
-        (way, *(number(1e3 * at["run_s"][way]) if way in at["run_s"] else "–" for at in many["at"]))
-        for way in many["ways"]
-    ]
-    ready["many"] = table(["way", *(power(at["error"]) for at in many["at"])], lines)
     text = render("sweep_linkages", found, ready, stamp=line, quick=output.call.quick)
     output.write("sweep_linkages.md", text)
 

@@ -1,0 +1,272 @@
+"""Thousands of runs of one mechanism in one call: ours in lanes, heyoka in batches, diffrax by vmap, one by one."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from references.equations.many_at_once import by_diffrax, by_heyoka
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench import figures, study, tables
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS
+from studies.bench.render import number, power, render, table
+from studies.bench.store import Output
+from studies.sweep_linkages.study import drawn, linkage
+from twoloop import consistent_states, ensemble, mechanisms, solve_dae
+from twoloop.mechanisms import Problem
+
+Array = NDArray[np.float64]
+Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
+
+GROUP, GEOMETRY = "many", "random linkages"
+TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1e-6, 1e-9)
+ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
+TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
+ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
+OWN = (ENSEMBLE, SINGLE)
+LINKAGES = "random four-bar linkages"
+STARTS = {  # mechanisms whose runs differ by their velocities at the start, and how long they run
+    "andrews": 0.03,
+    "spatial_slider_crank": 2.0,
+    "redundant_slider_crank": 2.0,
+}
+N_RUNS, N_QUICK = 256, 16
+SPAN = 6.0  # s, of the linkages
+N_GEOMETRY, N_GEOMETRY_QUICK = (10_000, 1_000_000), (200,)
+BLOCK = 100_000  # linkages at a time
+SPREAD = 0.02  # of lengths, of the mechanism with geometry and starts
+WANTED, WANTED_LINKAGES = 2.0, 6.0  # times the runs a second of heyoka's batches
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Runs of one mechanism, each a problem, and where they end."""
+
+    name: str
+    problems: Sequence[Problem]
+    t_end: float
+    true: Array  # (n_runs, n_q)
+
+
+def assembled(n: int) -> list[Problem]:
+    """The first n random linkages that can be assembled."""
+    made: list[Problem] = []
+    for one in drawn(2 * n):
+        try:
+            made.append(linkage(**one))
+        except ValueError:
+            continue
+    return made[:n]
+
+
+def linkages(n: int, t_end: float = SPAN) -> Ensemble:
+    """Linkages of random lengths, and where the equation in one coordinate has them end."""
+    problems = assembled(n)
+    known = [MinimalFourBar.from_parameters(each.parameters) for each in problems]
+    true = np.array([each.states(np.array([t_end]))[0][:, 0] for each in known])
+    return Ensemble(LINKAGES, problems, t_end, true)
+
+
+def of_starts(name: str, n: int, t_end: float) -> Ensemble:
+    """A mechanism with velocities of its own in each run.
+
+    Raises
+    ------
+    StudyError
+        If two unlike methods do not agree where a run ends.
+    """
+    problem = getattr(mechanisms, name)()
+    random = np.random.default_rng(7)
+    fastest = max(1.0, float(np.abs(problem.v0).max()))
+    guesses = problem.v0 + 0.1 * fastest * random.uniform(-1.0, 1.0, (n, len(problem.q0)))
+    q, v = consistent_states(problem.system, 0.0, problem.q0, guesses)
+    problems = [replace(problem, q0=q[k], v0=v[k], reference=None) for k in range(n)]
+    ends = [one_by_one(problems, t_end, method)(TIGHT) for method in ("DOP853", "Taylor")]
+    apart = float(np.abs(ends[0] - ends[1]).max())
+    if not apart < AGREE:
+        raise StudyError(f"the ends of {problem.name} by DOP853 and by Taylor are {apart:.1e} apart")
+    return Ensemble(problem.name, problems, t_end, ends[0])
+
+
+def one_by_one(problems: Sequence[Problem], t_end: float, method: str = "auto") -> Solve:
+    """Runs by single calls of the compiled default, or of another method."""
+
+    def solve(tol: float) -> Array:
+        given: dict[str, Any] = {"method": method, "rtol": tol, "atol": tol, "t_eval": [t_end], "compiled": True}
+        made = [solve_dae(p.system, (0.0, t_end), p.q0, p.v0, **given) for p in problems]
+        return np.array(
+            [r.q[:, -1] if r.success else np.full(len(p.q0), np.nan) for p, r in zip(problems, made, strict=True)]
+        )
+
+    return solve
+
+
+def in_lanes(problems: Sequence[Problem], t_end: float) -> Solve:
+    """Runs by one call of `ensemble` on one thread."""
+    system, p = problems[0].system, np.array([each.system.parameters for each in problems])
+    q, v = (np.array([getattr(each, name) for each in problems]) for name in ("q0", "v0"))
+
+    def solve(tol: float) -> Array:
+        given: dict[str, Any] = {"rtol": tol, "atol": tol, "t_eval": [t_end], "threads": 1}
+        return ensemble(system, (0.0, t_end), q, v, parameters=p if p.size else None, **given).q[:, :, -1]
+
+    return solve
+
+
+def ways(of: Ensemble) -> dict[str, Callable[[], Solve]]:
+    """What makes the call of each way."""
+    return {
+        ENSEMBLE: lambda: in_lanes(of.problems, of.t_end),
+        SINGLE: lambda: one_by_one(of.problems, of.t_end),
+        HEYOKA: lambda: by_heyoka(of.problems, of.t_end),
+        DIFFRAX: lambda: by_diffrax(of.problems, of.t_end),
+    }
+
+
+def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[str, Any]]:
+    """A row for each way, tolerance and repetition: CPU time by a run, that of the first call, errors at the end.
+
+    The calls after the first are repeated in turn, so that a slow minute of the machine falls on all alike.
+    """
+    made, solves = ways(of), {}
+    head = {"group": GROUP, "case": of.name, "n_runs": len(of.problems), "t_end": of.t_end}
+    for name in names:
+        try:
+            solves[name] = made[name]()
+        except (ImportError, ValueError) as why:
+            yield head | {
+                "way": name,
+                "message": f"{'not installed' if isinstance(why, ImportError) else 'not run'}: {why}",
+            }
+    for tol in QUICK_TOLERANCES if quick else TOLERANCES:
+        first = {name: _timed(solve, tol)[0] for name, solve in solves.items()}
+        for repeat, (name, solve) in product(range(1 if quick else REPEATS), solves.items()):
+            spent, ends = _timed(solve, tol)
+            errors = np.abs(ends - of.true).max(axis=1)
+            row = head | {"way": name, "tol": tol, "repeat": repeat, "first_s": first[name]}
+            row |= {"run_s": spent / len(of.problems), "n_failed": int(np.isnan(errors).sum())}
+            good = errors[~np.isnan(errors)]
+            yield row | (
+                {"error_median": float(np.median(good)), "error_worst": float(good.max())} if good.size else {}
+            )
+
+
+def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
+    began = time.process_time()
+    ends = solve(tol)
+    return time.process_time() - began, ends
+
+
+def with_geometry(n: int) -> dict[str, Any]:
+    """Linkages with lengths a little off: put together and run, in blocks, on all cores; what all of it takes."""
+    problem, random = mechanisms.four_bar(), np.random.default_rng(11)
+    system, began, failed, singly, spent = problem.system, time.perf_counter(), 0, 0, time.process_time()
+    for first in range(0, n, BLOCK):
+        size = (min(BLOCK, n - first), 4)
+        p = system.parameters * (1.0 + SPREAD * random.uniform(-1.0, 1.0, size))
+        q, v = consistent_states(system, 0.0, problem.q0, problem.v0, parameters=p, keep=[8])
+        runs = ensemble(system, (0.0, SPAN), q, v, parameters=p)
+        failed, singly = failed + int((~runs.success).sum()), singly + int(runs.singly.sum())
+    spent = time.process_time() - spent
+    wall = time.perf_counter() - began
+    return {"group": GEOMETRY, "n_runs": n, "wall": wall, "cpu": spent, "n_failed": failed, "n_singly": singly}
+
+
+def make(output: Output) -> pd.DataFrame:
+    """All rows."""
+    quick, rows = output.call.quick, []
+    n = N_QUICK if quick else N_RUNS
+    sets = [lambda: linkages(n), *(lambda name=name, t=t: of_starts(name, n, t) for name, t in STARTS.items())]
+    for each in sets[: 1 if quick else None]:
+        made = each()
+        # diffrax takes ten seconds to compile, and minutes for larger mechanisms
+        names = (ENSEMBLE, SINGLE, HEYOKA, *((DIFFRAX,) if made.name == LINKAGES and not quick else ()))
+        rows += list(rows_of(made, names, quick))
+    with_geometry(N_QUICK)  # compiles what is not on disk
+    rows += [with_geometry(n) for n in (N_GEOMETRY_QUICK if quick else N_GEOMETRY)]
+    return pd.DataFrame(rows)
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """The ways that ran, and at equal error ours beside the others.
+
+    The error of a way is the largest of its runs, at a tolerance at which none failed.
+    """
+    made = rows[(rows["group"] == GROUP) & rows["tol"].notna()]  # of packages that are there
+    made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=AGREE / 10)
+    made = made.assign(solver=made["way"], status="REACHED_END").sort_values(["case", "way", "tol", "repeat"])
+    found: dict[str, Any] = {"cases": [], "errors": list(ERRORS), "wanted": [WANTED, WANTED_LINKAGES]}
+    for case, own_rows in made.groupby("case", sort=False):
+        medians = tables.medians(own_rows)
+        own, at = medians["way"].isin(OWN), []
+        for error in ERRORS:
+            ours, others = tables.costs_at(medians[own], error), tables.costs_at(medians[~own], error, doubt=True)
+            line = {"error": error, **tables.compared({k: c for k, c in ours.items() if k == ENSEMBLE}, others)}
+            at.append(line | {"run_s": {name: cost for name, (cost, _) in (ours | others).items()}})
+        n_runs, t_end = (own_rows[name].iloc[0] for name in ("n_runs", "t_end"))
+        found["cases"].append({"case": case, "n_runs": int(n_runs), "t_end": float(t_end), "at": at})
+        found["repeats"] = int(medians["repeats"].max())
+    every = [line["ratio"] for each in found["cases"] for line in each["at"] if line["ratio"] is not None]
+    found["ratios"] = [min(every), max(every)] if every else None
+    found["verdicts"] = {
+        verdict: sum(line["verdict"] == verdict for each in found["cases"] for line in each["at"])
+        for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")
+    }
+    geometry = rows[rows["group"] == GEOMETRY]
+    found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
+    return found
+
+
+def figure_of(rows: pd.DataFrame) -> Figure:
+    """CPU time of a run over the largest error, a panel a mechanism."""
+    made = rows[(rows["group"] == GROUP) & rows["tol"].notna() & (rows["n_failed"] == 0)]
+    cases = list(dict.fromkeys(made["case"]))
+    width = 3.4 * len(cases) + 1.2
+    figure, panels = plt.subplots(1, len(cases), figsize=(width, 3.6), layout="constrained", squeeze=False)
+    colors = dict(zip((ENSEMBLE, SINGLE, HEYOKA, DIFFRAX), (figures.BLUE, figures.RED, "black", "gray"), strict=True))
+    for axes, case in zip(panels[0], cases, strict=True):
+        for way, own in made[made["case"] == case].groupby("way", sort=False):
+            line = own.groupby("tol")[["error_worst", "run_s"]].median()
+            axes.plot(line["error_worst"], 1e6 * line["run_s"], "o-", color=colors[way], label=way, ms=3.5)
+        axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
+        axes.invert_xaxis()
+        axes.grid(alpha=0.3)
+    panels[0][0].set_ylabel("CPU time of a run (µs)")
+    panels[0][-1].legend(fontsize=8)
+    return figure
+
+
+def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write findings, figure and report."""
+    found = findings_of(rows)
+    output.save_findings(found)
+    figures.save(figure_of(rows), output, "ensembles")
+    lines = []
+    for each in found["cases"]:
+        for way in (ENSEMBLE, SINGLE, HEYOKA, DIFFRAX):
+            cells = [number(1e6 * at["run_s"][way]) if way in at["run_s"] else "–" for at in each["at"]]
+            lines.append((each["case"], way, *cells))
+    ready = {"ways": table(["runs of", "way", *(power(error) for error in ERRORS)], lines)}
+    columns = ["runs", "wall-clock time (s)", "CPU time (s)", "failed", "made singly"]
+    cells = [
+        (*(each[name] for name in ("n_runs", "wall", "cpu", "n_failed", "n_singly")),) for each in found["geometry"]
+    ]
+    ready["geometry"] = table(columns, cells)
+    output.write("ensembles.md", render("ensembles", found, ready, stamp=line, quick=output.call.quick))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study."""
+    study.run_rows("ensembles", __doc__, words, make, report)
+
+
+if __name__ == "__main__":
+    main()

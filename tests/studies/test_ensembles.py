@@ -1,0 +1,112 @@
+"""Many runs in one call: every way ends where the equation in one coordinate does; sentences follow the rows."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from references.equations.many_at_once import by_diffrax, by_heyoka
+from studies import ensembles
+from studies.bench.cli import StudyError
+from studies.bench.render import render
+from studies.ensembles import DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, SINGLE, TOLERANCES
+from twoloop.mechanisms import double_pendulum
+
+T_END = 1.0
+PACKAGES = {HEYOKA: "heyoka", DIFFRAX: "diffrax"}
+
+
+@pytest.fixture(scope="module")
+def few():
+    return ensembles.linkages(9, T_END)  # not a multiple of the width of a vector
+
+
+@pytest.mark.parametrize(
+    "name", [ENSEMBLE, SINGLE, HEYOKA, pytest.param(DIFFRAX, marks=pytest.mark.slow)]
+)  # the last compiles for ten seconds
+def test_every_way_ends_where_each_linkage_does(name, few):
+    if name in PACKAGES:
+        pytest.importorskip(PACKAGES[name])
+    solve = ensembles.ways(few)[name]()
+    for _ in range(2):  # nothing is left of the call before
+        np.testing.assert_allclose(solve(1e-9), few.true, rtol=0.0, atol=1e-6)
+
+
+def test_other_mechanisms_are_refused(few):
+    for make, package in ((by_heyoka, "heyoka"), (by_diffrax, "diffrax")):
+        pytest.importorskip(package)
+        with pytest.raises(ValueError, match=r"must have the callbacks of the first.*given 'double pendulum'"):
+            make([few.problems[0], double_pendulum()], T_END)
+
+
+def test_runs_that_differ_by_their_starts_have_ends_that_two_methods_agree_on(monkeypatch):
+    made = ensembles.of_starts("andrews", 3, 0.01)
+    np.testing.assert_allclose(ensembles.in_lanes(made.problems, 0.01)(1e-9), made.true, rtol=0.0, atol=1e-6)
+    assert np.ptp(made.true, axis=0).max() > 1e-3
+    monkeypatch.setattr(ensembles, "AGREE", 0.0)
+    with pytest.raises(StudyError, match=r"by DOP853 and by Taylor are .* apart"):
+        ensembles.of_starts("andrews", 2, 0.01)
+
+
+def rows(error=lambda way, tol: tol, **seconds):
+    """Five equal repetitions at all tolerances; a run takes `seconds` at the loosest and twice as long at each next."""
+    head = {"group": ensembles.GROUP, "case": "linkages", "n_runs": 4, "t_end": 6.0, "first_s": 1.0, "n_failed": 0}
+    made = [
+        head
+        | {"way": way, "tol": tol, "repeat": repeat}
+        | {"run_s": run_s * 2.0**k, "error_median": 0.1 * tol, "error_worst": error(way, tol)}
+        for way, run_s in seconds.items()
+        for k, tol in enumerate(TOLERANCES)
+        for repeat in range(5)
+    ]
+    whole = {"group": ensembles.GEOMETRY, "n_runs": 10_000, "wall": 0.5, "cpu": 1.0, "n_failed": 0, "n_singly": 1}
+    return pd.DataFrame([*made, whole])
+
+
+def said(times, **more):
+    found = ensembles.findings_of(rows(**times, **more))
+    return render("ensembles", found, {"ways": "", "geometry": ""}, stamp="stamp", quick=False)
+
+
+def test_sentences_follow_the_rows():
+    text = said({ENSEMBLE: 0.01, SINGLE: 0.1, HEYOKA: 0.05})
+    assert "`twoloop.ensemble` takes the least time: the best of the others takes 5.0 to 5.0 times as long." in text
+    text = said({ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05})
+    assert f"ahead of the best of the others in 0 and behind in {len(ERRORS)} of {len(ERRORS)} pairs" in text
+    assert "10000 four-bar linkages" in text and "none failed" in text
+
+
+def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():
+    """At each tolerance heyoka takes less, for each error more: it is a thousand times less accurate."""
+    found = ensembles.findings_of(
+        rows(lambda way, tol: 1e3 * tol if way == HEYOKA else tol, **{ENSEMBLE: 0.02, HEYOKA: 0.01})
+    )
+    at = {line["error"]: line for line in found["cases"][0]["at"]}
+    assert at[1e-6]["verdict"] == "ahead" and at[1e-6]["ratio"] == pytest.approx(4.0, rel=1e-6)
+
+
+def test_a_way_with_failed_runs_is_not_the_cheapest():
+    table = rows(**{ENSEMBLE: 0.02, HEYOKA: 0.0005})
+    table.loc[table["way"] == HEYOKA, "n_failed"] = 1
+    assert {line["verdict"] for line in ensembles.findings_of(table)["cases"][0]["at"]} == {"alone"}
+
+
+def test_calls_after_the_first_are_repeated_in_turn(monkeypatch):
+    monkeypatch.setattr(ensembles, "TOLERANCES", (1e-4, 1e-6))
+    made = list(ensembles.rows_of(ensembles.linkages(2, 0.1), (ENSEMBLE, SINGLE), False))
+    order = [(row["tol"], row["repeat"], row["way"]) for row in made]
+    assert order == [(tol, k, way) for tol in (1e-4, 1e-6) for k in range(5) for way in (ENSEMBLE, SINGLE)]
+    assert all(row["n_failed"] == 0 and row["error_worst"] < 1e-2 for row in made)
+
+
+def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
+    def missing(*arguments):
+        raise ImportError("No module named 'heyoka'")
+
+    monkeypatch.setattr(ensembles, "by_heyoka", missing)
+    (row,) = ensembles.rows_of(few, (HEYOKA,), True)
+    assert row["way"] == HEYOKA and "not installed" in row["message"]
+
+
+def test_linkages_are_put_together_and_run():
+    row = ensembles.with_geometry(20)
+    assert row["n_runs"] == 20 and row["n_failed"] == 0 and row["wall"] > 0.0
