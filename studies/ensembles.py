@@ -249,11 +249,11 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     found = findings_of(rows)
     output.save_findings(found)
     figures.save(figure_of(rows), output, "ensembles")
-    lines = []
+    lines: list[list[str]] = []
     for each in found["cases"]:
         for way in (ENSEMBLE, SINGLE, HEYOKA, DIFFRAX):
             cells = [number(1e6 * at["run_s"][way]) if way in at["run_s"] else "–" for at in each["at"]]
-            lines.append((each["case"], way, *cells))
+            lines.append([each["case"], way, *cells])
     ready = {"ways": table(["runs of", "way", *(power(error) for error in ERRORS)], lines)}
     columns = ["runs", "wall-clock time (s)", "CPU time (s)", "failed", "made singly"]
     cells = [

@@ -156,7 +156,7 @@ def test_a_few_runs_do_not_wait_for_a_compiler(made, monkeypatch):
     monkeypatch.setattr("twoloop.generate.lane_code.OwnLanes.seconds_to_build", 10.0)
     system, q, v, parameters, *_ = made
     runs = ensemble(system, (0.0, 0.1), q[:3], v[:3], parameters=parameters[:3])
-    assert runs.singly.all() and "to compile them would take longer" in runs.message
+    assert runs.singly.all() and "to compile them does not pay" in runs.message
 
 
 def test_runs_through_a_singular_position_are_made_singly():

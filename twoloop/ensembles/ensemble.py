@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 IN_LANES = ("auto", "Taylor")  # methods that go in lanes
 CALL = 1e-3  # s of a call of solve_dae beside its steps
+WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
 
 
 def ensemble(
@@ -106,8 +107,8 @@ def ensemble(
                 raise Untraceable("the motion is stiff, and the first run was made by Newton's method")
             lanes = LaneRuns(system, starts)
             singly = n_runs * (first.stats.cpu_time + CALL)
-            if lanes.own.seconds_to_build > singly:
-                raise Untraceable(f"to compile them would take longer than these runs, about {singly:.2g} s")
+            if lanes.own.seconds_to_build > WORTH * singly:
+                raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
             in_lanes = _in_lanes(lanes, t1, times, options, n_threads, (q, v, n_steps))
         except Untraceable as reason:
             why = str(reason)
