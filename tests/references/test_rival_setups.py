@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from references.casadi.integrators import solve_cvodes, solve_idas
-from references.equations.duals import Dual, functions_on_duals
-from references.equations.expressions import FUNCTIONS, functions_of
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials import cvode_c
 from references.sundials.cvode_c import solve_cvode_c
@@ -126,14 +124,6 @@ def test_the_jacobian_of_the_accelerations_is_their_derivative(name):
         differences[k] = (ahead - behind) / 2e-6
     assert np.abs(differences).max() > 0.5
     assert np.abs(columns - differences).max() < 1e-5 * np.abs(differences).max()
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_of_duals_have_their_derivatives(name):
-    plain = functions_of(math)
-    made = functions_on_duals(plain)[name](Dual(0.4, {2: 3.0}))
-    assert made.value == plain[name](0.4)
-    assert made.by[2] == pytest.approx(3.0 * (plain[name](0.4 + 1e-6) - plain[name](0.4 - 1e-6)) / 2e-6, rel=1e-8)
 
 
 def test_cvode_takes_the_analytic_jacobian_and_differences_of_what_is_too_long(monkeypatch):

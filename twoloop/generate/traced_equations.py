@@ -30,10 +30,13 @@ class Equations:
         Its first quantities are t, q and v.
     t : Form
     q, v : list of Form (n_q,)
+    parameters : ndarray (n_p,)
+        Those of the system; who wants symbols in their place gives an array of forms before anything is traced.
     """
 
     def __init__(self, system: ConstrainedSystem):
         self.system, self.graph = system, Graph()
+        self.parameters: Any = system.parameters
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._made: dict[str, Any] = {}
@@ -66,7 +69,7 @@ class Equations:
 
     def _traced(self, kind: str, v: Sequence[Form]) -> Any:
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
-        out, shape, p = out.astype(object), out.shape, system.parameters.copy()
+        out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
         if out.size:
             try:
