@@ -174,19 +174,15 @@ class Written:
             raise NotSymbolic(f"{FUNCTIONS[kind]} cannot be had as an expression: {error!r}") from error
 
     def _sum(self, form: Form) -> Any:
-        """c + sum_i c_i x_i, a term that is not negative first."""
+        """c + sum_i c_i x_i, the negative terms last."""
         if form.key not in self.forms:
-            total = None
+            total: Any = float(form.constant)
             for i, c in sorted(form.terms.items(), key=lambda term: term[1] < 0.0):
                 x = self.known[i] if abs(c) == 1.0 else abs(c) * self.known[i]
-                if total is None:
+                if isinstance(total, float) and total == 0.0:
                     total = x if c > 0.0 else -x
                 else:
                     total = total + x if c > 0.0 else total - x
-            if total is None:
-                total = float(form.constant)
-            elif form.constant:
-                total = total + form.constant
             self.forms[form.key] = total
         return self.forms[form.key]
 

@@ -61,10 +61,13 @@ class Value:
     def __sub__(self, other: Any) -> "Value":
         return self._with("-", other)
 
+    def __rsub__(self, other: Any) -> "Value":
+        return self._with("-", other, True)
+
     def __mul__(self, other: Any) -> "Value":
         return self._with("*", other)
 
-    __rmul__ = __mul__
+    __radd__, __rmul__ = __add__, __mul__
 
     def __rtruediv__(self, other: Any) -> "Value":
         return self._with("/", other, True)

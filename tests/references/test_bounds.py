@@ -2,7 +2,6 @@
 
 import pytest
 
-from references.equations.accelerations import accelerations
 from references.paper.gear import solve_gear
 from references.scipy.index1 import solve_index1
 from references.sundials.ida import solve_ida
@@ -10,7 +9,6 @@ from references.sundials.ida_c import solve_ida_c
 from tests.test_bounds import FAR, NO_TANGENT, Q, V, beyond, system
 
 ENTRIES = {
-    "accelerations": lambda system: accelerations(system, [0.0], [[-1.0], [0.0]], [[0.0], [0.0]]),
     "solve_gear": lambda system: solve_gear(system, (0.0, 0.1), Q, V, 0.01),
     "solve_ida": lambda system: solve_ida(system, (0.0, 0.1), Q, V),
     "solve_ida_c": lambda system: solve_ida_c(system, (0.0, 0.1), Q, V),

@@ -1,18 +1,15 @@
 """Rivals are put, timed and stopped as their users would do it: what is built, counted, limited, and said of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from references.casadi import integrators as casadi_integrators
 from references.casadi.integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
 from references.diffrax import dopri8 as diffrax_dopri8
-from references.driver import TimeLimit, user_call
+from references.driver import Task, TimeLimit, user_call
 from references.paper.four_bar_minimal import trajectory
 from references.scipy import fully_implicit, index1
 from references.scipy.index1 import solve_index1
-from references.sundials import cvode_c
 from references.sundials.cvode import solve_cvode
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida import solve_ida
@@ -155,18 +152,6 @@ def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
     assert late.status is Status.SOLVER_FAILED and late.t.tolist() in ([], [0.0])
 
 
-def test_the_second_run_of_cvode_takes_the_steps_of_the_first():
-    pytest.importorskip("sksundae")
-    system, _, q, v = start(PENDULUM, 2.0)
-    functions = cvode_c.Functions(
-        cvode_c._right_hand_side(system, 0.0, q.tobytes(), v.tobytes()), None, None, np.empty(0)
-    )
-    given = functions, np.concatenate([q, v]), 0.0, 2.0, cvode_c.METHODS["Adams"], 1e-8, 1e-8
-    runs = [cvode_c.integrate(*given, times, TimeLimit(None)) for times in (np.empty(0), np.array([2.0]), TIMES)]
-    counts = [replace(statistics, cpu_time=0.0) for *_, statistics in runs]
-    assert counts[0] == counts[1] == counts[2] and counts[0].n_accepted > 50
-
-
 def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
     made = []
     before = index1.METHODS["DOP853"]
@@ -220,14 +205,14 @@ def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
 
 def test_solve_dae_differences_once_a_jacobian_and_is_told_the_rest():
     system, q, v = PENDULUM.system, PENDULUM.q0 + 0.1, PENDULUM.v0 + 0.2
-    run = fully_implicit._Run(system, None, None)
+    functions = fully_implicit.Functions(Task(system, system.n_c, 0.0, 1.0, q, v, None))
     y, yp = np.concatenate([q, v, np.zeros(2 * system.n_c)]), np.linspace(-1.0, 1.0, 2 * (system.n_q + system.n_c))
     known, calls = [np.zeros((y.size, y.size)) for _ in range(2)], []
-    matrix = run._matrix
+    matrix = functions.matrix
     for cj, into in zip((0.0, 1.0), known, strict=True):
-        matrix(0.3, y, yp, cj, into, *run._sizes_and_p)
-    run._matrix = lambda *given: calls.append(given[3]) or matrix(*given)
-    by_y, by_yp = run.jacobians(0.3, y, yp)
+        matrix(0.3, cj, y, yp, *functions.space, into.T)
+    functions.matrix = lambda *given: calls.append(given[1]) or matrix(*given)
+    by_y, by_yp = functions.jacobians(0.3, y, yp)
     assert calls == [0.0] and np.array_equal(by_y, known[0]) and np.count_nonzero(by_yp) > y.size / 2
     assert np.abs(known[1] - known[0] - by_yp).max() < 1e-6
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from references.scipy.index1 import solve_index1
-from references.sundials.ida import solve_ida
+from references.sundials.ida import ERROR_TESTS, SETTINGS, solve_ida
 from references.sundials.ida_c import solve_ida_c
-from references.sundials.ida_options import ERROR_TESTS, SETTINGS
 from tests.problems import without_tangent
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import tip_height

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from numba import njit
 
+from references.driver import OUTPUTS
 from references.paper.four_bar_minimal import trajectory
-from references.sundials import ida_c
 from references.sundials import library as sundials
+from references.sundials import loop
 from references.sundials.ida import solve_ida
-from references.sundials.ida_c import OUTPUTS, solve_ida_c
-from references.sundials.ida_compiled import iteration_matrix_at, residual_at
+from references.sundials.ida_c import solve_ida_c
+from references.sundials.residual import ALL, FORMS, iteration_matrix_at, parts_of, residual_at, space_of
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
@@ -127,25 +128,25 @@ def test_moving_pivot_without_gamma_and_with_a_mass_that_varies():
         assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-4
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("system", "tangent"),
     [(PROBLEM.system, None), (pendulum()[0], None), (pendulum(SPRING)[0], spring_tangent)],
     ids=["four-bar", "moving pivot", "exact tangent"],
 )
-def test_jacobian_is_that_of_the_residual(system, tangent):
-    n, m, f = system.n_q, system.n_c, system.functions
+def test_jacobian_is_that_of_the_residual(system, tangent, form):
+    parts = parts_of(system, form, ALL)._replace(tangent=tangent)
+    residual, matrix, size = residual_at(parts), iteration_matrix_at(parts), parts.size
     rng = np.random.default_rng(5)
-    t, cj, y, yp = 0.3, 7.0, rng.normal(size=2 * (n + m)), rng.normal(size=2 * (n + m))
-    residual = residual_at(*f[:5], n, m, system.constant_mass)
-    matrix = iteration_matrix_at(*f[:5], n, m, system.constant_mass, tangent)
-    space = system.functions.p, system.mass(t, y[:n]), np.zeros((m, n))
+    t, cj, y, yp = 0.3, 7.0, rng.normal(size=size), rng.normal(size=size)
+    space = space_of(system, form, t, y[: system.n_q].copy())
 
     def value(y, yp):
-        residual(t, y, yp, *space, res := np.zeros(y.size))
+        residual(t, y, yp, *space[:3], res := np.zeros(y.size))
         return res
 
     computed = np.zeros((y.size, y.size))
-    matrix(t, cj, y, yp, *space, np.zeros((n, n)), *np.zeros((3, y.size)), computed)
+    matrix(t, cj, y, yp, *space, computed)
     for j, e in enumerate(1e-5 * np.eye(y.size)):
         column = (value(y + e, yp + cj * e) - value(y - e, yp - cj * e)) / 2e-5
         assert np.abs(computed[j] - column).max() < 1e-5
@@ -192,8 +193,8 @@ def test_a_function_that_fails_comes_back_as_a_row(kind, flag, capfd):
 
 
 def test_too_many_steps_end_the_run(monkeypatch):
-    monkeypatch.setattr(ida_c, "MOST_STEPS", 20)
-    monkeypatch.setattr(ida_c, "STEPS_A_CALL", 10)
+    monkeypatch.setattr(loop, "MOST_STEPS", 20)
+    monkeypatch.setattr(loop, "STEPS_A_CALL", 10)
     result = run(10.0, 1e-8, t_eval=[1e-6, 10.0])
     assert result.status is Status.SOLVER_FAILED and "IDA_TOO_MUCH_WORK (-1)" in result.message
     assert result.t.tolist() == [1e-6]

@@ -11,8 +11,8 @@ from references.equations.straight_line import straight_line, straight_line_jaco
 from references.sundials import cvode_c
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.cvode_projection import projection_for_cvode
+from references.sundials.ida import NOT_TESTED, tolerances
 from references.sundials.ida_c import solve_ida_c
-from references.sundials.ida_options import NOT_TESTED, tolerances
 from studies.bench.figures import STYLES
 from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
 from twoloop import ConstrainedSystem, callback
