@@ -37,7 +37,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.equations.nonholonomic import with_all_rows
+from references.equations.rows import with_all_rows
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_vector
 from twoloop.checks.consistency import check_start
 from twoloop.problem.problem import Problem

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from references.driver import check_system
-from references.equations.redundant_rows import independent_rows
+from references.equations.rows import independent_rows
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced

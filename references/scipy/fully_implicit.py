@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import CAUSES, Task, TimeLimit, check_choice, check_task, result_of, user_call
-from references.equations.redundant_rows import on_independent_rows
+from references.equations.rows import on_independent_rows
 from references.scipy.steps import Steps
 from references.sundials.residual import (
     ALL,

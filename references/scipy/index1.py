@@ -19,7 +19,7 @@ from references.driver import ADVICE, TimeLimit, check_choice, check_task, longe
 from references.equations.accelerations import Equations, matrix_of, saddle_solve, schur_factors, times_inverse
 from references.equations.expressions import NotSymbolic
 from references.equations.linear import OPTIONS, cholesky_solve
-from references.equations.redundant_rows import on_independent_rows
+from references.equations.rows import on_independent_rows
 from references.equations.straight_line import straight_line_jacobian
 from references.scipy.steps import Steps
 from twoloop.checks.arguments import check_positive

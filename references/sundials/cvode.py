@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from references.driver import ADVICE, OutOfTimeError, TimeLimit, check_choice, check_task, user_call
 from references.equations.ode import ode_result
-from references.equations.redundant_rows import on_independent_rows
+from references.equations.rows import on_independent_rows
 from references.scipy.index1 import RightHandSide
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result

@@ -16,7 +16,7 @@ from references.equations.ode import ode_result
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.library import library, made
-from references.sundials.loop import memory, run
+from references.sundials.loop import Memory, run
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics
@@ -152,7 +152,8 @@ def integrate(
     max_step: float | None = None,
 ) -> tuple[Array, Array, str, Statistics]:
     """The times that were reached, rows y there, why it failed ("": it did not), and CVODE's counters."""
-    with memory("CVode", start[None].copy(), span, METHODS[method]) as solver:
+
+    def set_up(solver: Memory) -> None:
         solver.call("Init", functions.rate.address, span[0], *solver.vectors)
         solver.call("SStolerances", float(rtol), float(atol))
         if method == "Adams":
@@ -165,4 +166,6 @@ def integrate(
             solver.call("SetUserData", functions.data.ctypes.data)
             solver.call("SetProjFn", functions.projection.address)
         solver.bound_steps(max_step)
-        return run(solver, times, time_limit, COUNTERS[method], ADVICE)
+
+    given = "CVode", start[None], span, (METHODS[method],), set_up
+    return run(*given, times, time_limit, COUNTERS[method], ADVICE)

@@ -23,7 +23,7 @@ import sksundae
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import CAUSES, Task, TimeLimit, check_choice, check_task, longest_step, result_of, user_call
-from references.equations.redundant_rows import on_independent_rows
+from references.equations.rows import on_independent_rows
 from references.sundials.residual import (
     ALL,
     FORMS,

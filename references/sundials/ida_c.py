@@ -14,10 +14,10 @@ from numba import carray, cfunc, njit, types
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import check_system, check_task, result_of
-from references.equations.redundant_rows import on_independent_rows
+from references.equations.rows import on_independent_rows
 from references.sundials.ida import HIGHEST_ORDER, check_options, positions_of, tolerances
 from references.sundials.library import library
-from references.sundials.loop import RAISED, memory, run
+from references.sundials.loop import RAISED, Memory, run
 from references.sundials.residual import (
     OPTIONS,
     Parts,
@@ -33,7 +33,7 @@ from twoloop.result.result import Result
 
 Array = NDArray[np.float64]
 
-COUNTERS: dict[str, tuple[str, ...]] = {"n_evaluations": ("ResEvals",), "n_factorizations": ("JacEvals",)}
+COUNTERS = {"n_evaluations": ("ResEvals",), "n_factorizations": ("JacEvals",)}
 ADVICE = (
     "Look for a discontinuity, a singular position, a value that is not finite or an exception in a callback near this "
     "time, or try other tolerances."
@@ -92,14 +92,17 @@ def solve_ida_c(
     absolute = tolerances(system, state.shape[1], error_test, float(atol))
     residual, jacobian = _compiled(parts_of(system, form, positions_of(task)), system.functions.p.size)
     data = np.concatenate([each.ravel() for each in space_of(system, form, task.t0, task.q0)])
-    with memory("IDA", state, (task.t0, task.t1)) as solver:
+
+    def set_up(solver: Memory) -> None:
         solver.call("Init", residual.address, task.t0, *solver.vectors)
         solver.call("SVtolerances", float(rtol), solver.vector(absolute))
         solver.call("SetMaxOrd", max_order)
         solver.call("SetUserData", data.ctypes.data)
         solver.solve_dense(jacobian)
         solver.bound_steps(max_step)
-        times, rows, failure, statistics = run(solver, task.instants, time_limit, COUNTERS, ADVICE)
+
+    given = "IDA", state, (task.t0, task.t1), (), set_up
+    times, rows, failure, statistics = run(*given, task.instants, time_limit, COUNTERS, ADVICE)
     end = f"IDA reached the end, t = {task.t1:g}."
     columns = columns_of(form, system.n_q, system.n_c, *np.split(rows.T, 2))
     return result_of(system.n_q, times, columns, end, failure, statistics)

@@ -2,8 +2,8 @@
 
 import ctypes
 import itertools
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -129,27 +129,33 @@ class Memory:
         return name
 
 
-@contextmanager
-def memory(kind: str, state: Array, span: tuple[float, float], *given: int) -> Iterator[Memory]:
-    """A memory; all is freed at the end."""
-    with ExitStack() as stack:
-        yield Memory(stack, kind, state, span, *given)
-
-
 def run(
-    solver: Memory, times: Array, time_limit: float | None, counters: dict[str, tuple[str, ...]], advice: str
+    kind: str,
+    start: Array,
+    span: tuple[float, float],
+    given: tuple[int, ...],
+    set_up: Callable[[Memory], None],
+    times: Array,
+    time_limit: float | None,
+    counters: Mapping[str, tuple[str, ...]],
+    advice: str,
 ) -> tuple[Array, Array, str, Statistics]:
     """The times that were reached, the states there as rows, why it failed ("": it did not), and the statistics.
 
-    Timed is a second use of the memory, as SUNDIALS' guides have it: ReInit, and steps to the end without output.
+    Timed is a second use of a memory, as SUNDIALS' guides have it: ReInit, and steps to the end without output. The
+    output has a memory of its own: CVODE's ReInit does not forget when it projected last.
     """
-    limit = TimeLimit(time_limit)
-    with user_call as clock:
-        solver.restart()
-        flag = solver.go_to_the_end(limit)
-    counts = {name: sum(map(solver.counted, parts)) for name, parts in (COUNTERS | counters).items()}
-    statistics = Statistics(cpu_time=clock.seconds or 0.0, **counts)
-    failure, kept = solver.failure(flag, limit, advice), times[times <= solver.reached.value]
-    solver.restart()
-    rows = solver.rows_at(kept)
-    return kept[: len(rows)], rows, failure, statistics
+    with ExitStack() as stack:
+        solver = Memory(stack, kind, start.copy(), span, *given)
+        set_up(solver)
+        limit = TimeLimit(time_limit)
+        with user_call as clock:
+            solver.restart()
+            flag = solver.go_to_the_end(limit)
+        counts = {name: sum(map(solver.counted, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
+        failure, kept = solver.failure(flag, limit, advice), times[times <= solver.reached.value]
+    with ExitStack() as stack:
+        solver = Memory(stack, kind, start.copy(), span, *given)
+        set_up(solver)
+        rows = solver.rows_at(kept)
+    return kept[: len(rows)], rows, failure, Statistics(cpu_time=clock.seconds or 0.0, **counts)

@@ -8,7 +8,8 @@ import pytest
 
 from references.driver import TimeLimit
 from references.exudyn.beam import solve_exudyn_beam
-from references.exudyn.four_bar import SOLVERS, solve_exudyn
+from references.exudyn.mechanisms import solve_exudyn
+from references.exudyn.run import SOLVERS
 from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import solve_gear
 from references.scipy.beam_reduced import reduced_motion

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from references.exudyn.beam import MODELS, solve_exudyn_beam
-from references.exudyn.four_bar import SOLVERS, solve_exudyn
+from references.exudyn.mechanisms import solve_exudyn
+from references.exudyn.run import SOLVERS
 from references.sundials.ida import solve_ida
 from twoloop.mechanisms import ancf_beam, four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height

@@ -5,7 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from references.exudyn.four_bar import SOLVERS, solve_exudyn
+from references.exudyn.mechanisms import solve_exudyn
+from references.exudyn.run import SOLVERS
 from references.paper.four_bar_minimal import MinimalFourBar
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("exudyn")
 
-from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn_mechanism
+from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn
 from references.exudyn.model import frame
 from studies.validation import study as validation
 from twoloop import mechanisms
@@ -16,7 +16,7 @@ FEWEST = {"spatial slider-crank": 1000, "heavy top": 500, "A04 Bricard": 1000}  
 
 def end_error(problem, n_steps, **options):
     known = problem.reference
-    result = solve_exudyn_mechanism(problem, known.t, n_steps, store_every=n_steps, **options)
+    result = solve_exudyn(problem, known.t, n_steps, store_every=n_steps, **options)
     assert result.success, result.message
     assert np.abs(result.q[:, 0] - problem.q0).max() < 1e-12
     assert np.abs(result.v[:, 0] - problem.v0).max() < 1e-12
@@ -44,7 +44,7 @@ def test_the_list_of_the_study_is_that_of_the_models():
 
 def test_other_mechanisms_are_refused():
     with pytest.raises(ValueError, match=r"problem must be of A02 or one of .*given 'double pendulum'"):
-        solve_exudyn_mechanism(mechanisms.double_pendulum(), 1.0, 100)
+        solve_exudyn(mechanisms.double_pendulum(), 1.0, 100)
 
 
 def test_frames_are_rotations_with_the_columns_given():

@@ -8,8 +8,7 @@ pytest.importorskip("exudyn")
 import exudyn as exu
 
 from references.exudyn import run as exudyn_run
-from references.exudyn.four_bar import _model, _positions
-from references.exudyn.mechanisms import MODELS, solve_exudyn_mechanism
+from references.exudyn.mechanisms import MODELS, model_of, solve_exudyn
 from studies.bench.collector import Case
 from studies.bench.solvers import CATALOGUE, RADII, RIVALS
 from studies.validation import study as validation
@@ -20,7 +19,7 @@ TOP = PROBLEMS["heavy top"]
 
 
 def top_at(radius):
-    return solve_exudyn_mechanism(TOP, 0.2, 200, spectral_radius=radius)
+    return solve_exudyn(TOP, 0.2, 200, spectral_radius=radius)
 
 
 def test_the_radius_reaches_the_solver_and_the_default_is_exudyns():
@@ -31,9 +30,9 @@ def test_the_radius_reaches_the_solver_and_the_default_is_exudyns():
 
 
 def test_more_damping_is_less_accurate_and_of_order_two():
-    fine = solve_exudyn_mechanism(TOP, 0.2, 6400).q[:, -1]
+    fine = solve_exudyn(TOP, 0.2, 6400).q[:, -1]
     errors = {
-        (radius, n): np.abs(solve_exudyn_mechanism(TOP, 0.2, n, spectral_radius=radius).q[:, -1] - fine).max()
+        (radius, n): np.abs(solve_exudyn(TOP, 0.2, n, spectral_radius=radius).q[:, -1] - fine).max()
         for radius, n in ((0.9, 200), (0.3, 200), (0.3, 400))
     }
     assert errors[0.3, 200] > errors[0.9, 200]
@@ -48,7 +47,7 @@ def test_a_radius_out_of_range_is_named(radius):
 
 def test_the_radius_belongs_to_one_solver():
     with pytest.raises(ValueError, match="spectral_radius belongs to solver='GeneralizedAlpha'"):
-        solve_exudyn_mechanism(TOP, 0.2, 200, "HHT", spectral_radius=0.6)
+        solve_exudyn(TOP, 0.2, 200, "HHT", spectral_radius=0.6)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -76,8 +75,8 @@ def test_any_number_of_steps_can_be_asked_for():
 def test_solvers_with_error_control_refuse_joints(name):
     """When one of them no longer does, it belongs into the catalogue."""
     problem = four_bar()
-    _container, mbs, _ = _model(problem, _positions(problem))
+    model = model_of(problem)
     settings = exudyn_run._settings(0.1, 10, 1)
     settings.timeIntegration.automaticStepSize = True
     with exudyn_run._silence(), pytest.raises(exu.ModelError, match="constraints that cannot be solved"):
-        mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, name))
+        model.mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, name))

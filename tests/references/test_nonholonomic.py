@@ -5,7 +5,7 @@ import pytest
 
 from references.casadi.integrators import solve_idas
 from references.diffrax.dopri8 import solve_diffrax
-from references.equations.nonholonomic import with_all_rows
+from references.equations.rows import with_all_rows
 from references.heyoka.taylor import solve_heyoka
 from references.paper.gear import solve_gear
 from references.scipy.index1 import solve_index1

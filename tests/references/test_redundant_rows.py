@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from references.equations.redundant_rows import independent_rows
+from references.equations.rows import independent_rows
 from references.scipy.fully_implicit import solve_fully_implicit
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode import solve_cvode
