@@ -32,6 +32,7 @@ import os
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Self
 
 import numpy as np
@@ -138,6 +139,16 @@ def check_time_limit(time_limit: float | None) -> None:
     """Say what is wrong with a time limit."""
     if time_limit is not None:
         check_positive("time_limit", time_limit)
+
+
+def imported(module: str, name: str = "", extra: str = "peers") -> Any:
+    """An optional package, or a module of it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        name = name or module.partition(".")[0]
+        how = "make peers, or pip" if extra == "peers" else "pip"
+        raise RuntimeError(f"{name} is not installed: {how} install 'twoloop[{extra}]'") from error
 
 
 def longest_step(max_step: float | None, span: float) -> float:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import ADVICE, Task, TimeLimit, check_choice, check_task, user_call
+from references.driver import ADVICE, Task, TimeLimit, check_choice, check_task, imported, user_call
 from references.equations.expressions import Expressions, functions_of
 from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_size
@@ -201,17 +201,9 @@ def _solved(
     return ode_result(task.system, times, states, failure, f"{name} reached the end, t = {t1:g}.", statistics)
 
 
-def _casadi() -> Any:
-    try:
-        import casadi
-    except ImportError as error:
-        raise RuntimeError("casadi is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    return casadi
-
-
 @lru_cache(maxsize=256)
 def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> dict[str, Any]:
-    casadi, n = _casadi(), system.n_q
+    casadi, n = imported("casadi"), system.n_q
     made = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
     t, x = casadi.SX.sym("t"), casadi.SX.sym("x", 2 * n)
     q, v = ([x[first + i] for i in range(n)] for first in (0, n))
@@ -223,7 +215,7 @@ def _integrator(
     plugin: str, system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, options: tuple[Any, ...], times: bytes
 ) -> Any:
     """What integrates to these times; compiled, where there is a compiler and that helps."""
-    casadi, compiler = _casadi(), shutil.which("cc")
+    casadi, compiler = imported("casadi"), shutil.which("cc")
     arguments = ("motion", plugin, _equations(system, t0, q0, v0), t0, np.frombuffer(times).tolist())
     given = dict(options) | ({"rootfinder_options": ROOT} if plugin == "collocation" else {})
     if compiler is None or system.n_q > LARGEST_COMPILED:

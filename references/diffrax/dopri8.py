@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import ADVICE, TimeLimit, check_task, user_call
+from references.driver import ADVICE, TimeLimit, check_task, imported, user_call
 from references.equations.expressions import Expressions, NotSymbolic, functions_of
 from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_size
@@ -113,11 +113,7 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_s
 
 def packages() -> tuple[Any, Any]:
     """JAX, set to numbers of 64 bits, and diffrax."""
-    try:
-        import diffrax
-        import jax
-    except ImportError as error:
-        raise RuntimeError("diffrax is not installed: make peers, or pip install 'twoloop[peers]'") from error
+    diffrax, jax = imported("diffrax"), imported("jax")
     jax.config.update("jax_enable_x64", True)
     return jax, diffrax
 

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from references.diffrax.dopri8 import derivative_of, packages, solved
+from references.driver import imported
 from references.equations.expressions import Expressions
-from references.heyoka.taylor import heyoka, rates_of
+from references.heyoka.taylor import rates_of
 from twoloop.problem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -38,7 +39,7 @@ def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
 
 def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
     """heyoka's Taylor integrator in batches as wide as the processor's vectors, built once a tolerance."""
-    package = heyoka()
+    package = imported("heyoka")
     equations, states, parameters = _gathered(problems)
     n, width, made = equations.system.n_q, package.recommended_simd_size(), {}
     motion = rates_of(equations, [package.par[i] for i in range(parameters.shape[1])])

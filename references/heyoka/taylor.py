@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import ADVICE, TimeLimit, check_task, longest_step, user_call
+from references.driver import ADVICE, TimeLimit, check_task, imported, longest_step, user_call
 from references.equations.expressions import Expressions, functions_of
 from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_positive
@@ -68,7 +68,7 @@ def integrate(
     integrator: Any, start: Array, span: tuple[float, float], times: Array, time_limit: float | None, longest: float
 ) -> tuple[Array, Array, str, str, Statistics]:
     """The times that were reached, rows y there, why it failed ("": it did not), what is said if not, statistics."""
-    (t0, t1), outcomes = span, heyoka().taylor_outcome
+    (t0, t1), outcomes = span, imported("heyoka").taylor_outcome
     limit, steps = TimeLimit(time_limit), 0
     with user_call as clock:
         integrator.time, integrator.state[:] = t0, start
@@ -90,18 +90,9 @@ def integrate(
     return kept, rows, failure, end, Statistics(n_accepted=steps, cpu_time=clock.seconds or 0.0)
 
 
-def heyoka() -> Any:
-    """The package."""
-    try:
-        import heyoka
-    except ImportError as error:
-        raise RuntimeError("heyoka is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    return heyoka
-
-
 def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> list[tuple[Any, Any]]:
     """heyoka's variables q, v and their rates."""
-    package, n = heyoka(), equations.system.n_q
+    package, n = imported("heyoka"), equations.system.n_q
     symbols = package.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
     state = package.time, symbols[:n], symbols[n:]
     rates = [*symbols[n:], *equations.accelerations(functions_of(package), *state, parameters or [])]
@@ -111,7 +102,7 @@ def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> lis
 
 @lru_cache(maxsize=256)
 def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> Any:
-    package, q, v = heyoka(), np.frombuffer(q0).copy(), np.frombuffer(v0).copy()
+    package, q, v = imported("heyoka"), np.frombuffer(q0).copy(), np.frombuffer(v0).copy()
     return package.taylor_adaptive(
         rates_of(Expressions(system, t0, q, v)),
         [*q, *v],

@@ -12,7 +12,7 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import Task, check_task
+from references.driver import Task, check_task, imported
 from references.equations.ode import ode_result
 from references.heyoka import taylor
 from references.minimal.equations import Minimal, minimal
@@ -120,7 +120,7 @@ def _minimal(same: _Same) -> Minimal:
 
 @lru_cache(maxsize=256)
 def _integrator(own: Minimal, tol: float) -> Any:
-    package = taylor.heyoka()
+    package = imported("heyoka")
     symbols = package.make_vars(*(f"y{i}" for i in range(len(own.start))))
     equations = list(zip(symbols, own.equations(package)(symbols), strict=True))
     return package.taylor_adaptive(equations, list(own.start), tol=tol, fast_math=True, compact_mode=False)

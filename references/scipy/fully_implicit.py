@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import CAUSES, Task, TimeLimit, check_choice, check_task, result_of, user_call
+from references.driver import CAUSES, Task, TimeLimit, check_choice, check_task, imported, result_of, user_call
 from references.equations.rows import on_independent_rows
 from references.scipy.steps import Steps
 from references.sundials.residual import (
@@ -70,7 +70,8 @@ def solve_fully_implicit(
     """
     check_choice("method", method, METHODS)
     task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), takes_velocity_rows=False)
-    solver_type, functions = _solver_type(method), Functions(task)
+    package, functions = imported("solve_dae.integrate"), Functions(task)
+    solver_type = package.BDFDAE if method == "BDF" else package.RadauDAE
     y0, yp0 = start_of(system, "stabilised", task.t0, task.q0, task.v0)
     options = {"rtol": float(rtol), "atol": float(atol), "jac": functions.jacobians, **METHODS[method]}
 
@@ -96,17 +97,6 @@ def solve_fully_implicit(
     )
 
 
-def _solver_type(method: str) -> Callable[..., Any]:
-    try:
-        from solve_dae.integrate import BDFDAE, RadauDAE
-    except ImportError as error:
-        raise RuntimeError(
-            "the package solve_dae is not installed. Install it, or this project with its extra: pip install "
-            "'twoloop[peers]'"
-        ) from error
-    return BDFDAE if method == "BDF" else RadauDAE  # type: ignore[no-any-return]
-
-
 class Functions:
     """F(t, y, y') and its derivatives as the package calls them."""
 
@@ -115,7 +105,7 @@ class Functions:
         self._residual, self.matrix = residual_at(parts), iteration_matrix_at(parts)
         self.space, self._sizes = space_of(task.system, "stabilised", task.t0, task.q0), (n, m)
         self.raised = False  # a callback raised an exception
-        start = np.zeros((2, parts.size))
+        start = np.zeros((2, 2 * (n + m)))
         start[0, : 2 * n] = task.y0
         self.residual(TimeLimit(None))(task.t0, *start)  # compiles
         self.jacobians(task.t0, *start)

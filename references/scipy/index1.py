@@ -15,7 +15,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
-from references.driver import ADVICE, TimeLimit, check_choice, check_task, longest_step, result_of, user_call
+from references.driver import ADVICE, TimeLimit, check_choice, check_task, imported, longest_step, result_of, user_call
 from references.equations.accelerations import Equations, matrix_of, saddle_solve, schur_factors, times_inverse
 from references.equations.expressions import NotSymbolic
 from references.equations.linear import OPTIONS, cholesky_solve
@@ -101,7 +101,7 @@ def solve_index1(
     _check_choices(method, stabilisation, alpha)
     task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol))
     t0, t1, y0, times = task.t0, task.t1, task.y0, task.times
-    solver_type = METHODS[method] if method in METHODS else _pair(method)
+    solver_type = METHODS[method] if method in METHODS else getattr(imported("extensisq"), method)
     strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0
     equations, projected = RightHandSide(task.system, t0, task.q0, strength), stabilisation == "projection"
     equations.warm(t0, y0, projected)
@@ -127,14 +127,6 @@ def solve_index1(
     columns = np.concatenate([shown.states, *equations.at_points(shown.t, shown.states, equations.alpha)])
     end = f"{method} reached the end, t = {t1:g}."
     return result_of(system.n_q, shown.t, columns, end, run.message(method, ADVICE), statistics, np.diff(run.ends))
-
-
-def _pair(method: str) -> type[OdeSolver]:
-    try:
-        import extensisq
-    except ImportError as error:
-        raise RuntimeError("extensisq is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    return getattr(extensisq, method)  # type: ignore[no-any-return]
 
 
 def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None:

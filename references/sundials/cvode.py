@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import ADVICE, OutOfTimeError, TimeLimit, check_choice, check_task, user_call
+from references.driver import ADVICE, OutOfTimeError, TimeLimit, check_choice, check_task, imported, user_call
 from references.equations.ode import ode_result
 from references.equations.rows import on_independent_rows
 from references.scipy.index1 import RightHandSide
@@ -53,14 +53,10 @@ def solve_cvode(
         `a` and `lam` from eq. (6) at the stored states. Of the statistics: n_evaluations, all calls of the right-hand
         side.
     """
-    from references.sundials.ida import states_at
-
     check_choice("method", method, METHODS)
     task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
-    try:
-        from sksundae.cvode import CVODE
-    except ImportError as error:
-        raise RuntimeError("scikit-sundae is not installed: pip install 'twoloop[references]'") from error
+    CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
+    from references.sundials.ida import states_at
 
     t0, t1, times, y0 = task.t0, task.t1, task.instants, task.y0
     equations = RightHandSide(task.system, t0, task.q0, 0.0)

@@ -192,8 +192,8 @@ def _solver(task: Task, form: str, start: Array, options: dict[str, Any], limit:
             JJ[:] = 0.0  # it arrives as the last call left it
             matrix(t, cj, state[0], state[1], *space, JJ.T)
 
-    residual(task.t0, state[0], state[1], *space[:3], np.empty(parts.size))  # compiles
-    matrix(task.t0, 1.0, state[0], state[1], *space, np.zeros((parts.size, parts.size)).T)
+    residual(task.t0, state[0], state[1], *space[:3], np.empty(start.shape[1]))  # compiles
+    matrix(task.t0, 1.0, state[0], state[1], *space, np.zeros((start.shape[1],) * 2).T)
     return sksundae.ida.IDA(resfn, jacfn=jacfn, **options)
 
 

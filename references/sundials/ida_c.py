@@ -90,7 +90,9 @@ def solve_ida_c(
     system, form = task.system, "stabilised"
     state = start_of(system, form, task.t0, task.q0, task.v0)
     absolute = tolerances(system, state.shape[1], error_test, float(atol))
-    residual, jacobian = _compiled(parts_of(system, form, positions_of(task)), system.functions.p.size)
+    residual, jacobian = _compiled(
+        parts_of(system, form, positions_of(task)), system.n_q, system.n_c, system.functions.p.size
+    )
     data = np.concatenate([each.ravel() for each in space_of(system, form, task.t0, task.q0)])
 
     def set_up(solver: Memory) -> None:
@@ -109,9 +111,9 @@ def solve_ida_c(
 
 
 @lru_cache(maxsize=64)
-def _compiled(parts: Parts, n_p: int) -> tuple[Any, Any]:
+def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
     """IDA's residual and Jacobian functions; their user data are the arrays of `space_of`, one after another."""
-    n, m, size = parts.n, parts.m, parts.size
+    size = 2 * (n + m)  # a constant of the machine code, as the others
     ends = np.cumsum([n_p, n * n, m * n, n * n, size, size, size]).tolist()
     after_p, after_M, after_Cq, after_K, after_y, after_here, n_memory = ends
     array_of, matrix_of = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data

@@ -20,6 +20,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from references.equations.accelerations import compiled_gamma
+from references.equations.ode import accelerations
 from twoloop.kernels.compile.callbacks import stand_in
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 from twoloop.problem.system import ConstrainedSystem
@@ -37,7 +38,7 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "rea
 
 
 class Parts(NamedTuple):
-    """What the functions of a system are compiled of; the sizes are constants of the machine code.
+    """What the functions of a system are compiled of; they take the sizes from M and C_q.
 
     `positions`: how many rows are of C. `tangent`: dQ/dq, if nothing of the force is to be differenced.
     """
@@ -50,15 +51,8 @@ class Parts(NamedTuple):
     constraint_rate: Dispatcher
     gamma: Callable[..., None]
     tangent: Dispatcher | None
-    n: int
-    m: int
     positions: int
     constant_mass: bool
-
-    @property
-    def size(self) -> int:
-        """How many unknowns there are."""
-        return 2 * self.n + (self.m if self.index1 else 2 * self.m)
 
 
 def parts_of(system: ConstrainedSystem, form: str, positions: int) -> Parts:
@@ -66,7 +60,7 @@ def parts_of(system: ConstrainedSystem, form: str, positions: int) -> Parts:
     f, index1 = system.functions, form == "index1"
     gamma = compiled_gamma(system) if index1 else f.gamma
     functions = f.mass, f.force, f.constraint, f.jacobian, f.constraint_rate, gamma, own_tangent(system)
-    return Parts(index1, *functions, system.n_q, system.n_c, positions, system.constant_mass)
+    return Parts(index1, *functions, positions, system.constant_mass)
 
 
 def own_tangent(system: ConstrainedSystem) -> Dispatcher | None:
@@ -77,12 +71,9 @@ def own_tangent(system: ConstrainedSystem) -> Dispatcher | None:
 
 
 def start_of(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> Array:
-    """Unknowns and their derivatives at the start (2, size); accelerations and multipliers from one linear system."""
-    n, m = system.n_q, system.n_c
-    jacobian, gamma = system.jacobian(t0, q), np.zeros(m)
-    compiled_gamma(system)(t0, q, v, system.functions.p, gamma)
-    kkt = np.block([[system.mass(t0, q), jacobian.T], [jacobian, np.zeros((m, m))]])
-    a, lam = np.split(np.linalg.solve(kkt, np.concatenate([system.force(t0, q, v), gamma])), [n])
+    """Unknowns and their derivatives at the start (2, size); accelerations and multipliers by eq. (6)."""
+    m = system.n_c
+    a, lam = (each[:, 0] for each in accelerations(system, np.array([t0]), np.concatenate([q, v])[:, None]))
     zeros = np.zeros(m)
     if form == "index1":
         return np.array([np.concatenate([q, v, lam]), np.concatenate([v, a, zeros])])
@@ -105,10 +96,11 @@ def space_of(system: ConstrainedSystem, form: str, t0: float, q0: Array) -> tupl
 @lru_cache(maxsize=64)
 def residual_at(parts: Parts) -> Callable[..., None]:
     """(t, y, y', p, M, Cq, res) -> None: the residual; M and C_q are left as they are at q."""
-    index1, mass, force, constraint, jacobian, constraint_rate, gamma, _, n, m, positions, constant_mass = parts
+    index1, mass, force, constraint, jacobian, constraint_rate, gamma, _, positions, constant_mass = parts
 
     @njit(**OPTIONS)
     def residual(t, y, yp, p, M, Cq, res):  # type: ignore[no-untyped-def]
+        m, n = Cq.shape
         q, v, a = y[:n], y[n : 2 * n], yp[n : 2 * n]
         if not constant_mass:
             M[:, :] = 0.0
@@ -158,15 +150,15 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
 
     J arrives full of zeros. With a tangent, what is differenced is the residual without the force.
     """
-    index1, mass, force, _, jacobian, _, gamma, tangent, n, m, positions, constant_mass = parts
+    index1, mass, force, _, jacobian, _, gamma, tangent, positions, constant_mass = parts
     exact = tangent is not None
     add_tangent = stand_in("force_by_q") if tangent is None else tangent
     differenced = residual_at(parts._replace(force=_no_force if exact else force, tangent=None))
     by_velocities = index1 or not exact
-    below = 2 * n if index1 else 2 * n + m  # the first of the rows whose derivatives by q are differenced
 
     @njit(**OPTIONS)
-    def of_velocities(t, q, v, p, out):  # type: ignore[no-untyped-def]
+    def of_velocities(t, q, v, p, m, out):  # type: ignore[no-untyped-def]
+        n = q.size
         out[: n + m] = 0.0
         if not exact:
             force(t, q, v, p, out[:n])
@@ -175,6 +167,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
 
     @njit(**OPTIONS)
     def iteration_matrix(t, cj, y, yp, p, M, Cq, K, moved, here, there, J):  # type: ignore[no-untyped-def]
+        m, n = Cq.shape
         moved[:] = y
         q, v = moved[:n], moved[n : 2 * n]
         if not constant_mass:
@@ -198,11 +191,11 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
             for k in range(positions, m):
                 J[2 * n + m + k, 2 * n + k] = 1.0
         if by_velocities:
-            of_velocities(t, q, v, p, here)
+            of_velocities(t, q, v, p, m, here)
             for j in range(n):
                 step = DIFFERENCE * max(1.0, abs(y[n + j]))
                 v[j] = y[n + j] + step
-                of_velocities(t, q, v, p, there)
+                of_velocities(t, q, v, p, m, there)
                 v[j] = y[n + j]
                 for i in range(n + m if index1 else n):
                     J[n + j, n + i] -= (there[i] - here[i]) / step
@@ -214,7 +207,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
             q[j] = y[j]
             for i in range(2 * n):
                 J[j, i] = (there[i] - here[i]) / step
-            for i in range(below, y.size):
+            for i in range(2 * n if index1 else 2 * n + m, y.size):  # C_q stands above
                 J[j, i] = (there[i] - here[i]) / step
             J[j, j] += cj
         if exact:

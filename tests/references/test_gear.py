@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from references.equations.accelerations import accelerations
+from references.equations.ode import accelerations
 from references.paper import gear
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
@@ -100,7 +100,7 @@ def test_low_orders_damp_and_the_third_feeds(order, least, most):
 def test_accelerations_and_multipliers():
     result = run(1.0, 2e-3, 4, start="accurate")
     q, v = truth().states(result.t)
-    a, lam = accelerations(PROBLEM.system, result.t, q, v)
+    a, lam = accelerations(PROBLEM.system, result.t, np.concatenate([q, v]))
     assert worst(result.a, a) < 1e-3 and worst(result.lam, lam) < 1e-3
     first = run(0.1, 0.01, 1)
     assert worst(np.diff(first.v) / 0.01, first.a[:, 1:]) < 1e-10  # the derivative that the formula takes
