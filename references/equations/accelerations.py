@@ -125,9 +125,7 @@ def _accelerations(
                 lam[i] -= 2.0 * alpha * Ct[i] + alpha * alpha * C[i]
         a[:] = 0.0
         force(t, q, v, p, a)
-        if definite:
-            return _eliminate(L, known, Cq, a, lam)
-        return saddle_solve(L, Cq, a, lam)
+        return solve_for(L, definite, known, Cq, a, lam)
 
     return accelerate  # type: ignore[no-any-return]
 
@@ -180,8 +178,13 @@ def times_inverse(L, known, x):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def schur_factors(L, known, Cq):  # type: ignore[no-untyped-def]
-    """Factors of S = C_q M^-1 C_q^T, and whether S is positive definite."""
+def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
+    """Eq. (6), by eqs. (7) and (8): a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers.
+
+    `L`: the factors of M, or M itself where it is not definite. Returns False where the matrix is singular.
+    """
+    if not definite:
+        return saddle_solve(L, Cq, a, lam)
     m, n = Cq.shape
     S, W, x = np.zeros((m, m)), Cq.T.copy(), np.empty(n)
     for i in range(m):
@@ -191,17 +194,9 @@ def schur_factors(L, known, Cq):  # type: ignore[no-untyped-def]
             if x[j] != 0.0:
                 for k in range(i, m):
                     S[k, i] += x[j] * W[j, k]
-    return S, cholesky(S)
-
-
-@njit(**OPTIONS)
-def _eliminate(L, known, Cq, a, lam):  # type: ignore[no-untyped-def]
-    """Eqs. (7) and (8): a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers."""
-    m, n = Cq.shape
-    S, definite = schur_factors(L, known, Cq)
-    if not definite:
+    if not cholesky(S):
         return False
-    x = a.copy()
+    x[:] = a
     times_inverse(L, known, x)
     for i in range(m):
         lam[i] = -lam[i]

@@ -59,7 +59,9 @@ def accelerations(system: ConstrainedSystem, t: Array, states: Array) -> tuple[A
 def _solved(matrices: Array, right: Array, n: int) -> tuple[Array, Array]:
     """Solutions (n_t, n), (n_t, n_c) of linear equations with the matrices [M C_q^T; C_q 0], of least norm."""
     Cq = matrices[:, n:, :n]
-    some = np.linspace(0, len(Cq) - 1, SAMPLES).astype(int)  # at a singular position more rows depend on others
+    some = np.unique(
+        np.linspace(0, len(Cq) - 1, SAMPLES).astype(int)
+    )  # at a singular position more rows depend on others
     chosen = max((_independent(each) for each in Cq[some]), key=len)
     kept = np.concatenate([np.arange(n), n + chosen])
     try:

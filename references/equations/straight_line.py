@@ -14,11 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from references.equations.expressions import FUNCTIONS, Expressions, Written, functions_of
+from references.equations.linear import OPTIONS
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 COMMUTES = "+*"
 MOST_OPERATIONS = 3000  # of a Jacobian: numba takes two or three milliseconds for each
 
@@ -137,4 +137,4 @@ def _machine_code(system: ConstrainedSystem, into: str, program: Program, result
     scope: dict[str, Any] = functions_of(math)
     text = "\n    ".join([f"def derivative(t, y, {into}):", *lines])
     exec(compile(text, f"<straight-line code of {system.name}>", "exec"), scope)
-    return njit(**_OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]
+    return njit(**OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]

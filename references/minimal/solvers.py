@@ -25,6 +25,8 @@ from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
+_KNOWN: dict[int, tuple[Problem, Minimal]] = {}
+
 
 def solve_heyoka_minimal(
     problem: Problem,
@@ -97,25 +99,14 @@ def _checked(
         raise TypeError(f"problem must be a Problem of twoloop.mechanisms; given {problem!r}")
     span = 0.0, t_end
     task = check_task(problem.system, span, problem.q0, problem.v0, t_eval, time_limit, tolerances, derivatives=False)
-    return _minimal(_Same(problem)), task
+    return _minimal(problem), task
 
 
-class _Same:
-    """A problem as a key of a cache: that object and no other."""
-
-    def __init__(self, problem: Problem):
-        self.problem = problem
-
-    def __hash__(self) -> int:
-        return id(self.problem)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.problem is other.problem
-
-
-@lru_cache(maxsize=64)
-def _minimal(same: _Same) -> Minimal:
-    return minimal(same.problem)
+def _minimal(problem: Problem) -> Minimal:
+    """The equations of a problem, made once for that object, as what is built of them is kept by them."""
+    if id(problem) not in _KNOWN:
+        _KNOWN[id(problem)] = problem, minimal(problem)
+    return _KNOWN[id(problem)][1]
 
 
 @lru_cache(maxsize=256)

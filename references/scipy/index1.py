@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.driver import ADVICE, TimeLimit, check_choice, check_task, imported, longest_step, result_of, user_call
-from references.equations.accelerations import Equations, matrix_of, saddle_solve, schur_factors, times_inverse
+from references.equations.accelerations import Equations, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
-from references.equations.linear import OPTIONS, cholesky_solve
+from references.equations.linear import OPTIONS
 from references.equations.rows import on_independent_rows
 from references.equations.straight_line import straight_line_jacobian
 from references.scipy.steps import Steps
@@ -270,25 +270,11 @@ def _projection(
 
 @njit(**OPTIONS)
 def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
-    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular. C is lost.
-
-    Where M is not positive definite, x changes by the d of M d + C_q^T mu = 0 and C_q d = C, which is the same.
-    """
-    m, n = Cq.shape
-    change = np.zeros(n)
-    if definite:
-        S, good = schur_factors(L, known, Cq)
-        if not good:
-            return np.inf
-        cholesky_solve(S, C)
-        for i in range(m):
-            for j in range(n):
-                change[j] += Cq[i, j] * C[i]
-        times_inverse(L, known, change)
-    elif not saddle_solve(L, Cq, change, C):
+    """x -= d of M d + C_q^T mu = 0 and C_q d = C, and the largest change; infinite when that is singular. C is lost."""
+    change, largest = np.zeros(x.size), 0.0
+    if not solve_for(L, definite, known, Cq, change, C):
         return np.inf
-    largest = 0.0
-    for j in range(n):
+    for j in range(x.size):
         x[j] -= change[j]
         largest = max(largest, abs(change[j]))
         if not np.isfinite(change[j]):

@@ -47,11 +47,6 @@ ERROR_TESTS = {
     "positions": "coordinates only",
 }
 HIGHEST_ORDER = 5  # of IDA
-# keyword arguments of both drivers, by name: IDA as it comes, and as it is cheapest on stiff beams
-SETTINGS: dict[str, dict[str, Any]] = {
-    "default": {"max_order": HIGHEST_ORDER, "error_test": "all"},
-    "best": {"max_order": 2, "error_test": "positions"},
-}
 NOT_TESTED = 1e12  # the absolute tolerance that takes an unknown out of IDA's error test, and out of Newton's
 SMALLEST_STEP = (
     1e-12  # of the length of t_span; without a smallest step IDA shrinks its steps towards a NaN without end

@@ -14,12 +14,12 @@ from numba import carray, cfunc, njit, types
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import check_system, check_task, result_of
+from references.equations.linear import OPTIONS
 from references.equations.rows import on_independent_rows
 from references.sundials.ida import HIGHEST_ORDER, check_options, positions_of, tolerances
 from references.sundials.library import library
 from references.sundials.loop import RAISED, Memory, run
 from references.sundials.residual import (
-    OPTIONS,
     Parts,
     columns_of,
     iteration_matrix_at,

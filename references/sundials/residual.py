@@ -12,7 +12,7 @@ Mu is zero.
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,6 +20,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from references.equations.accelerations import compiled_gamma
+from references.equations.linear import OPTIONS
 from references.equations.ode import accelerations
 from twoloop.kernels.compile.callbacks import stand_in
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
@@ -33,8 +34,6 @@ FORMS = {
 }
 ALL = 10**9  # rows that are of C: there are none of A v + b = 0 below
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
-
-OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
 class Parts(NamedTuple):

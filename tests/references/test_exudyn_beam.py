@@ -154,7 +154,3 @@ def test_wrong_arguments_are_named():
         solve_exudyn_beam(four_bar(), 1.0, 10)
     with pytest.raises(ValueError, match="n_elements must be at least 1"):
         solve_exudyn_beam(problem, 1.0, 10, n_elements=0)
-    with pytest.raises(ValueError, match="solver must be one of"):
-        solve_exudyn_beam(problem, 1.0, 10, solver="RK44")
-    with pytest.raises(ValueError, match="multiple of store_every = 3"):
-        solve_exudyn_beam(problem, 1.0, 10, store_every=3)

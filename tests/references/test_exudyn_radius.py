@@ -39,17 +39,6 @@ def test_more_damping_is_less_accurate_and_of_order_two():
     assert 3.3 < errors[0.3, 200] / errors[0.3, 400] < 4.7
 
 
-@pytest.mark.parametrize("radius", [-0.1, 1.1])
-def test_a_radius_out_of_range_is_named(radius):
-    with pytest.raises(ValueError, match="spectral_radius must be between 0 and 1; given"):
-        top_at(radius)
-
-
-def test_the_radius_belongs_to_one_solver():
-    with pytest.raises(ValueError, match="spectral_radius belongs to solver='GeneralizedAlpha'"):
-        solve_exudyn(TOP, 0.2, 200, "HHT", spectral_radius=0.6)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_runs_with_another_radius(name):
     """It was refused where there is a model and an option."""

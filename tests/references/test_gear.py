@@ -184,38 +184,3 @@ def test_failure_of_the_accurate_start_comes_back_as_a_row():
     result = solve_gear(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01, 4, start="accurate")
     assert result.status is Status.SOLVER_FAILED and "The accurate start failed. DOP853" in result.message
     assert np.array_equal(result.t, [0.0, 0.01])
-
-
-def test_exception_of_a_callback_comes_through():
-    def force(t, q, v):
-        if t > 0.5:
-            raise ValueError("no force today")
-        return np.array([0.0, -9.81])
-
-    with pytest.raises(ValueError, match="no force today"):
-        solve_gear(pendulum(force=force), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01)
-
-
-@pytest.mark.parametrize(
-    ("changed", "error", "message"),
-    [
-        ({"step": 0.0}, ValueError, "step must be positive"),
-        ({"step": "0.1"}, TypeError, "step must be a number"),
-        ({"step": 0.3}, ValueError, "step must go a whole number of times into t_span, whose length is 1.0; given 0.3"),
-        ({"step": 3.0}, ValueError, "step must go a whole number of times"),
-        ({"order": 0}, ValueError, "order must be at least 1"),
-        ({"order": 7}, ValueError, "order must be at most 6"),
-        ({"order": 2.0}, TypeError, "order must be an int"),
-        ({"start": "push"}, ValueError, "start must be one of ramp, accurate; given 'push'"),
-        ({"newton_tol": -1.0}, ValueError, "newton_tol must be positive"),
-        ({"t_eval": [0.015]}, ValueError, "t_eval must hold multiples of step"),
-        ({"t_span": (1.0, 0.0)}, ValueError, "t_span must be"),
-        ({"q0": PROBLEM.q0 + 0.01}, ValueError, "q0 is not consistent"),
-        ({"v0": np.zeros(3)}, ValueError, "v0 must have shape"),
-        ({"system": PROBLEM}, TypeError, "system must be a ConstrainedSystem"),
-    ],
-)
-def test_wrong_arguments_are_named(changed, error, message):
-    given = {"system": PROBLEM.system, "t_span": (0.0, 1.0), "q0": PROBLEM.q0, "v0": PROBLEM.v0, "step": 0.01}
-    with pytest.raises(error, match=message):
-        solve_gear(**{**given, **changed})

@@ -118,16 +118,6 @@ def test_result_has_our_shapes_and_signs(form):
         assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-3
 
 
-@pytest.mark.parametrize("times", [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0, 1.0]])
-def test_t_eval_gives_exactly_these_times(times):
-    problem = PROBLEMS["default"]
-    result = solve_ida(problem.system, (0.0, 1.0), problem.q0, problem.v0, t_eval=times)
-    q, _ = truth("default").states(times)
-    assert result.t.tolist() == times and result.success
-    assert np.abs(result.q - q).max() < 1e-5
-    assert result.stats.n_accepted is None and result.h.size == 0
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_moving_pivot_in_plain_python_without_gamma(form):
     system = moving_pivot()
@@ -146,40 +136,3 @@ def test_differenced_gamma_gives_the_same_motion():
         for kwargs in ({}, {"gamma": None})
     )
     assert np.abs(given.q[:, -1] - differenced.q[:, -1]).max() < 1e-6
-
-
-@pytest.mark.parametrize("t_eval", [None, [0.5, 0.9, 1.5, 2.0]])
-@pytest.mark.parametrize("form", FORMS)
-def test_a_force_that_becomes_nan_comes_back_as_a_row(form, t_eval, capsys):
-    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t <= 1.0 else np.nan]))
-    result = solve_ida(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], form, 1e-6, 1e-6, t_eval=t_eval)
-    assert result.status is Status.SOLVER_FAILED and not result.success
-    assert "IDA failed" in result.message and "status -" in result.message
-    assert result.t.size > 1 and 0.89 < result.t[-1] <= 1.0
-    assert np.isfinite(result.q).all() and result.q.shape == (2, result.t.size)
-    assert capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_an_exception_of_a_callback_comes_through(form):
-    def force(t, q, v):
-        if t > 0.5:
-            raise ZeroDivisionError("the motor burnt out")
-        return np.array([0.0, -9.81])
-
-    with pytest.raises(ZeroDivisionError, match="burnt out"):
-        solve_ida(pendulum(force), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], form)
-
-
-def test_wrong_arguments_are_named():
-    system = pendulum()
-    with pytest.raises(ValueError, match="form must be one of index1, stabilised; given 'index3'"):
-        solve_ida(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "index3")
-    with pytest.raises(ValueError, match="rtol must be positive"):
-        solve_ida(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], rtol=0.0)
-    with pytest.raises(ValueError, match="q0 is not consistent"):
-        solve_ida(system, (0.0, 1.0), [1.1, 0.0], [0.0, 0.0])
-    with pytest.raises(ValueError, match="t_eval must lie within"):
-        solve_ida(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], t_eval=[2.0])
-    with pytest.raises(TypeError, match="system must be a ConstrainedSystem"):
-        solve_ida(PROBLEMS["default"], (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])

@@ -156,13 +156,10 @@ def test_jacobian_is_that_of_the_residual(system, tangent, form):
 # --- output and statistics
 
 
-@pytest.mark.parametrize("times", [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0], [1e-13, 1.0 - 1e-13, 1.0]])
-def test_t_eval_gives_exactly_these_times(times):
+def test_output_next_to_the_ends():
+    times = [1e-13, 1.0 - 1e-13, 1.0]
     result = run(1.0, 1e-8, t_eval=times)
-    q, v = trajectory(PROBLEM.parameters, times)
-    assert result.t.tolist() == times and result.success and "t = 1." in result.message
-    assert result.q.shape == result.v.shape == result.a.shape == (9, len(times)) and result.lam.shape[0] == 8
-    assert np.abs(result.q - q).max() < 1e-5 and np.abs(result.v - v).max() < 1e-4
+    assert result.t.tolist() == times and np.abs(result.q - trajectory(PROBLEM.parameters, times)[0]).max() < 1e-5
 
 
 def test_counts_follow_the_tolerance_and_not_the_output():
@@ -221,24 +218,6 @@ def test_functions_that_from_python_compiles_are_taken():
     result = solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
     assert result.success
     assert np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4
-
-
-def test_wrong_arguments_are_named():
-    system, q0, v0 = PROBLEM.system, PROBLEM.q0, PROBLEM.v0
-    with pytest.raises(TypeError, match="system must be a ConstrainedSystem"):
-        solve_ida_c(PROBLEM, (0.0, 1.0), q0, v0)
-    with pytest.raises(ValueError, match="t_span must be"):
-        solve_ida_c(system, (1.0, 0.0), q0, v0)
-    with pytest.raises(ValueError, match="rtol must be positive"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0, rtol=0.0)
-    with pytest.raises(TypeError, match="atol must be a number"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0, atol="small")
-    with pytest.raises(ValueError, match="q0 is not consistent"):
-        solve_ida_c(system, (0.0, 1.0), q0 + 0.1, v0)
-    with pytest.raises(ValueError, match="v0 must have shape"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0[:3])
-    with pytest.raises(ValueError, match="t_eval must lie within"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0, t_eval=[2.0])
 
 
 # --- the wheel

@@ -188,11 +188,6 @@ def test_the_projection_is_the_shortest_one_and_projects_the_error():
     assert np.allclose(err, np.concatenate([free @ estimate[:3], free @ estimate[3:]]), rtol=0.0, atol=1e-13)
 
 
-def test_adams_is_not_projected():
-    with pytest.raises(ValueError, match=r"projected needs method 'BDF'.*; given 'Adams'"):
-        run(solve_cvode_c, PENDULUM, "Adams", projected=True)
-
-
 def test_each_set_up_is_run_beside_the_others_and_drawn_as_itself():
     added = {IDA_C_STATES: True, CVODE_C_PROJECTED: True, "CVODES, CasADi": False}
     assert {name: CATALOGUE[name].keeps_constraints for name in added} == added
