@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import ADVICE, Task, TimeLimit, check_choice, check_task, imported, user_call
-from references.equations.expressions import Expressions, functions_of
+from references.equations.expressions import expressions_at, functions_of
 from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_size
 from twoloop.problem.system import ConstrainedSystem
@@ -74,7 +74,8 @@ def solve_idas(
         `a` and `lam` from eq. (6) at the stored states. Of the statistics: n_accepted and n_evaluations (the
         residuals). A failure gives no output, and the last line of CasADi's text.
     """
-    return _by_sundials("idas", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps)
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
+    return _by_sundials("idas", task, (rtol, atol), most_steps, time_limit, {})
 
 
 def solve_cvodes(
@@ -107,8 +108,8 @@ def solve_cvodes(
         As `solve_idas`; n_evaluations are those of the accelerations.
     """
     check_choice("method", method, METHODS)
-    more = METHODS[method]
-    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps, more)
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
+    return _by_sundials("cvodes", task, (rtol, atol), most_steps, time_limit, METHODS[method])
 
 
 def solve_collocation(
@@ -147,21 +148,14 @@ def solve_collocation(
 
 def _by_sundials(
     plugin: str,
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
-    rtol: float,
-    atol: float,
-    t_eval: ArrayLike | None,
-    time_limit: float | None,
+    task: Task,
+    tolerances: tuple[float, float],
     most_steps: int,
-    more: dict[str, str] | None = None,
+    time_limit: float | None,
+    more: dict[str, str],
 ) -> Result:
-    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
-    most_steps = check_size("most_steps", most_steps, 1)
-    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps}
-    options |= more or {}
+    most_steps, (rtol, atol) = check_size("most_steps", most_steps, 1), tolerances
+    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps, **more}
     options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
     return _solved(task, plugin, np.array([task.t1]), task.instants, options, time_limit)
 
@@ -204,7 +198,7 @@ def _solved(
 @lru_cache(maxsize=256)
 def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> dict[str, Any]:
     casadi, n = imported("casadi"), system.n_q
-    made = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
+    made = expressions_at(system, t0, q0, v0)
     t, x = casadi.SX.sym("t"), casadi.SX.sym("x", 2 * n)
     q, v = ([x[first + i] for i in range(n)] for first in (0, n))
     return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions_of(casadi), t, q, v))}

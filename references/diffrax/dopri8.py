@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import ADVICE, TimeLimit, check_task, imported, user_call
-from references.equations.expressions import Expressions, NotSymbolic, functions_of
+from references.equations.expressions import Expressions, NotSymbolic, expressions_at, functions_of
 from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_size
 from twoloop.problem.system import ConstrainedSystem
@@ -96,7 +96,7 @@ def solve_diffrax(
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_steps: int) -> Callable[..., Any]:
     """(t0, t1, y0, rtol, atol, times) -> states as rows, what failed ("": nothing), steps, rejected ones."""
     jax, diffrax = packages()
-    derivative = derivative_of(Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy()))
+    derivative = derivative_of(expressions_at(system, t0, q0, v0))
 
     @jax.jit
     def run(t0: Any, t1: Any, y0: Any, rtol: Any, atol: Any, times: Any) -> Any:

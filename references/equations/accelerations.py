@@ -158,12 +158,21 @@ def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
     """
     m, n = Cq.shape
     K, x, pivots = np.zeros((n + m, n + m)), np.empty(n + m), np.zeros(n + m, dtype=np.int64)
-    K[:n, :n], K[n:, :n], K[:n, n:] = M, Cq, Cq.T
-    x[:n], x[n:] = a, lam
+    for i in range(n):  # by elements: the assignment of one slice to another doubles the time of compiling
+        x[i] = a[i]
+        for j in range(n):
+            K[i, j] = M[i, j]
+        for k in range(m):
+            K[n + k, i] = K[i, n + k] = Cq[k, i]
+    for k in range(m):
+        x[n + k] = lam[k]
     if not lu_factor(K, pivots):
         return False
     lu_solve(K, pivots, x)
-    a[:], lam[:] = x[:n], x[n:]
+    for i in range(n):
+        a[i] = x[i]
+    for k in range(m):
+        lam[k] = x[n + k]
     return True
 
 
@@ -186,9 +195,13 @@ def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
     if not definite:
         return saddle_solve(L, Cq, a, lam)
     m, n = Cq.shape
-    S, W, x = np.zeros((m, m)), Cq.T.copy(), np.empty(n)
+    S, W, x = np.zeros((m, m)), np.empty((n, m)), np.empty(n)
+    for j in range(n):
+        for i in range(m):
+            W[j, i] = Cq[i, j]
     for i in range(m):
-        x[:] = Cq[i]
+        for j in range(n):
+            x[j] = Cq[i, j]
         times_inverse(L, known, x)
         for j in range(n):
             if x[j] != 0.0:
@@ -196,7 +209,8 @@ def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
                     S[k, i] += x[j] * W[j, k]
     if not cholesky(S):
         return False
-    x[:] = a
+    for j in range(n):
+        x[j] = a[j]
     times_inverse(L, known, x)
     for i in range(m):
         lam[i] = -lam[i]

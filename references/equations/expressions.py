@@ -6,7 +6,7 @@ little fill; then the graph is written as expressions of a package, an operation
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -137,6 +137,12 @@ class Expressions:
         """The accelerations (n_q,) of eq. (6) as expressions; `parameters`: symbols, if it is of these."""
         written = Written(self.traced.graph, functions, [t, *q, *v, *parameters])
         return written.each(self.solution[: self.system.n_q])
+
+
+@lru_cache(maxsize=64)
+def expressions_at(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Expressions:
+    """The equations about a start, of which the arrays' bytes are given, made once."""
+    return Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
 
 
 class Written:

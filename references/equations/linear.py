@@ -1,13 +1,21 @@
 """Compiled linear algebra of the references: their own, so that nothing of twoloop's is in what it is compared with."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numba import njit
 
+from twoloop.kernels.compile.caches import compile_kept, watch
+
 SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+
+
+def compiled_now(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile for any mechanism, and keep the machine code on disk until it or something that it calls changes."""
+    return lambda function: compile_kept(function, signature, watch(function), error_model="numpy")
 
 
 @njit(**OPTIONS)
@@ -68,7 +76,9 @@ def lu_factor(A, pivots):  # type: ignore[no-untyped-def]
         pivots[k], scale[pivot] = pivot, scale[k]
         if pivot != k:
             for j in range(n):
-                A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
+                moved = A[k, j]
+                A[k, j] = A[pivot, j]
+                A[pivot, j] = moved
         for i in range(k + 1, n):
             if A[i, k] != 0.0:
                 A[i, k] /= A[k, k]

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from references.equations.expressions import FUNCTIONS, Expressions, Written, functions_of
+from references.equations.expressions import FUNCTIONS, Expressions, Written, expressions_at, functions_of
 from references.equations.linear import OPTIONS
 from twoloop.problem.system import ConstrainedSystem
 
@@ -78,10 +78,19 @@ class Value:
 
 def program_of(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Program, list[str]]:
     """The program of the accelerations, of the values t, q0, q1, ..., v0, v1, ..., and the names of its results."""
-    program, inputs = Program(), _inputs(system)
-    equations = Expressions(system, t0, q0, v0)
-    written = Written(equations.traced.graph, program.functions(), [Value(program, name) for name in inputs])
-    return program, [_name(each) for each in written.each(equations.solution[: system.n_q])]
+    return _program(Expressions(system, t0, q0, v0))
+
+
+def _program(equations: Expressions) -> tuple[Program, list[str]]:
+    program = Program()
+    made = _written(equations, program).each(equations.solution[: equations.system.n_q])
+    return program, [_name(each) for each in made]
+
+
+def _written(equations: Expressions, program: Program) -> Written:
+    """What writes forms into a program, of the values t, q0, q1, ..., v0, v1, ..."""
+    names = ["t", *(f"{letter}{i}" for letter in "qv" for i in range(equations.system.n_q))]
+    return Written(equations.traced.graph, program.functions(), [Value(program, name) for name in names])
 
 
 def straight_line(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> Callable[..., Any]:
@@ -100,7 +109,7 @@ def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: Array, v0: 
 @lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
     n = system.n_q
-    program, names = program_of(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
+    program, names = _program(expressions_at(system, t0, q0, v0))
     results = [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
     return _machine_code(system, "rate", program, results)
 
@@ -108,9 +117,8 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Cal
 @lru_cache(maxsize=256)
 def _compiled_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
     n, program = system.n_q, Program()
-    equations = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
-    inputs = [Value(program, name) for name in _inputs(system)]
-    written = Written(equations.traced.graph, program.functions(), inputs)
+    equations = expressions_at(system, t0, q0, v0)
+    written = _written(equations, program)
     results = [f"columns[{n + i}, {i}] = 1.0" for i in range(n)]
     for k, column in enumerate(equations.derivatives()):
         made = written.each(column)
@@ -119,11 +127,6 @@ def _compiled_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: byte
         places = [(i, _name(each)) for i, each in enumerate(made) if isinstance(each, Value) or each != 0.0]
         results += [f"columns[{k}, {n + i}] = {name}" for i, name in places]
     return _machine_code(system, "columns", program, results)
-
-
-def _inputs(system: ConstrainedSystem) -> list[str]:
-    """The names of t, q and v in a program."""
-    return ["t", *(f"{letter}{i}" for letter in "qv" for i in range(system.n_q))]
 
 
 def _name(made: Any) -> str:

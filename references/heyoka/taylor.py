@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import ADVICE, TimeLimit, check_task, imported, longest_step, user_call
-from references.equations.expressions import Expressions, functions_of
+from references.equations.expressions import Expressions, expressions_at, functions_of
 from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_positive
 from twoloop.problem.system import ConstrainedSystem
@@ -102,10 +102,9 @@ def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> lis
 
 @lru_cache(maxsize=256)
 def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> Any:
-    package, q, v = imported("heyoka"), np.frombuffer(q0).copy(), np.frombuffer(v0).copy()
-    return package.taylor_adaptive(
-        rates_of(Expressions(system, t0, q, v)),
-        [*q, *v],
+    return imported("heyoka").taylor_adaptive(
+        rates_of(expressions_at(system, t0, q0, v0)),
+        [*np.frombuffer(q0), *np.frombuffer(v0)],
         time=t0,
         tol=tol,
         fast_math=True,

@@ -1,13 +1,11 @@
 """The compiled steps of `paper.ablation`: one stage loop, in which variants differ by branches on `variant`."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
 
-from references.equations.linear import cholesky, cholesky_solve, lu_factor, lu_solve
-from twoloop.kernels.compile.caches import compile_kept, watch
+from references.equations.linear import cholesky, cholesky_solve, compiled_now, lu_factor, lu_solve
 from twoloop.kernels.data.common import CONSTANT_MASS, INTEGERS, KIT, MATRIX, VECTOR
 from twoloop.kernels.evaluation.partition import full_pivoting
 
@@ -325,15 +323,11 @@ def _error(n, tol, states):  # type: ignore[no-untyped-def]
     return np.sqrt(total / (2 * n))
 
 
-def _compile_now(function: Callable[..., Any]) -> Any:
-    """Compile for any mechanism and keep the machine code on disk until it or something that it calls changes."""
-    i8, f8 = types.int64, types.float64
-    sizes, tableau = (i8, i8, i8, i8, i8), (MATRIX, VECTOR, VECTOR, MATRIX)
-    signature = i8(KIT, *sizes, *tableau, f8, f8, i8, f8, f8, VECTOR, VECTOR, MATRIX, INTEGERS)
-    return compile_kept(function, signature, watch(function), error_model="numpy")
+_I8, _F8 = types.int64, types.float64
+_SIZES, _TABLEAU = (_I8,) * 5, (MATRIX, VECTOR, VECTOR, MATRIX)
 
 
-@_compile_now
+@compiled_now(_I8(KIT, *_SIZES, *_TABLEAU, _F8, _F8, _I8, _F8, _F8, VECTOR, VECTOR, MATRIX, INTEGERS))
 def run(  # type: ignore[no-untyped-def]
     f, n, m, s, variant, order, A, b, c, inverse, t0, t1, n_steps, tol, loop_tol, state, where, rows, counters
 ):

@@ -8,7 +8,6 @@ meant. Numbers from here say what such formulas do; they are not numbers of ADAM
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -17,11 +16,10 @@ from numba import njit, types
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import Task, TimeLimit, check_choice, check_task, result_of, user_call
-from references.equations.linear import lu_factor, lu_solve
+from references.equations.linear import compiled_now, lu_factor, lu_solve
 from references.equations.ode import ode_result
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_positive, check_size, check_span
-from twoloop.kernels.compile.caches import compile_kept, watch
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
@@ -143,27 +141,12 @@ def solve_gear(
     given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
     past = np.zeros((HIGHEST, given.shape[1]))
     code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
-    formulas = _formulas()
+    fixed = t0, h, order, _formulas(), float(newton_tol), keep, rows, counters
     with user_call as clock:
         while code == DONE and made < n_steps and not limit.passed():
             called = time.monotonic()
             last = min(made + stride, n_steps)
-            code = _integrate(
-                Kit(system.functions),
-                system.n_q,
-                given,
-                past,
-                made + 1,
-                last,
-                t0,
-                h,
-                order,
-                formulas,
-                float(newton_tol),
-                keep,
-                rows,
-                counters,
-            )
+            code = _integrate(Kit(system.functions), system.n_q, given, past, made + 1, last, *fixed)
             made = last
             stride *= 2 if time.monotonic() - called < CALL else 1
     return _result(system, order, t0, h, code, keep, rows, counters, clock.seconds or 0.0, limit)
@@ -304,27 +287,9 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
     return NOT_CONVERGED
 
 
-def _compile_now(function: Callable[..., Any]) -> Any:
-    """Compile for `_INTEGRATE` and keep the machine code on disk until it or something that it calls changes."""
-    return compile_kept(function, _INTEGRATE, watch(function), error_model="numpy")
-
-
-@_compile_now
+@compiled_now(_INTEGRATE)
 def _integrate(  # type: ignore[no-untyped-def]
-    f,
-    n,
-    given,
-    past,
-    first,
-    last,
-    t0,
-    h,
-    order,
-    formulas,
-    tol,
-    keep,
-    rows,
-    counters,
+    f, n, given, past, first, last, t0, h, order, formulas, tol, keep, rows, counters
 ):
     """Steps `first` to `last`; `keep` holds the numbers of those to store.
 

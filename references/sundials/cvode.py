@@ -56,13 +56,14 @@ def solve_cvode(
     check_choice("method", method, METHODS)
     task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
     CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
-    from references.sundials.ida import states_at
+    from references.sundials.ida import SMALLEST_STEP, states_at
 
     t0, t1, times, y0 = task.t0, task.t1, task.instants, task.y0
     equations = RightHandSide(task.system, t0, task.q0, 0.0)
     y0.setflags(write=False)  # as CVODE hands it over, so that what is compiled here is what it calls
     equations.warm(t0, y0, False)
     options: dict[str, Any] = {"method": method, "rtol": float(rtol), "atol": float(atol), "max_num_steps": MOST_STEPS}
+    options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0}
     jacobian = equations.jacobian(t0, y0)
 
     def integrator(limit: TimeLimit) -> Any:

@@ -14,10 +14,6 @@ from tests.problems import (
     force_residual,
     moving_pivot,
     moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
     pendulum,
     violations,
     worst,
@@ -127,13 +123,6 @@ def test_time_dependent_constraints(order):
         result = solve_gear(system, (0.0, 1.0), q, v, step, order, start="accurate")
         errors.append(worst(result.q, moving_pivot_state(result.t)[0]))
     assert errors[0] < 3e-3 and abs(np.log2(errors[0] / errors[1]) - order) < 0.3
-
-
-def test_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities():
-    result = solve_gear(oblique_pendulum(), (0.0, 2.0), *oblique_start(), 0.005, 4, start="accurate")
-    x, u, lam = oblique_point(result.t)
-    ours = oblique_to_point(result)
-    assert worst(ours[0], x) < 1e-6 and worst(ours[1], u) < 1e-5 and worst(result.lam[0], lam) < 1e-4
 
 
 @pytest.mark.parametrize("start", STARTS)

@@ -10,12 +10,6 @@ from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.index1 import ONE_STEP, STABILISATIONS, solve_index1
 from tests.problems import (
     force_residual,
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
     pendulum,
     violations,
     worst,
@@ -24,23 +18,6 @@ from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
 
 PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
-# position error at 10 s with the tolerances 1e-6 and 1e-8: three times what was measured, the scatter of tolerances
-# that differ by 2 % included, and more
-BOUNDS = {
-    ("default", "DOP853", "none"): (1.5e-4, 3e-7),
-    ("default", "DOP853", "baumgarte"): (1e-5, 1e-7),
-    ("default", "DOP853", "projection"): (1e-4, 2e-7),
-    ("default", "RK45", "none"): (2e-3, 2e-5),
-    ("default", "RK45", "baumgarte"): (1e-4, 1e-6),
-    ("default", "RK45", "projection"): (5e-5, 5e-7),
-    ("default", "LSODA", "none"): (1e-3, 1e-5),
-    ("default", "LSODA", "baumgarte"): (1e-3, 1e-5),
-    ("default", "Radau", "none"): (1e-5, None),
-    ("default", "BDF", "none"): (5e-3, None),
-    ("collinear", "DOP853", "none"): (3e-4, 3e-6),
-    ("collinear", "DOP853", "baumgarte"): (1e-4, 2e-7),
-    ("collinear", "DOP853", "projection"): (2e-4, 6e-7),
-}
 
 
 @cache
@@ -51,17 +28,6 @@ def truth(name):
 def run(name, t_end, *args, **options):
     problem = PROBLEMS[name]
     return solve_index1(problem.system, (0.0, t_end), problem.q0, problem.v0, *args, **options)
-
-
-@pytest.mark.parametrize(("name", "method", "stabilisation"), BOUNDS)
-def test_agrees_with_the_truth_and_follows_the_tolerance(name, method, stabilisation):
-    q, v = truth(name).states([10.0])
-    for tolerance, bound in zip((1e-6, 1e-8), BOUNDS[name, method, stabilisation], strict=True):
-        if bound is not None:
-            result = run(name, 10.0, method, tolerance, tolerance, stabilisation=stabilisation)
-            assert result.status is Status.REACHED_END and result.t[-1] == 10.0
-            assert worst(result.q[:, -1], q[:, 0]) < bound
-            assert worst(result.v[:, -1], v[:, 0]) < 20.0 * bound
 
 
 def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
@@ -117,27 +83,6 @@ def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabili
     for t, q, v, a in zip(result.t, result.q.T, result.v.T, result.a.T, strict=True):
         feedback = 2.0 * alpha * system.velocity_constraint(t, q, v) + alpha**2 * system.constraint(t, q)
         assert worst(system.jacobian(t, q) @ a, system.gamma(t, q, v) - feedback) < 1e-11
-
-
-@pytest.mark.parametrize("stabilisation", STABILISATIONS)
-def test_time_dependent_constraints_without_a_gamma(stabilisation):
-    q, v = moving_pivot_state(0.0)
-    system = moving_pivot(gamma=False)
-    result = solve_index1(system, (0.0, 5.0), q, v, rtol=1e-9, atol=1e-9, stabilisation=stabilisation)
-    q, v = moving_pivot_state(result.t)
-    assert worst(result.q, q) < 1e-6 and worst(result.v, v) < 1e-6
-    bound = {"none": 1e-7, "baumgarte": 1e-8, "projection": 1e-14}[stabilisation]
-    assert violations(system, result)[0] < bound
-
-
-@pytest.mark.parametrize("stabilisation", STABILISATIONS)
-def test_full_mass_matrix_that_varies(stabilisation):
-    result = solve_index1(
-        oblique_pendulum(), (0.0, 3.0), *oblique_start(), rtol=1e-9, atol=1e-9, stabilisation=stabilisation
-    )
-    x, u, lam = oblique_point(result.t)
-    ours = oblique_to_point(result)
-    assert worst(ours[0], x) < 1e-7 and worst(ours[1], u) < 1e-6 and worst(result.lam[0], lam) < 1e-5
 
 
 @pytest.mark.parametrize("method", ONE_STEP)
