@@ -3,7 +3,8 @@
 The equations are those of `scipy.index1` without stabilisation. Without Python in its way: `sundials.cvode_c`.
 """
 
-from contextlib import suppress
+import io
+from contextlib import redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ def solve_cvode(
 
     limit = TimeLimit(time_limit)
     timed, outcome = integrator(limit), None
-    with user_call as clock, suppress(OutOfTimeError):
+    with redirect_stdout(io.StringIO()), user_call as clock, suppress(OutOfTimeError):  # it prints its failures
         timed.init_step(t0, y0)
         outcome = timed.step(t1, tstop=t1)
     statistics = Statistics(n_evaluations=int(equations.counters[0]), cpu_time=clock.seconds or 0.0)

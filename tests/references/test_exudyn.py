@@ -165,7 +165,9 @@ def test_the_list_of_the_study_is_that_of_the_models():
 
 
 def test_other_mechanisms_are_refused():
-    with pytest.raises(ValueError, match=r"problem must be of A02 or one of .*given 'double pendulum'"):
+    with pytest.raises(
+        ValueError, match=r"problem must be a four-bar linkage, of A02 or one of .*given 'double pendulum'"
+    ):
         solve_exudyn(mechanisms.double_pendulum(), 1.0, 100)
 
 
