@@ -82,9 +82,8 @@ def solve_exudyn(
         (n_factorizations); cpu_time is that of the solver, its initialisation included.
     """
     if not isinstance(problem, Problem) or not has_model(problem):
-        given = f"the Problem {problem.name!r}" if isinstance(problem, Problem) else repr(problem)
-        error = ValueError if isinstance(problem, Problem) else TypeError
-        raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given}")
+        error, given = (ValueError, problem.name) if isinstance(problem, Problem) else (TypeError, problem)
+        raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
     steps = check_steps(t_end, n_steps, solver, store_every, time_limit, spectral_radius, alpha)
     model, redundant = model_of(problem), problem.name.startswith(REDUNDANT)
     reference = np.concatenate(model.reference)
