@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from references.equations.linear import OPTIONS, cholesky, cholesky_solve, lu_factor, lu_solve
+from references.equations.linear import OPTIONS, SINGULAR, cholesky, cholesky_solve, lu_factor, lu_solve
 from twoloop.kernels.data.common import GAMMA_GIVEN
 from twoloop.problem.system import ConstrainedSystem
 
@@ -38,7 +38,7 @@ class Equations:
         if self.known and np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0:
             self.known |= DIAGONAL
         self.factors = np.ascontiguousarray(mass)
-        if not cholesky(self.factors):
+        if not cholesky(self.factors, SINGULAR):
             self.factors, self.known = np.ascontiguousarray(mass.copy()), self.known & CONSTANT | SADDLE
             if not saddle_solve(self.factors, system.jacobian(t0, q0), np.zeros(system.n_q), np.zeros(system.n_c)):
                 raise ValueError(
@@ -141,7 +141,7 @@ def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
             return factors, definite
         M = np.zeros((q.size, q.size))
         mass(t, q, p, M)
-        if definite and not cholesky(M):
+        if definite and not cholesky(M, SINGULAR):
             definite = False
             M[:, :] = 0.0
             mass(t, q, p, M)

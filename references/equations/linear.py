@@ -19,18 +19,19 @@ def compiled_now(signature: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 @njit(**OPTIONS)
-def cholesky(A):  # type: ignore[no-untyped-def]
+def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
     """Cholesky's factor of A in its lower half, with the reciprocals of the pivots; whether A is definite.
 
-    Where a pivot is zero, or has lost all of its digits, its column becomes zero: `solve` leaves that unknown out.
+    A pivot that is no more than `lost` times what stood there is zero, and so is its column: `cholesky_solve` leaves
+    that unknown out.
     """
     n, definite = A.shape[0], True
     for k in range(n):
         before = A[k, k]
         for j in range(k):
             A[k, k] -= A[k, j] * A[k, j]
-        definite = definite and A[k, k] > SINGULAR * abs(before)
-        if A[k, k] <= SINGULAR * abs(before):  # not so of NaN, which stays
+        definite = definite and A[k, k] > lost * abs(before)
+        if A[k, k] <= lost * abs(before):  # not so of NaN, which stays
             for i in range(k, n):
                 A[i, k] = 0.0
             continue

@@ -8,7 +8,7 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
 
-from references.equations.linear import cholesky, cholesky_solve
+from references.equations.linear import SINGULAR, cholesky, cholesky_solve
 from references.sundials.library import REALS, library
 from references.sundials.loop import RAISED
 
@@ -43,7 +43,7 @@ def projection_for_cvode(
                 S[i, k] = 0.0
                 for j in range(n):
                     S[i, k] += Cq[i, j] * Cq[k, j]
-        cholesky(S)
+        cholesky(S, SINGULAR)
 
     @njit(error_model="numpy")
     def shortest(Cq, S, r, x):  # type: ignore[no-untyped-def]

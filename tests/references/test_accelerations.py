@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from references.equations.accelerations import Equations, compiled_gamma, saddle_solve
-from references.equations.linear import cholesky
+from references.equations.linear import SINGULAR, cholesky
 from references.equations.ode import ode_result
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.index1 import solve_index1
@@ -106,7 +106,7 @@ def test_saddle_points_of_indefinite_matrices(seed):
     M += M.T
     M[seed] = M[:, seed] = 0.0
     a, lam = Q.copy(), Qd.copy()
-    assert not cholesky(M.copy()) and saddle_solve(M, Cq, a, lam)
+    assert not cholesky(M.copy(), SINGULAR) and saddle_solve(M, Cq, a, lam)
     for mine, known in zip((a, lam), saddle(M, Cq, Q, Qd), strict=True):
         assert worst(mine, known) < 1e-10
     Cq[3] = Cq[0] - Cq[1]  # dependent
@@ -116,9 +116,9 @@ def test_saddle_points_of_indefinite_matrices(seed):
 
 
 def test_rounding_is_not_taken_for_mass():
-    assert cholesky(np.diag([1e-9, 1.0, 1e9])) and not cholesky(np.diag([1.0, 0.0]))
+    assert cholesky(np.diag([1e-9, 1.0, 1e9]), SINGULAR) and not cholesky(np.diag([1.0, 0.0]), SINGULAR)
     e = np.array([0.1, 0.7, 0.3])
-    assert not cholesky(np.eye(3) * (e @ e) - np.outer(e, e))  # its last pivot is some 1e-17
+    assert not cholesky(np.eye(3) * (e @ e) - np.outer(e, e), SINGULAR)  # its last pivot is some 1e-17
 
 
 @pytest.mark.parametrize("constant", [True, False])
