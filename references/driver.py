@@ -1,19 +1,57 @@
-"""What the adapters of all solvers share: checks of their arguments, and a limit on the time of a run."""
+"""What the adapters of all solvers share: their arguments, checked, a limit on the time of a run, and its `Result`.
+
+What is the same for all stands here, and not at each adapter:
+
+system : ConstrainedSystem
+    The problem. Callbacks are compiled into what the solver calls at the first run (a few seconds). Solvers that take
+    expressions want compiled callbacks which give Q_d and do not branch on t, q or v.
+t_span : (float, float)
+    Start and end, s; the end after the start.
+q0, v0 : array_like (n_q,)
+    Consistent initial coordinates and velocities.
+rtol, atol : float
+    The solver's tolerances of q and v.
+t_eval : array_like, optional
+    Increasing times in t_span at which to store the solution, by the solver's own interpolation, in a second run of
+    the same steps that is not timed. None: `OUTPUTS` times, evenly, if the adapter does not say that it stores steps.
+time_limit : float, optional
+    Wall-clock time that the integration may take, s. A run past it is a failed one. None: no limit.
+max_step : float, optional
+    The longest step that the solver may take, s. None: the length of t_span.
+
+They return a `Result`, with the sign of M a + C_q^T lam = Q. `h` is empty where steps are not stored; `cpu_time` is
+that of the call that a user writes (`user_call`). A failure gives what was computed before it,
+`Status.SOLVER_FAILED` and the solver's text.
+
+They raise TypeError or ValueError, before any work, for a wrong argument, naming it, RuntimeError for a package that is
+not installed; an exception of a Python callback comes through.
+"""
 
 import math
 import os
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from references.equations.rows import with_all_rows
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_vector
+from twoloop.checks.consistency import check_start
 from twoloop.problem.problem import Problem
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status
 
 Array = NDArray[np.float64]
+
+OUTPUTS = 1001  # instants of the default t_eval of solvers that do not store their steps
+
+CAUSES = "Look for a discontinuity, a singular position or a value that is not finite near this time, or try"
+ADVICE = f"{CAUSES} other tolerances or another method."
 
 
 def cpu_time() -> float:
@@ -103,6 +141,16 @@ def check_time_limit(time_limit: float | None) -> None:
         check_positive("time_limit", time_limit)
 
 
+def imported(module: str, name: str = "", extra: str = "peers") -> Any:
+    """An optional package, or a module of it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        name = name or module.partition(".")[0]
+        how = "make peers, or pip" if extra == "peers" else "pip"
+        raise RuntimeError(f"{name} is not installed: {how} install 'twoloop[{extra}]'") from error
+
+
 def longest_step(max_step: float | None, span: float) -> float:
     """Return the longest step that a solver may take: what is asked for, or the whole run."""
     if max_step is None:
@@ -133,17 +181,54 @@ def check_problem(problem: Any, parameter: str, expected: str) -> Problem:
     return problem
 
 
-def check_run(
+@dataclass(frozen=True)
+class Task:
+    """The arguments of a run, checked; `system` has the rows A v + b = 0 below those of C, of which there are n_c."""
+
+    system: ConstrainedSystem
+    n_c: int
+    t0: float
+    t1: float
+    q0: Array
+    v0: Array
+    times: Array | None
+
+    @property
+    def y0(self) -> Array:
+        """The start [q, v]."""
+        return np.concatenate([self.q0, self.v0])
+
+    @property
+    def key(self) -> tuple[ConstrainedSystem, float, bytes, bytes]:
+        """What equations that are made for a start are kept by."""
+        return self.system, self.t0, self.q0.tobytes(), self.v0.tobytes()
+
+    @property
+    def instants(self) -> Array:
+        """When to store the solution: the times given, or `OUTPUTS` evenly."""
+        return np.linspace(self.t0, self.t1, OUTPUTS) if self.times is None else self.times
+
+
+def check_task(
     system: ConstrainedSystem,
     t_span: tuple[float, float],
     q0: ArrayLike,
     v0: ArrayLike,
     t_eval: ArrayLike | None,
     time_limit: float | None,
+    tolerances: tuple[float, float] | None = None,
     step: float | None = None,
-    takes_velocity_rows: bool = False,
-) -> tuple[float, float, Array, Array, Array | None]:
-    """Return start, end, q0, v0 and output times, or say what is wrong with an argument of a run."""
+    takes_velocity_rows: bool = True,
+    derivatives: bool = True,
+) -> Task:
+    """Say what is wrong with an argument of a run, or return all of them.
+
+    `step`: of which output times are multiples; `derivatives`: whether those of the constraints are checked, which
+    who traces the callbacks does otherwise.
+    """
+    if tolerances is not None:
+        for name, value in zip(("rtol", "atol"), tolerances, strict=True):
+            check_positive(name, value)
     check_system(system)
     if system.n_a > 0 and not takes_velocity_rows:
         raise ValueError(
@@ -154,10 +239,24 @@ def check_run(
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)
     check_time_limit(time_limit)
-    return t0, t1, q0, v0, None if t_eval is None else check_times(t_eval, t0, t1, step)
+    times = None if t_eval is None else check_times(t_eval, t0, t1, step)
+    check_start(system, t0, q0, v0, derivatives=derivatives)
+    return Task(with_all_rows(system), system.n_c, t0, t1, q0, v0, times)
 
 
-def check_tolerances(rtol: float, atol: float) -> None:
-    """Raise unless both are positive numbers."""
-    check_positive("rtol", rtol)
-    check_positive("atol", atol)
+def result_of(
+    n: int, t: Array, columns: Array, end: str, failure: str, statistics: Statistics, h: Array | None = None
+) -> Result:
+    """The Result of rows [q v a lam] (3 n_q + n_c, n_t); `failure` is the message of a run that failed, `end` else."""
+    q, v, a, lam = np.split(columns, [n, 2 * n, 3 * n])
+    return Result(
+        t=t,
+        q=q,
+        v=v,
+        a=a,
+        lam=lam,
+        h=np.empty(0) if h is None else h,
+        status=Status.SOLVER_FAILED if failure else Status.REACHED_END,
+        message=failure or end,
+        stats=statistics,
+    )

@@ -256,10 +256,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
             lines.append([each["case"], way, *cells])
     ready = {"ways": table(["runs of", "way", *(power(error) for error in ERRORS)], lines)}
     columns = ["runs", "wall-clock time (s)", "CPU time (s)", "failed", "made singly"]
-    cells = [
-        (*(each[name] for name in ("n_runs", "wall", "cpu", "n_failed", "n_singly")),) for each in found["geometry"]
-    ]
-    ready["geometry"] = table(columns, cells)
+    fields = ("n_runs", "wall", "cpu", "n_failed", "n_singly")
+    geometry = [[number(each[name]) for name in fields] for each in found["geometry"]]
+    ready["geometry"] = table(columns, geometry)
     output.write("ensembles.md", render("ensembles", found, ready, stamp=line, quick=output.call.quick))
 
 

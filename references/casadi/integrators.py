@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_choice, check_run, check_tolerances, user_call
-from references.equations.expressions import Expressions, functions_of
-from references.equations.nonholonomic import with_all_rows
-from references.equations.ode import ADVICE, ode_result, output_times
+from references.driver import ADVICE, Task, TimeLimit, check_choice, check_task, imported, user_call
+from references.equations.expressions import expressions_at, functions_of
+from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_size
-from twoloop.checks.consistency import check_start
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics
@@ -63,37 +61,21 @@ def solve_idas(
 
     Parameters
     ----------
-    system : ConstrainedSystem
-        The problem, of compiled callbacks, which give Q_d and do not branch on q or v.
-    t_span : (float, float)
-        Start and end, s; the end after the start.
-    q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities.
-    rtol, atol : float
-        IDAS' tolerances.
-    t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, interpolated by IDAS, in a second run that is not
-        timed. None: 1001 times, evenly.
+    system, t_span, q0, v0, rtol, atol, t_eval : see `references.driver`
     time_limit : float, optional
-        Wall-clock time that the integration may take, s. CasADi does not look at the clock, but lets exceptions of
-        signals through: a run ends after `most_steps` steps, and one that took longer is a failed one. None: no limit.
+        See `references.driver`. CasADi does not look at the clock, but lets exceptions of signals through: a run ends
+        after `most_steps` steps, and one that took longer is a failed one.
     most_steps : int
         Steps after which a run ends.
 
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_accepted, n_evaluations (the
-        residuals) and cpu_time. A failure gives no output, `Status.SOLVER_FAILED` and the last line of CasADi's text.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong, or the equations cannot be had as expressions: before any work, naming it.
-    RuntimeError
-        If CasADi is not installed.
+        `a` and `lam` from eq. (6) at the stored states. Of the statistics: n_accepted and n_evaluations (the
+        residuals). A failure gives no output, and the last line of CasADi's text.
     """
-    return _by_sundials("idas", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps)
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
+    return _by_sundials("idas", task, (rtol, atol), most_steps, time_limit, {})
 
 
 def solve_cvodes(
@@ -116,26 +98,18 @@ def solve_cvodes(
 
     Parameters
     ----------
-    system, t_span, q0, v0 : see `solve_idas`
-    rtol, atol : float
-        CVODES' tolerances.
+    system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps : see `solve_idas`
     method : {"BDF", "Adams"}
         Orders up to 5, or up to 12.
-    t_eval, time_limit, most_steps : see `solve_idas`
 
     Returns
     -------
     Result
         As `solve_idas`; n_evaluations are those of the accelerations.
-
-    Raises
-    ------
-    TypeError, ValueError, RuntimeError
-        As `solve_idas`.
     """
     check_choice("method", method, METHODS)
-    more = METHODS[method]
-    return _by_sundials("cvodes", system, t_span, q0, v0, rtol, atol, t_eval, time_limit, most_steps, more)
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
+    return _by_sundials("cvodes", task, (rtol, atol), most_steps, time_limit, METHODS[method])
 
 
 def solve_collocation(
@@ -155,72 +129,43 @@ def solve_collocation(
 
     Parameters
     ----------
-    system, t_span, q0, v0 : see `solve_idas`
+    system, t_span, q0, v0, time_limit : see `solve_idas`
     n_steps : int
         Number of steps.
-    time_limit : float, optional
-        See `solve_idas`.
 
     Returns
     -------
     Result
-        At the ends of the steps, of no more than `OUTPUTS` of them. Of the statistics: n_accepted and cpu_time.
-
-    Raises
-    ------
-    TypeError, ValueError, RuntimeError
-        As `solve_idas`.
+        At the ends of the steps, of no more than `OUTPUTS` of them. Of the statistics: n_accepted.
     """
     n_steps = check_size("n_steps", n_steps, 1)
-    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit, takes_velocity_rows=True)
-    check_start(system, t0, q0, v0, derivatives=False)
-    system = with_all_rows(system)
-    ends = t0 + (t1 - t0) * np.unique(np.linspace(0, n_steps, min(OUTPUTS, n_steps) + 1).astype(int)) / n_steps
+    task = check_task(system, t_span, q0, v0, None, time_limit, derivatives=False)
+    parts = np.unique(np.linspace(0, n_steps, min(OUTPUTS, n_steps) + 1).astype(int))
+    ends = task.t0 + (task.t1 - task.t0) * parts / n_steps
     options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps, "collocation_scheme": "legendre"}
-    return _solved(system, "collocation", t0, ends[1:], ends, q0, v0, options, time_limit)
+    return _solved(task, "collocation", ends[1:], ends, options, time_limit)
 
 
 def _by_sundials(
     plugin: str,
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
-    rtol: float,
-    atol: float,
-    t_eval: ArrayLike | None,
-    time_limit: float | None,
+    task: Task,
+    tolerances: tuple[float, float],
     most_steps: int,
-    more: dict[str, str] | None = None,
+    time_limit: float | None,
+    more: dict[str, str],
 ) -> Result:
-    check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
-    times = output_times(times, t0, t1)
-    check_start(system, t0, q0, v0, derivatives=False)
-    system = with_all_rows(system)
-    most_steps = check_size("most_steps", most_steps, 1)
-    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps}
-    options |= more or {}
+    most_steps, (rtol, atol) = check_size("most_steps", most_steps, 1), tolerances
+    options: dict[str, Any] = {"reltol": float(rtol), "abstol": float(atol), "max_num_steps": most_steps, **more}
     options["show_eval_warnings"] = False  # of each step that is too long, thousands of lines; a failure is told
-    return _solved(system, plugin, t0, np.array([t1]), times, q0, v0, options, time_limit)
+    return _solved(task, plugin, np.array([task.t1]), task.instants, options, time_limit)
 
 
 def _solved(
-    system: ConstrainedSystem,
-    plugin: str,
-    t0: float,
-    timed: Array,
-    times: Array,
-    q0: Array,
-    v0: Array,
-    options: dict[str, Any],
-    time_limit: float | None,
+    task: Task, plugin: str, timed: Array, times: Array, options: dict[str, Any], time_limit: float | None
 ) -> Result:
     """The Result at `times`, with the clock of a run that stores at `timed`."""
-    check_choice("plugin", plugin, PLUGINS)
-    made = partial(_integrator, plugin, system, t0, q0.tobytes(), v0.tobytes(), tuple(options.items()))
-    start = np.concatenate([q0, v0])
-    t1, name = float(timed[-1]), PLUGINS[plugin]
+    made = partial(_integrator, plugin, *task.key, tuple(options.items()))
+    start, t0, t1, name = task.y0, task.t0, task.t1, PLUGINS[plugin]
     limit, failure, cpu, states = TimeLimit(time_limit), "", None, np.empty((start.size, 0))
     counts: dict[str, Any] = {}
     after = times[times > t0]
@@ -247,21 +192,13 @@ def _solved(
         n_evaluations=counts.get("nfevals"),
         cpu_time=cpu or 0.0,
     )
-    return ode_result(system, times, states, failure, f"{name} reached the end, t = {t1:g}.", statistics)
-
-
-def _casadi() -> Any:
-    try:
-        import casadi
-    except ImportError as error:
-        raise RuntimeError("casadi is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    return casadi
+    return ode_result(task.system, times, states, failure, f"{name} reached the end, t = {t1:g}.", statistics)
 
 
 @lru_cache(maxsize=256)
 def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> dict[str, Any]:
-    casadi, n = _casadi(), system.n_q
-    made = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
+    casadi, n = imported("casadi"), system.n_q
+    made = expressions_at(system, t0, q0, v0)
     t, x = casadi.SX.sym("t"), casadi.SX.sym("x", 2 * n)
     q, v = ([x[first + i] for i in range(n)] for first in (0, n))
     return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions_of(casadi), t, q, v))}
@@ -272,7 +209,7 @@ def _integrator(
     plugin: str, system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, options: tuple[Any, ...], times: bytes
 ) -> Any:
     """What integrates to these times; compiled, where there is a compiler and that helps."""
-    casadi, compiler = _casadi(), shutil.which("cc")
+    casadi, compiler = imported("casadi"), shutil.which("cc")
     arguments = ("motion", plugin, _equations(system, t0, q0, v0), t0, np.frombuffer(times).tolist())
     given = dict(options) | ({"rootfinder_options": ROOT} if plugin == "collocation" else {})
     if compiler is None or system.n_q > LARGEST_COMPILED:

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_run, check_tolerances, user_call
-from references.equations.expressions import Expressions, NotSymbolic, functions_of
-from references.equations.nonholonomic import with_all_rows
-from references.equations.ode import ADVICE, ode_result, output_times
+from references.driver import ADVICE, TimeLimit, check_task, imported, user_call
+from references.equations.expressions import Expressions, NotSymbolic, expressions_at, functions_of
+from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_size
-from twoloop.checks.consistency import check_start
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics
@@ -47,47 +45,28 @@ def solve_diffrax(
 
     Parameters
     ----------
-    system : ConstrainedSystem
-        The problem, of compiled callbacks, which give Q_d and do not branch on q or v; at most `LARGEST` coordinates.
-    t_span : (float, float)
-        Start and end, s; the end after the start.
-    q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities.
-    rtol, atol : float
-        Tolerances of q and v.
-    t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, by the method's interpolant (of order 8), in a second
-        run that is not timed. None: 1001 times, evenly.
+    system, t_span, q0, v0, rtol, atol, t_eval : see `references.driver`
+        At most `LARGEST` coordinates.
     time_limit : float, optional
-        Wall-clock time that the integration may take, s. Compiled code does not look at the clock: a run ends after
-        `most_steps` steps, and one that took longer than the limit is a failed one. None: no limit.
+        See `references.driver`. Compiled code does not look at the clock: a run ends after `most_steps` steps, and one
+        that took longer than the limit is a failed one.
     most_steps : int
         Steps after which a run ends, rejected ones included.
 
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_accepted, n_rejected_error,
-        n_evaluations (13 a step) and cpu_time. A failure gives `Status.SOLVER_FAILED` and diffrax's text.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong, or the equations cannot be had as expressions: before any work, naming it.
-    RuntimeError
-        If diffrax is not installed.
+        `a` and `lam` from eq. (6) at the stored states; between steps those of the interpolant, of order 8. Of the
+        statistics: n_accepted, n_rejected_error and n_evaluations (13 a step).
     """
-    check_tolerances(rtol, atol)
     most_steps = check_size("most_steps", most_steps, 1)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
-    times = output_times(times, t0, t1)
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
+    system, t0, t1, times, start = task.system, task.t0, task.t1, task.instants, task.y0
     if system.n_q > LARGEST:
         raise NotSymbolic(
             f"system must have at most {LARGEST} coordinates for diffrax; {system.name!r} has {system.n_q}"
         )
-    check_start(system, t0, q0, v0, derivatives=False)
-    system = with_all_rows(system)
-    solve = _compiled(system, t0, q0.tobytes(), v0.tobytes(), most_steps)
+    solve = _compiled(*task.key, most_steps)
     start = np.concatenate([q0, v0])
 
     end, soon = np.array([t1]), t0 + 1e-6 * (t1 - t0)
@@ -116,34 +95,12 @@ def solve_diffrax(
 @lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_steps: int) -> Callable[..., Any]:
     """(t0, t1, y0, rtol, atol, times) -> states as rows, what failed ("": nothing), steps, rejected ones."""
-    try:
-        import diffrax
-        import jax
-    except ImportError as error:
-        raise RuntimeError("diffrax is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    jax.config.update("jax_enable_x64", True)
-    n, equations = system.n_q, Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
-    functions = functions_of(jax.numpy)
-
-    def derivative(t: Any, y: Any, _: Any) -> Any:
-        a = equations.accelerations(functions, t, [y[i] for i in range(n)], [y[n + i] for i in range(n)])
-        return jax.numpy.concatenate([y[n:], jax.numpy.stack([jax.numpy.asarray(each) for each in a])])
+    jax, diffrax = packages()
+    derivative = derivative_of(expressions_at(system, t0, q0, v0))
 
     @jax.jit
     def run(t0: Any, t1: Any, y0: Any, rtol: Any, atol: Any, times: Any) -> Any:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol)
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(derivative),
-            diffrax.Dopri8(),
-            t0=t0,
-            t1=t1,
-            dt0=None,
-            y0=y0,
-            saveat=diffrax.SaveAt(ts=times),
-            stepsize_controller=controller,
-            max_steps=most_steps,
-            throw=False,
-        )
+        return solved(derivative, t0, t1, y0, (rtol, atol), diffrax.SaveAt(ts=times), most_steps)
 
     def solve(t0: float, t1: float, y0: Array, rtol: float, atol: float, times: Array) -> Any:
         found = jax.block_until_ready(run(t0, t1, y0, rtol, atol, times))
@@ -152,3 +109,44 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_s
         return np.array(found.ys), "" if good else str(found.result), *counts
 
     return solve
+
+
+def packages() -> tuple[Any, Any]:
+    """JAX, set to numbers of 64 bits, and diffrax."""
+    diffrax, jax = imported("diffrax"), imported("jax")
+    jax.config.update("jax_enable_x64", True)
+    return jax, diffrax
+
+
+def derivative_of(equations: Expressions) -> Callable[[Any, Any, Any], Any]:
+    """(t, y, parameters or None) -> y', y = [q, v], as diffrax calls it."""
+    (jax, _), n = packages(), equations.system.n_q
+    functions = functions_of(jax.numpy)
+
+    def derivative(t: Any, y: Any, p: Any) -> Any:
+        q, v, parameters = ([x[i] for i in range(len(x))] for x in (y[:n], y[n:], () if p is None else p))
+        a = equations.accelerations(functions, t, q, v, parameters)
+        return jax.numpy.concatenate([y[n:], jax.numpy.stack([jax.numpy.asarray(each) for each in a])])
+
+    return derivative
+
+
+def solved(
+    derivative: Any, t0: Any, t1: Any, y0: Any, tolerances: tuple[Any, Any], saveat: Any, most_steps: int, p: Any = None
+) -> Any:
+    """What diffrax makes of it, by Dopri8 with the controller of its default."""
+    _, diffrax = packages()
+    rtol, atol = tolerances
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(derivative),
+        diffrax.Dopri8(),
+        t0=t0,
+        t1=t1,
+        dt0=None,
+        y0=y0,
+        args=p,
+        saveat=saveat,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
+        max_steps=most_steps,
+        throw=False,
+    )

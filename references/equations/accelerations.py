@@ -1,4 +1,4 @@
-"""Accelerations and multipliers of any ConstrainedSystem, compiled from its callbacks: what several references need.
+"""Accelerations and multipliers of any ConstrainedSystem, compiled from its callbacks, for solvers in Python.
 
 Eq. (6), M a + C_q^T lam = Q and C_q a = Q_d, is solved by the Schur complement S = C_q M^-1 C_q^T where M is positive
 definite, and else, as with Euler parameters, as it stands, by elimination with row exchanges. What is compiled are
@@ -13,12 +13,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from references.driver import check_system
-from twoloop.checks.arguments import check_real
-from twoloop.checks.bounds import check_bounds
-from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
+from references.equations.linear import OPTIONS, SINGULAR, cholesky, cholesky_solve, lu_factor, lu_solve
 from twoloop.kernels.data.common import GAMMA_GIVEN
 from twoloop.problem.system import ConstrainedSystem
 
@@ -27,43 +24,6 @@ Array = NDArray[np.float64]
 GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
 
 CONSTANT, DIAGONAL, SADDLE = 1, 2, 4  # bits of what is known of the mass matrix; the last: it is not definite
-SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
-
-OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
-
-
-def accelerations(system: ConstrainedSystem, t: ArrayLike, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-    """Accelerations and multipliers of eq. (6) at given states.
-
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    t : array_like (n_t,)
-        Times, s.
-    q, v : array_like (n_q, n_t)
-        Coordinates and velocities, one column an instant.
-
-    Returns
-    -------
-    a : ndarray (n_q, n_t)
-    lam : ndarray (n_c, n_t)
-        Of M a + C_q^T lam = Q and C_q a = Q_d; NaN where the matrix is singular.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong.
-    """
-    check_system(system)
-    t = check_real("t", t)
-    states = np.concatenate([check_real("q", q), check_real("v", v)])
-    if t.ndim != 1 or states.shape != (2 * system.n_q, t.size):
-        raise ValueError(
-            f"q and v must have a column of {system.n_q} for each of the {t.size} times; together they have shape "
-            f"{states.shape}"
-        )
-    check_bounds(system, float(t[0]), *np.split(states[:, 0], 2))
-    return Equations(system, float(t[0]), states[: system.n_q, 0]).at_points(t, states)
 
 
 class Equations:
@@ -78,7 +38,7 @@ class Equations:
         if self.known and np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0:
             self.known |= DIAGONAL
         self.factors = np.ascontiguousarray(mass)
-        if not factor(self.factors):
+        if not cholesky(self.factors, SINGULAR):
             self.factors, self.known = np.ascontiguousarray(mass.copy()), self.known & CONSTANT | SADDLE
             if not saddle_solve(self.factors, system.jacobian(t0, q0), np.zeros(system.n_q), np.zeros(system.n_c)):
                 raise ValueError(
@@ -88,10 +48,16 @@ class Equations:
                 )
 
     def at_points(self, t: Array, states: Array, alpha: float = 0.0) -> tuple[Array, Array]:
-        """Accelerations and multipliers at states (2 n_q, n_t), with Baumgarte's terms when alpha > 0."""
-        rows = np.ascontiguousarray(states.T)
-        n_c, p = self.system.n_c, self.system.functions.p
-        a, lam = _at_points(self.accelerate)(t, rows, n_c, alpha, p, self.factors, self.known)
+        """Accelerations and multipliers at states (2 n_q, n_t), with Baumgarte's terms when alpha > 0.
+
+        NaN where the matrix is singular.
+        """
+        rows, n, p = np.ascontiguousarray(states.T), self.system.n_q, self.system.functions.p
+        a, lam = np.empty((t.size, n)), np.empty((t.size, self.system.n_c))
+        for k in range(t.size):
+            q, v = rows[k, :n], rows[k, n:]
+            if not self.accelerate(t[k], q, v, alpha, p, self.factors, self.known, a[k], lam[k]):
+                a[k], lam[k] = np.nan, np.nan
         return a.T, lam.T
 
 
@@ -159,29 +125,9 @@ def _accelerations(
                 lam[i] -= 2.0 * alpha * Ct[i] + alpha * alpha * C[i]
         a[:] = 0.0
         force(t, q, v, p, a)
-        if definite:
-            return _eliminate(L, known, Cq, a, lam)
-        return saddle_solve(L, Cq, a, lam)
+        return solve_for(L, definite, known, Cq, a, lam)
 
     return accelerate  # type: ignore[no-any-return]
-
-
-@lru_cache(maxsize=64)
-def _at_points(accelerate: Callable[..., Any]) -> Callable[..., Any]:
-    """(t, states as rows, n_c, alpha, p, factors, known) -> a, lam as rows."""
-
-    @njit(**OPTIONS)
-    def at_points(t, states, m, alpha, p, factors, known):  # type: ignore[no-untyped-def]
-        n = states.shape[1] // 2
-        a, lam = np.empty((t.size, n)), np.empty((t.size, m))
-        for k in range(t.size):
-            q, v = states[k, :n].copy(), states[k, n:].copy()
-            if not accelerate(t[k], q, v, alpha, p, factors, known, a[k], lam[k]):
-                a[k, :] = np.nan
-                lam[k, :] = np.nan
-        return a, lam
-
-    return at_points  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=64)
@@ -195,7 +141,7 @@ def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
             return factors, definite
         M = np.zeros((q.size, q.size))
         mass(t, q, p, M)
-        if definite and not factor(M):
+        if definite and not cholesky(M, SINGULAR):
             definite = False
             M[:, :] = 0.0
             mass(t, q, p, M)
@@ -205,59 +151,28 @@ def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
 
 
 @njit(**OPTIONS)
-def factor(A):  # type: ignore[no-untyped-def]
-    """`ldl_factor`, which holds rounding for definite, with pivots that have lost all of their digits refused."""
-    before = np.empty(A.shape[0])
-    for k in range(A.shape[0]):
-        before[k] = A[k, k]
-    good = ldl_factor(A)
-    for k in range(A.shape[0]):
-        good = good and A[k, k] * before[k] * SINGULAR < 1.0
-    return good
-
-
-@njit(**OPTIONS)
 def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
     """Eq. (6) as it stands: a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers.
 
     Returns False where the matrix is singular or has values that are not finite.
     """
     m, n = Cq.shape
-    size = n + m
-    K, scale = np.zeros((size, size + 1)), np.zeros(size)  # the last column: the right-hand side
-    for i in range(n):
-        K[i, size] = a[i]
+    K, x, pivots = np.zeros((n + m, n + m)), np.empty(n + m), np.zeros(n + m, dtype=np.int64)
+    for i in range(n):  # by elements: the assignment of one slice to another doubles the time of compiling
+        x[i] = a[i]
         for j in range(n):
             K[i, j] = M[i, j]
-            scale[i] = max(scale[i], abs(M[i, j]))
         for k in range(m):
-            K[n + k, size] = lam[k]
-            K[i, n + k] = K[n + k, i] = Cq[k, i]
-            scale[i] = max(scale[i], abs(Cq[k, i]))
-            scale[n + k] = max(scale[n + k], abs(Cq[k, i]))
-    for k in range(size):
-        pivot, largest = k, 0.0
-        for i in range(k, size):
-            if abs(K[i, k]) > largest * scale[i]:
-                pivot, largest = i, abs(K[i, k]) / scale[i]
-        if not SINGULAR < largest < np.inf:
-            return False
-        scale[pivot] = scale[k]
-        for j in range(k, size + 1):
-            moved = K[pivot, j]
-            K[pivot, j] = K[k, j]
-            K[k, j] = moved / K[k, k] if j > k else moved
-        for i in range(k + 1, size):
-            if K[i, k] != 0.0:
-                for j in range(k + 1, size + 1):
-                    K[i, j] -= K[i, k] * K[k, j]
-    for k in range(size - 1, -1, -1):
-        for j in range(k + 1, size):
-            K[k, size] -= K[k, j] * K[j, size]
-    for i in range(n):
-        a[i] = K[i, size]
+            K[n + k, i] = K[i, n + k] = Cq[k, i]
     for k in range(m):
-        lam[k] = K[n + k, size]
+        x[n + k] = lam[k]
+    if not lu_factor(K, pivots):
+        return False
+    lu_solve(K, pivots, x)
+    for i in range(n):
+        a[i] = x[i]
+    for k in range(m):
+        lam[k] = x[n + k]
     return True
 
 
@@ -266,14 +181,19 @@ def times_inverse(L, known, x):  # type: ignore[no-untyped-def]
     """x becomes M^-1 x."""
     if known & DIAGONAL:
         for j in range(x.size):
-            x[j] *= L[j, j]
+            x[j] *= L[j, j] * L[j, j]
     else:
-        ldl_solve(L, x)
+        cholesky_solve(L, x)
 
 
 @njit(**OPTIONS)
-def schur_factors(L, known, Cq):  # type: ignore[no-untyped-def]
-    """Factors of S = C_q M^-1 C_q^T, and whether S is positive definite."""
+def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
+    """Eq. (6), by eqs. (7) and (8): a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers.
+
+    `L`: the factors of M, or M itself where it is not definite. Returns False where the matrix is singular.
+    """
+    if not definite:
+        return saddle_solve(L, Cq, a, lam)
     m, n = Cq.shape
     S, W, x = np.zeros((m, m)), np.empty((n, m)), np.empty(n)
     for j in range(n):
@@ -286,25 +206,17 @@ def schur_factors(L, known, Cq):  # type: ignore[no-untyped-def]
         for j in range(n):
             if x[j] != 0.0:
                 for k in range(i, m):
-                    S[i, k] += x[j] * W[j, k]
-    return S, ldl_factor(S)
-
-
-@njit(**OPTIONS)
-def _eliminate(L, known, Cq, a, lam):  # type: ignore[no-untyped-def]
-    """Eqs. (7) and (8): a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers."""
-    m, n = Cq.shape
-    S, definite = schur_factors(L, known, Cq)
-    if not definite:
+                    S[k, i] += x[j] * W[j, k]
+    if not cholesky(S):
         return False
-    x = a.copy()
+    for j in range(n):
+        x[j] = a[j]
     times_inverse(L, known, x)
     for i in range(m):
-        total = -lam[i]
+        lam[i] = -lam[i]
         for j in range(n):
-            total += Cq[i, j] * x[j]
-        lam[i] = total
-    ldl_solve(S, lam)
+            lam[i] += Cq[i, j] * x[j]
+    cholesky_solve(S, lam)
     for i in range(m):
         for j in range(n):
             a[j] -= Cq[i, j] * lam[i]

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from references.equations.expressions import Expressions, functions_of
-from references.heyoka.taylor import LARGEST_UNROLLED
+from references.diffrax.dopri8 import derivative_of, packages, solved
+from references.driver import imported
+from references.equations.expressions import Expressions
+from references.heyoka.taylor import LARGEST_UNROLLED, rates_of
 from twoloop.problem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -22,32 +24,12 @@ CALLBACKS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamm
 
 def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
     """Dopri8 of diffrax over all runs by `vmap`, compiled once at the first call."""
-    import diffrax
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
+    jax, diffrax = packages()
     equations, states, parameters = _gathered(problems)
-    n, functions = equations.system.n_q, functions_of(jax.numpy)
-
-    def derivative(t: Any, y: Any, p: Any) -> Any:
-        q, v, lengths = ([x[i] for i in range(x.shape[0])] for x in (y[:n], y[n:], p))
-        a = equations.accelerations(functions, t, q, v, lengths)
-        return jax.numpy.concatenate([y[n:], jax.numpy.stack([jax.numpy.asarray(each) for each in a])])
+    derivative, n = derivative_of(equations), equations.system.n_q
 
     def one(y0: Any, p: Any, tol: Any) -> Any:
-        found = diffrax.diffeqsolve(
-            diffrax.ODETerm(derivative),
-            diffrax.Dopri8(),
-            t0=0.0,
-            t1=t_end,
-            dt0=None,
-            y0=y0,
-            args=p,
-            saveat=diffrax.SaveAt(t1=True),
-            stepsize_controller=diffrax.PIDController(rtol=tol, atol=tol),
-            max_steps=MOST_STEPS,
-            throw=False,
-        )
+        found = solved(derivative, 0.0, t_end, y0, (tol, tol), diffrax.SaveAt(t1=True), MOST_STEPS, p)
         good = found.result == diffrax.RESULTS.successful
         return jax.numpy.where(good, found.ys[-1][:n], jax.numpy.nan)
 
@@ -57,21 +39,16 @@ def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
 
 def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
     """heyoka's Taylor integrator in batches as wide as the processor's vectors, built once a tolerance."""
-    import heyoka
-
+    package = imported("heyoka")
     equations, states, parameters = _gathered(problems)
-    n, width, made = equations.system.n_q, heyoka.recommended_simd_size(), {}
-    symbols = heyoka.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
-    p = [heyoka.par[i] for i in range(parameters.shape[1])]
-    a = equations.accelerations(functions_of(heyoka), heyoka.time, symbols[:n], symbols[n:], p)
-    rates = [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in [*symbols[n:], *a]]
-    motion = list(zip(symbols, rates, strict=True))
+    n, width, made = equations.system.n_q, package.recommended_simd_size(), {}
+    motion = rates_of(equations, [package.par[i] for i in range(parameters.shape[1])])
     groups = np.minimum(np.arange(-(-len(states) // width) * width), len(states) - 1).reshape(-1, width)
 
     def solve(tol: float) -> Array:
         if tol not in made:
             start = states[groups[0]].T.copy()
-            made[tol] = heyoka.taylor_adaptive_batch(
+            made[tol] = package.taylor_adaptive_batch(
                 motion, start, tol=tol, fast_math=True, compact_mode=n > LARGEST_UNROLLED
             )
         integrator, ends = made[tol], np.full((len(states), n), np.nan)
@@ -80,7 +57,7 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
             integrator.state[:] = states[group].T
             integrator.pars[:] = parameters[group, : len(integrator.pars)].T  # those up to the last that is used
             integrator.propagate_until(t_end)
-            good = [result[0] == heyoka.taylor_outcome.time_limit for result in integrator.propagate_res]
+            good = [result[0] == package.taylor_outcome.time_limit for result in integrator.propagate_res]
             ends[group[good]] = integrator.state[:n, good].T
         return ends
 
@@ -102,4 +79,4 @@ def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:
             raise ValueError(f"problems must have the callbacks of the first, {first.name!r}; given {problem.name!r}")
     states = np.array([np.concatenate([problem.q0, problem.v0]) for problem in problems])
     parameters = np.array([problem.system.functions.p for problem in problems])
-    return Expressions(first.system, 0.0, first.q0, first.v0), states, parameters
+    return Expressions(first.system, 0.0, first.q0, first.v0, of_parameters=True), states, parameters

@@ -13,12 +13,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from references.equations.expressions import FUNCTIONS, Expressions, functions_of
+from references.equations.expressions import FUNCTIONS, Expressions, Written, expressions_at, functions_of
+from references.equations.linear import OPTIONS
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 COMMUTES = "+*"
 MOST_OPERATIONS = 3000  # of a Jacobian: numba takes two or three milliseconds for each
 
@@ -41,7 +41,7 @@ class Program:
 
     def functions(self) -> dict[str, Callable[["Value"], "Value"]]:
         """The functions that `Expressions` asks for."""
-        return {name: lambda x, name=name: self.value(name, x.name) for name in FUNCTIONS}  # type: ignore[misc]
+        return {name: lambda x, name=name: self.value(name, x.name) for name in FUNCTIONS.values()}  # type: ignore[misc]
 
 
 class Value:
@@ -50,59 +50,47 @@ class Value:
     def __init__(self, program: Program, name: str):
         self.program, self.name = program, name
 
-    def _with(self, operator: str, other: Any, swapped: bool = False) -> Any:
-        if not isinstance(other, Value):
-            number = float(other)
-            if number == 0.0 and operator == "*":
-                return 0.0
-            if (number == 0.0 and operator == "+") or (number == 1.0 and operator == "*"):
-                return self
-            if not swapped and ((number == 0.0 and operator == "-") or (number == 1.0 and operator == "/")):
-                return self
-            other = Value(self.program, f"({number!r})")
-        pair = (other.name, self.name) if swapped else (self.name, other.name)
+    def _with(self, operator: str, other: Any, swapped: bool = False) -> "Value":
+        pair = (_name(other), self.name) if swapped else (self.name, _name(other))
         left, right = sorted(pair) if operator in COMMUTES else pair
         return self.program.value(left, operator, right)
 
-    def __add__(self, other: Any) -> Any:
+    def __add__(self, other: Any) -> "Value":
         return self._with("+", other)
 
-    def __radd__(self, other: Any) -> Any:
-        return self._with("+", other, True)
-
-    def __sub__(self, other: Any) -> Any:
+    def __sub__(self, other: Any) -> "Value":
         return self._with("-", other)
 
-    def __rsub__(self, other: Any) -> Any:
+    def __rsub__(self, other: Any) -> "Value":
         return self._with("-", other, True)
 
-    def __mul__(self, other: Any) -> Any:
+    def __mul__(self, other: Any) -> "Value":
         return self._with("*", other)
 
-    def __rmul__(self, other: Any) -> Any:
-        return self._with("*", other, True)
+    __radd__, __rmul__ = __add__, __mul__
 
-    def __truediv__(self, other: Any) -> Any:
-        return self._with("/", other)
-
-    def __rtruediv__(self, other: Any) -> Any:
+    def __rtruediv__(self, other: Any) -> "Value":
         return self._with("/", other, True)
 
-    def __neg__(self) -> Any:
+    def __neg__(self) -> "Value":
         return self._with("-", 0.0, True)
-
-    def __pow__(self, exponent: int) -> Any:
-        if exponent != int(exponent) or exponent < 1:
-            raise TypeError(f"expressions of straight-line code have powers 1, 2, 3, ... alone; given {exponent!r}")
-        half = self ** (int(exponent) // 2) if exponent > 1 else 1.0
-        return half * half * self if exponent % 2 else half * half
 
 
 def program_of(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Program, list[str]]:
     """The program of the accelerations, of the values t, q0, q1, ..., v0, v1, ..., and the names of its results."""
-    program, t, q, v = _inputs(system)
-    made = Expressions(system, t0, q0, v0).accelerations(program.functions(), t, q, v)
+    return _program(Expressions(system, t0, q0, v0))
+
+
+def _program(equations: Expressions) -> tuple[Program, list[str]]:
+    program = Program()
+    made = _written(equations, program).each(equations.solution[: equations.system.n_q])
     return program, [_name(each) for each in made]
+
+
+def _written(equations: Expressions, program: Program) -> Written:
+    """What writes forms into a program, of the values t, q0, q1, ..., v0, v1, ..."""
+    names = ["t", *(f"{letter}{i}" for letter in "qv" for i in range(equations.system.n_q))]
+    return Written(equations.traced.graph, program.functions(), [Value(program, name) for name in names])
 
 
 def straight_line(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> Callable[..., Any]:
@@ -121,30 +109,24 @@ def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: Array, v0: 
 @lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
     n = system.n_q
-    program, names = program_of(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
+    program, names = _program(expressions_at(system, t0, q0, v0))
     results = [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
     return _machine_code(system, "rate", program, results)
 
 
 @lru_cache(maxsize=256)
 def _compiled_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
-    n, (program, t, q, v) = system.n_q, _inputs(system)
-    expressions = Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
-    made = expressions.derivatives(program.functions(), t, q, v)
-    if program.operations > MOST_OPERATIONS:
-        return None
+    n, program = system.n_q, Program()
+    equations = expressions_at(system, t0, q0, v0)
+    written = _written(equations, program)
     results = [f"columns[{n + i}, {i}] = 1.0" for i in range(n)]
-    for k, column in enumerate(made):
-        places = [(i, _name(each)) for i, each in enumerate(column) if isinstance(each, Value) or each != 0.0]
+    for k, column in enumerate(equations.derivatives()):
+        made = written.each(column)
+        if program.operations > MOST_OPERATIONS:
+            return None
+        places = [(i, _name(each)) for i, each in enumerate(made) if isinstance(each, Value) or each != 0.0]
         results += [f"columns[{k}, {n + i}] = {name}" for i, name in places]
     return _machine_code(system, "columns", program, results)
-
-
-def _inputs(system: ConstrainedSystem) -> tuple[Program, Value, list[Value], list[Value]]:
-    """An empty program, and the values t, q0, q1, ..., v0, v1, ... that it is of."""
-    program = Program()
-    q, v = ([Value(program, f"{letter}{i}") for i in range(system.n_q)] for letter in "qv")
-    return program, Value(program, "t"), q, v
 
 
 def _name(made: Any) -> str:
@@ -158,4 +140,4 @@ def _machine_code(system: ConstrainedSystem, into: str, program: Program, result
     scope: dict[str, Any] = functions_of(math)
     text = "\n    ".join([f"def derivative(t, y, {into}):", *lines])
     exec(compile(text, f"<straight-line code of {system.name}>", "exec"), scope)
-    return njit(**_OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]
+    return njit(**OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]

@@ -58,41 +58,26 @@ def solve_exudyn_beam(
     ----------
     problem : Problem
         From `twoloop.mechanisms.ancf_beam`; only `parameters` are read.
-    t_end : float
-        End, s; the run starts at 0.
-    n_steps : int
-        Number of steps.
+    t_end, n_steps, solver, store_every, time_limit : see `references.exudyn.mechanisms.solve_exudyn`
     model : {"cable", "shear"}
         `MODELS` describes each in a line fit for a table. The first converges far faster with the mesh.
     n_elements : int, optional
         Number of equal elements. None: that of the problem.
-    solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
-        `references.exudyn.run.SOLVERS` describes each in a line fit for a table.
-    store_every : int
-        Store the start and every so many steps; `n_steps` must be a multiple of it.
-    time_limit : float, optional
-        Wall-clock time that the run may take, s, looked at after every step. A run past it is a failed one. None: no
-        limit.
 
     Returns
     -------
     Result
         q, v, a (6 (n_elements + 1), n_t) in the order of `ancf_beam`, so that its `tip_height` and
         `midpoint_deflection` read them. What the model has not is NaN: the directors, and with "shear" the slopes as
-        well. `lam` (2, n_t) is NaN too. All else as in `references.exudyn.four_bar.solve_exudyn`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong, naming it.
+        well. `lam` (2, n_t) is NaN too. All else as in `references.exudyn.mechanisms.solve_exudyn`.
     """
     check_problem(problem, "youngs_modulus", "a beam of twoloop.mechanisms.ancf_beam")
-    t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
+    steps = check_steps(t_end, n_steps, solver, store_every, time_limit)
     check_choice("model", model, MODELS)
     p = problem.parameters
     n_elements = p["n_elements"] if n_elements is None else check_size("n_elements", n_elements, 1)
     _container, mbs, sensors, reference = _model(p, model, n_elements)
-    result = run(mbs, sensors, reference.ravel(), 2, t_end, n_steps, solver, store_every, time_limit)
+    result = run(mbs, sensors, reference.ravel(), 2, steps)
     q, v, a = (_ours(coordinates, n_elements) for coordinates in (result.q, result.v, result.a))
     return replace(result, q=q, v=v, a=a)
 

@@ -1,4 +1,4 @@
-"""Published mechanisms as Exudyn models: rigid bodies, joints, springs and weight of its own.
+"""The four-bar linkage and published mechanisms as Exudyn models: bodies, joints, springs and weight of its own.
 
 Nothing comes from twoloop's equations but masses, inertias, geometry and the state at the start. Spatial bodies have
 Euler parameters, as ours have, but for the bars of A04, whose rotation matrices are computed from them.
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
-from references.exudyn.run import check_radius, check_steps, run
+from references.exudyn.run import check_steps, run
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
 from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
@@ -25,66 +25,99 @@ X, Y, Z = np.eye(3)
 REDUNDANT = ("A02", "A04")  # beginnings of names: rows that depend on others, for good or where the motion passes
 
 
-def solve_exudyn_mechanism(
+def solve_exudyn(
     problem: Problem,
     t_end: float,
     n_steps: int,
     solver: str = "GeneralizedAlpha",
     *,
     spectral_radius: float | None = None,
+    alpha: float | None = None,
     store_every: int = 1,
     time_limit: float | None = None,
 ) -> Result:
-    """Run a published mechanism with one of Exudyn's implicit solvers, with a fixed step.
+    """Run a mechanism with one of Exudyn's implicit solvers, with a fixed step.
 
     Parameters
     ----------
     problem : Problem
-        One of those in `MODELS`, by its name, or of A02. Its parameters and its start are read, not its system.
+        One of those in `MODELS`, by its name, of A02, or of `twoloop.mechanisms.four_bar`. Its parameters and its start
+        are read, not its system.
     t_end : float
         End, s; the run starts at 0.
-    n_steps, solver, spectral_radius, store_every, time_limit
-        As of `references.exudyn.four_bar.solve_exudyn`.
+    n_steps : int
+        Number of steps.
+    solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
+        `SOLVERS` describes each in a line fit for a table.
+
+        "GeneralizedAlpha": J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, on index 3 by M. Arnold and
+        O. Bruels, Multibody Syst. Dyn. 18 (2007) 185-202. From the spectral radius r at infinite frequency
+        alpha_m = (2 r - 1)/(r + 1), alpha_f = r/(r + 1), gamma = 1/2 - alpha_m + alpha_f, beta = (gamma + 1/2)^2/4.
+
+        "HHT": alpha_m = 0, alpha_f = -alpha, gamma = (1 - 2 alpha)/2, beta = (1 - alpha)^2/4 (Hilber, Hughes and
+        Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292). Exudyn has no setting for it: its settings know alpha_m
+        and alpha_f through r only, and r = 1/2, where alpha_m vanishes, is HHT with alpha = -1/3. For the others its
+        solver is started and its four coefficients are overwritten before the first step. This is the
+        formula of HHT-I3, not its step-size control.
+    spectral_radius : float, optional
+        Of "GeneralizedAlpha" alone, 0 (most damping) to 1 (none). None: 0.9, Exudyn's default. With 1 the index-3
+        form is weakly unstable: on the four-bar linkage the run fails within seconds, whatever the step.
+    alpha : float, optional
+        Of "HHT" alone, -1/3 (most damping) to 0 (the trapezoidal rule, as unstable as a spectral radius of 1). None:
+        -0.3, the default of MSC Adams.
+    store_every : int
+        Store the start and every so many steps; `n_steps` must be a multiple of it.
+    time_limit : float, optional
+        Wall-clock time that the run may take, s, looked at after every step. A run past it is a failed one. None: no
+        limit.
 
     Returns
     -------
     Result
-        As of `references.exudyn.four_bar.solve_exudyn`, in our coordinates; of A02 by its tips and of A04, whose
-        coordinates Exudyn does not have, `a` is NaN.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong, naming it.
+        In our coordinates; `a` as Exudyn's solver has it, but NaN of A02 by its tips and of A04, whose coordinates
+        Exudyn does not have; `lam` NaN, for Exudyn's joint forces are not our multipliers. Times are Exudyn's own,
+        which carry the rounding of an accumulated sum. `h` is empty unless every step is stored. A step that does not
+        converge gives what was stored before it, `Status.SOLVER_FAILED` and Exudyn's text. Of the statistics Exudyn
+        tells steps (n_accepted), Newton iterations (n_outer) and Jacobians, each with its factorisation
+        (n_factorizations); cpu_time is that of the solver, its initialisation included.
     """
-    if not has_model(problem):
-        raise ValueError(f"problem must be of A02 or one of {', '.join(MODELS)}; given {problem.name!r}")
-    t_end, n_steps, store_every = check_steps(t_end, n_steps, solver, store_every, time_limit)
-    radius = check_radius(spectral_radius, solver)
-    model = (_n_four_bar if problem.name.startswith("A02") else MODELS[problem.name])(problem)
-    model.mbs.Assemble()
-    result = run(
-        model.mbs,
-        model.sensors,
-        np.concatenate(model.reference),
-        problem.system.n_c,
-        t_end,
-        n_steps,
-        solver,
-        store_every,
-        time_limit,
-        radius,
-        dependent_rows=problem.name.startswith(REDUNDANT),
-    )
+    if not isinstance(problem, Problem) or not has_model(problem):
+        error, given = (ValueError, problem.name) if isinstance(problem, Problem) else (TypeError, problem)
+        raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
+    steps = check_steps(t_end, n_steps, solver, store_every, time_limit, spectral_radius, alpha)
+    model, redundant = model_of(problem), problem.name.startswith(REDUNDANT)
+    reference = np.concatenate(model.reference)
+    result = run(model.mbs, model.sensors, reference, problem.system.n_c, steps, redundant)
     if problem.name == bricard().name:
         return _with_matrices(result)
     tips = problem.name.startswith("A02") and len(problem.q0) != len(result.q)
     return _with_tips(result, problem.parameters["n"]) if tips else result
 
 
+def model_of(problem: Problem) -> Model:
+    """The model of a problem, assembled."""
+    make = MODELS.get(problem.name, _n_four_bar if problem.name.startswith("A02") else _four_bar)
+    model = make(problem)
+    model.mbs.Assemble()
+    return model
+
+
 def has_model(problem: Problem) -> bool:
     """Whether there is a model of a problem."""
-    return problem.name in MODELS or problem.name.startswith("A02")
+    return problem.name in MODELS or problem.name.startswith("A02") or "L3" in problem.parameters
+
+
+def _four_bar(problem: Problem) -> Model:
+    p = problem.parameters
+    model, lengths = Model((0.0, -p["gravity"], 0.0)), [p[f"L{i + 1}"] for i in range(3)]
+    for length, q, v in zip(lengths, problem.q0.reshape(3, 3), problem.v0.reshape(3, 3), strict=True):
+        mass = p["density"] * length
+        model.planar_body(mass, mass * length**2 / 12.0, q, v)
+    model.pin(GROUND, (0.0, 0.0), 0, (-0.5 * lengths[0], 0.0))
+    for i in range(2):
+        model.pin(i, (0.5 * lengths[i], 0.0), i + 1, (-0.5 * lengths[i + 1], 0.0))
+    model.pin(2, (0.5 * lengths[2], 0.0), GROUND, (p["L"], 0.0))
+    return model
 
 
 def _heavy_top(problem: Problem) -> Model:

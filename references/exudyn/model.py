@@ -90,24 +90,19 @@ class Model:
 
     def spring(self, i: int, a: ArrayLike, j: int, b: ArrayLike, *data: float) -> None:
         """A spring-damper between points of space at the start: stiffness, damping, length."""
-        markers = []
-        for body, point in ((i, a), (j, b)):
-            number, local, _ = self._local(body, point)
-            markers.append(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=local)))
         stiffness, damping, length = data
-        self.mbs.AddObject(
-            ObjectConnectorSpringDamper(
-                markerNumbers=markers, stiffness=stiffness, damping=damping, referenceLength=length
-            )
-        )
+        markers = [self._marker(*self._local(body, point)[:2]) for body, point in ((i, a), (j, b))]
+        properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "referenceLength": length}
+        self.mbs.AddObject(ObjectConnectorSpringDamper(markerNumbers=markers, **properties))
 
     def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> None:
         """A pin between points of two planar bodies, each in the axes of its body."""
-        markers = []
-        for body, (x, y) in ((i, a), (j, b)):
-            number = self.ground if body == GROUND else self.bodies[body]
-            markers.append(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=[x, y, 0.0])))
+        numbers = (self.ground if body == GROUND else self.bodies[body] for body in (i, j))
+        markers = [self._marker(number, [*point, 0.0]) for number, point in zip(numbers, (a, b), strict=True)]
         self.mbs.AddObject(ObjectJointRevolute2D(markerNumbers=markers))
+
+    def _marker(self, number: int, local: list[float]) -> int:
+        return int(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=local)))
 
     def hold(self, body: int, coordinate: int) -> None:
         """Keep a coordinate of a body."""

@@ -8,17 +8,17 @@ cannot be solved" (1.13.6).
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import exudyn as exu
 import numpy as np
 from exudyn.itemInterface import SensorNode
 from numpy.typing import NDArray
 
-from references.driver import TimeLimit, check_choice, check_time_limit, user_call
+from references.driver import TimeLimit, check_choice, check_time_limit, result_of, user_call
 from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics, Status
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -37,25 +37,40 @@ _OUTPUTS = (
 )
 
 
+class Steps(NamedTuple):
+    """The arguments that all models take, checked."""
+
+    t_end: float
+    n_steps: int
+    solver: str
+    store_every: int
+    time_limit: float | None
+    radius: float
+    alpha: float
+
+
 def check_steps(
-    t_end: float, n_steps: int, solver: str, store_every: int, time_limit: float | None
-) -> tuple[float, int, int]:
-    """Return t_end, n_steps and store_every, or say what is wrong with an argument."""
+    t_end: float,
+    n_steps: int,
+    solver: str,
+    store_every: int,
+    time_limit: float | None,
+    spectral_radius: float | None = None,
+    alpha: float | None = None,
+) -> Steps:
+    """Return the arguments, with Exudyn's default of the radius and MSC Adams' of alpha, or say what is wrong."""
     check_positive("t_end", t_end)
     check_time_limit(time_limit)
     n_steps, store_every = check_size("n_steps", n_steps, 1), check_size("store_every", store_every, 1)
     if n_steps % store_every != 0:
         raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
     check_choice("solver", solver, SOLVERS)
-    return float(t_end), n_steps, store_every
+    radius = _option("spectral_radius", spectral_radius, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
+    strength = _option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
+    return Steps(float(t_end), n_steps, solver, store_every, time_limit, radius, strength)
 
 
-def check_radius(value: float | None, solver: str) -> float:
-    """The spectral radius of the generalized-alpha method; Exudyn's default for None."""
-    return check_option("spectral_radius", value, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
-
-
-def check_option(
+def _option(
     name: str, value: float | None, default: float, span: tuple[float, float], owner: str, solver: str
 ) -> float:
     """The value of an option that belongs to one solver, checked."""
@@ -75,23 +90,13 @@ def add_sensors(mbs: Any, node: int) -> list[int]:
 
 
 def run(
-    mbs: Any,
-    sensors: Sequence[list[int]],
-    reference: Array,
-    n_c: int,
-    t_end: float,
-    n_steps: int,
-    solver: str,
-    store_every: int,
-    time_limit: float | None,
-    radius: float = SPECTRAL_RADIUS,
-    alpha: float = ALPHA,
-    dependent_rows: bool = False,
+    mbs: Any, sensors: Sequence[list[int]], reference: Array, n_c: int, steps: Steps, dependent_rows: bool = False
 ) -> Result:
     """Solve an assembled system whose nodes have these sensors and reference coordinates, with n_c constraints.
 
     With dependent rows, which Exudyn's usual linear solver cannot treat, a dense one leaves out what is singular.
     """
+    t_end, n_steps, solver, store_every, time_limit, radius, alpha = steps
     settings = _settings(t_end, n_steps, store_every)
     if dependent_rows:
         settings.linearSolver.solverType = exu.LinearSolverType.EigenDense
@@ -105,27 +110,20 @@ def run(
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
     did = mbs.sys["dynamicSolver"].it
     made = did.currentStepIndex - (2 if failure else 1)  # the index counts from 1, and the failed step
-    message = f"Exudyn reached the end, t = {t[-1]:g}."
-    if stopped := not failure and made < n_steps:
+    message = ""
+    if not failure and made < n_steps:
         message = limit.message("Exudyn", did.currentTime, "take fewer steps")
     elif failure:
         message = f"Exudyn failed in the step to t = {did.currentTime:.10g}: {failure}. Take more steps."
-    return Result(
-        t=t,
-        q=q + reference[:, None],
-        v=v,
-        a=a,
-        lam=np.full((n_c, t.size), np.nan),
-        h=np.full(t.size - 1, did.currentStepSize) if store_every == 1 else np.empty(0),
-        status=Status.SOLVER_FAILED if failure or stopped else Status.REACHED_END,
-        message=message,
-        stats=Statistics(
-            n_accepted=made,
-            n_outer=did.newtonStepsCount,
-            n_factorizations=did.newtonJacobiCount,
-            cpu_time=clock.seconds or 0.0,
-        ),
+    statistics = Statistics(
+        n_accepted=made,
+        n_outer=did.newtonStepsCount,
+        n_factorizations=did.newtonJacobiCount,
+        cpu_time=clock.seconds or 0.0,
     )
+    columns = np.concatenate([q + reference[:, None], v, a, np.full((n_c, t.size), np.nan)])
+    h = np.full(t.size - 1, did.currentStepSize) if store_every == 1 else None
+    return result_of(len(q), t, columns, f"Exudyn reached the end, t = {t[-1]:g}.", message, statistics, h)
 
 
 def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:

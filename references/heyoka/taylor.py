@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_run, longest_step, user_call
-from references.equations.expressions import Expressions, functions_of
-from references.equations.nonholonomic import with_all_rows
-from references.equations.ode import ADVICE, ode_result, output_times
+from references.driver import ADVICE, TimeLimit, check_task, imported, longest_step, user_call
+from references.equations.expressions import Expressions, expressions_at, functions_of
+from references.equations.ode import ode_result
 from twoloop.checks.arguments import check_positive
-from twoloop.checks.consistency import check_start
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics
@@ -47,46 +45,30 @@ def solve_heyoka(
 
     Parameters
     ----------
-    system : ConstrainedSystem
-        The problem, of compiled callbacks, which give Q_d and do not branch on q or v.
-    t_span : (float, float)
-        Start and end, s; the end after the start.
-    q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities.
+    system, t_span, q0, v0, t_eval, time_limit, max_step : see `references.driver`
+        The clock is looked at every `STEPS_A_CALL` steps.
     tol : float
         heyoka's one tolerance.
-    t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, by the Taylor series of the steps, in a second run
-        that is not timed. None: 1001 times, evenly.
-    time_limit : float, optional
-        Wall-clock time that the integration may take, s, looked at every `STEPS_A_CALL` steps. A run past it is a
-        failed one. None: no limit.
-    max_step : float, optional
-        The longest step that it may take, s. None: the length of t_span.
 
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_accepted and cpu_time, that
-        of the call. The integrator is kept for the next run of the same system, start and tolerance, its machine code
-        in heyoka's own cache on disk. A failure gives what was computed before it, and `Status.SOLVER_FAILED`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong, or the equations cannot be had as expressions: before any work, naming it.
-    RuntimeError
-        If heyoka is not installed.
+        `a` and `lam` from eq. (6) at the stored states. Of the statistics: n_accepted. The integrator is kept for the
+        next run of the same system, start and tolerance, its machine code in heyoka's own cache on disk.
     """
     check_positive("tol", tol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
-    times = output_times(times, t0, t1)
-    check_start(system, t0, q0, v0, derivatives=False)
-    system = with_all_rows(system)
-    integrator, outcomes = _integrator(system, t0, q0.tobytes(), v0.tobytes(), float(tol))
-    start = np.concatenate([q0, v0])
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, derivatives=False)
+    integrator, longest = _integrator(*task.key, float(tol)), longest_step(max_step, task.t1 - task.t0)
+    made = integrate(integrator, task.y0, (task.t0, task.t1), task.instants, time_limit, longest)
+    times, rows, failure, end, statistics = made
+    return ode_result(task.system, times, rows.T, failure, end, statistics)
 
-    longest = longest_step(max_step, t1 - t0)
+
+def integrate(
+    integrator: Any, start: Array, span: tuple[float, float], times: Array, time_limit: float | None, longest: float
+) -> tuple[Array, Array, str, str, Statistics]:
+    """The times that were reached, rows y there, why it failed ("": it did not), what is said if not, statistics."""
+    (t0, t1), outcomes = span, imported("heyoka").taylor_outcome
     limit, steps = TimeLimit(time_limit), 0
     with user_call as clock:
         integrator.time, integrator.state[:] = t0, start
@@ -95,8 +77,7 @@ def solve_heyoka(
             steps += taken
             if outcome != outcomes.step_limit or limit.passed():
                 break
-    cpu, reached = clock.seconds or 0.0, float(integrator.time)
-    failure = ""
+    reached, failure = float(integrator.time), ""
     if outcome == outcomes.step_limit:
         failure = limit.message("heyoka", reached, "take looser tolerances")
     elif outcome != outcomes.time_limit:  # which is what heyoka calls the end
@@ -104,29 +85,28 @@ def solve_heyoka(
     kept = times[times <= (reached if failure else t1)]
     integrator.time, integrator.state[:] = t0, start
     grid = kept if kept.size and kept[0] == t0 else np.append(t0, kept)  # it must begin where the state is
-    states = integrator.propagate_grid(grid, max_delta_t=longest)[-1].T[:, grid.size - kept.size :]
+    rows = integrator.propagate_grid(grid, max_delta_t=longest)[-1][grid.size - kept.size :]
     end = f"heyoka, order {integrator.order}, reached the end, t = {t1:g}."
-    return ode_result(system, kept, states, failure, end, Statistics(n_accepted=steps, cpu_time=cpu))
+    return kept, rows, failure, end, Statistics(n_accepted=steps, cpu_time=clock.seconds or 0.0)
+
+
+def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> list[tuple[Any, Any]]:
+    """heyoka's variables q, v and their rates."""
+    package, n = imported("heyoka"), equations.system.n_q
+    symbols = package.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
+    state = package.time, symbols[:n], symbols[n:]
+    rates = [*symbols[n:], *equations.accelerations(functions_of(package), *state, parameters or [])]
+    rates = [package.expression(rate) if isinstance(rate, float) else rate for rate in rates]
+    return list(zip(symbols, rates, strict=True))
 
 
 @lru_cache(maxsize=256)
-def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> tuple[Any, Any]:
-    """An integrator, and heyoka's names of outcomes."""
-    try:
-        import heyoka
-    except ImportError as error:
-        raise RuntimeError("heyoka is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    n, state = system.n_q, np.concatenate([np.frombuffer(q0), np.frombuffer(v0)])
-    symbols = heyoka.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
-    equations = Expressions(system, t0, state[:n], state[n:])
-    rates = [*symbols[n:], *equations.accelerations(functions_of(heyoka), heyoka.time, symbols[:n], symbols[n:])]
-    rates = [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates]
-    integrator = heyoka.taylor_adaptive(
-        list(zip(symbols, rates, strict=True)),
-        state.tolist(),
+def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> Any:
+    return imported("heyoka").taylor_adaptive(
+        rates_of(expressions_at(system, t0, q0, v0)),
+        [*np.frombuffer(q0), *np.frombuffer(v0)],
         time=t0,
         tol=tol,
         fast_math=True,
-        compact_mode=n > LARGEST_UNROLLED,
+        compact_mode=system.n_q > LARGEST_UNROLLED,
     )
-    return integrator, heyoka.taylor_outcome

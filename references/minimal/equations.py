@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from references.paper.four_bar_minimal import MinimalFourBar
+from references.paper.four_bar_minimal import MinimalFourBar, absolute, tangent_of
 from twoloop.mechanisms import Problem
 
 Array = NDArray[np.float64]
@@ -217,40 +217,24 @@ def _four_bar(problem: Problem) -> Minimal:
 
         return rates
 
-    def directions(angle: Array) -> dict[int, Array]:
-        """e of the three bars, as complex numbers."""
-        own_e = np.exp(1j * angle)
-        chord = ground - Lk * own_e
-        along = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
-        across = side * np.sqrt(La**2 / np.abs(chord) ** 2 - along**2)
-        own_a = chord * (along + 1j * across) / La
-        return {own: own_e, a: own_a, b: (chord - La * own_a) / Lb}
-
     def turns(angle: Array) -> dict[int, Array]:
         """The three angles, continuous in the one: R turns with its bar only where that is longer than the ground."""
-        vector = directions(angle)
-        chord = ground - Lk * vector[own]
-        across = np.angle(chord) if Lk < ground else angle + np.angle(chord / vector[own] * -1.0) + math.pi
-        first = across + np.angle(vector[a] / chord)
-        return {own: angle, a: first, b: first + np.angle(vector[b] / vector[a])}
+        bar = np.exp(1j * angle)
+        chord = ground - Lk * bar
+        along = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
+        of_a = chord * (along + 1j * side * np.sqrt(La**2 / np.abs(chord) ** 2 - along**2))
+        across = np.angle(chord) if Lk < ground else angle + np.angle(-chord / bar) + math.pi
+        first = across + np.angle(of_a / chord)
+        return {own: angle, a: first, b: first + np.angle((chord - of_a) / of_a)}
 
     at_start = turns(np.array(problem.q0[3 * own + 2]))
     whole = [2.0 * math.pi * round((problem.q0[3 * i + 2] - float(at_start[i])) / (2.0 * math.pi)) for i in range(3)]
 
     def states(y: Array) -> tuple[Array, Array]:
-        vector = directions(y[0])
-        sine = (vector[b] * vector[a].conj()).imag
-        rate = {own: y[1]}
-        rate[a] = -Lk * (vector[b] * vector[own].conj()).imag / (La * sine) * y[1]
-        rate[b] = Lk * (vector[a] * vector[own].conj()).imag / (Lb * sine) * y[1]
-        q, v = np.empty((9, y.shape[1])), np.empty((9, y.shape[1]))
         turned = turns(y[0])
-        for i in range(3):
-            q[3 * i + 2], v[3 * i + 2] = turned[i] + whole[i], rate[i]
-            place = sum(HALVES[i][j] * lengths[j] * vector[j] for j in range(3))
-            speed = sum(HALVES[i][j] * lengths[j] * 1j * vector[j] * rate[j] for j in range(3))
-            q[3 * i : 3 * i + 2], v[3 * i : 3 * i + 2] = (place.real, place.imag), (speed.real, speed.imag)
-        return q, v
+        angles = np.array([turned[i] + whole[i] for i in range(3)])
+        tangent = tangent_of(np.array(lengths), angles)
+        return absolute(np.array(lengths), angles, tangent / tangent[own] * y[1])
 
     return Minimal(equations, (float(problem.q0[3 * own + 2]), float(problem.v0[3 * own + 2])), states)
 

@@ -10,15 +10,14 @@ import time
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_choice, check_run
+from references.driver import TimeLimit, check_choice, check_task, result_of
 from references.paper import ablation_kernels as kernels
 from twoloop.checks.arguments import check_positive
-from twoloop.checks.consistency import check_start
 from twoloop.kernels.data.common import GAMMA_GIVEN, Kit
 from twoloop.methods.tableaux import Tableau
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics, Status
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -59,12 +58,8 @@ def solve_variant(
 
     Parameters
     ----------
-    system : ConstrainedSystem
+    system, t_span, q0, v0, time_limit : see `references.driver`
         With `gamma`, and with constraints on positions that do not depend on one another.
-    t_span : (float, float)
-        Start and end, s.
-    q0, v0 : array_like (n_q,)
-        Consistent start.
     variant : str
         One of `VARIANTS`, which says what each does.
     tableau : Tableau
@@ -76,8 +71,6 @@ def solve_variant(
     loop_tol : float, optional
         Change of a stage, relative to max(1, |y|), at which the loop over the stages ends. None: 1e-4 tol, at least
         1e-11, as with fixed steps.
-    time_limit : float, optional
-        Wall-clock time that the run may take, s.
 
     Returns
     -------
@@ -87,11 +80,6 @@ def solve_variant(
         partitions; n_outer, sweeps over all stages; n_inner, Newton iterations for positions.
     mu : float
         Largest |mu| of the stabilised form, of its M q' = M v - C_q^T mu; 0 of the others.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong.
 
     Notes
     -----
@@ -103,13 +91,13 @@ def solve_variant(
     check_choice("variant", variant, VARIANTS)
     if (step is None) == (tol is None):
         raise ValueError(f"give either step, for fixed steps, or tol; given step={step!r}, tol={tol!r}")
-    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
+    task = check_task(system, t_span, q0, v0, None, time_limit, takes_velocity_rows=False)
+    system, t0, t1 = task.system, task.t0, task.t1
     check_positive("tol" if step is None else "step", tol if step is None else step)
     if not system.functions.flags[GAMMA_GIVEN]:
         raise ValueError(f"system must have gamma; given {system.name!r} without it")
     if np.linalg.matrix_rank(tableau.A) < tableau.stages:
         raise ValueError(f"tableau must have an invertible A; that of {tableau.name} is singular")
-    check_start(system, t0, q0, v0)
     span, which = t1 - t0, list(VARIANTS).index(variant)
     if loop_tol is None:
         loop_tol = max(LOOP_SHARE * (tol or 0.0), LEAST_LOOP)
@@ -122,7 +110,7 @@ def solve_variant(
     counters, where = np.zeros(kernels.N_COUNTERS, dtype=np.int64), np.zeros(kernels.N_PLACES)
     n_steps = 0 if step is None else max(1, round(span / step))
     where[kernels.T], where[kernels.H], where[kernels.LONGEST] = t0, span / n_steps if n_steps else FIRST * span, span
-    state = np.concatenate([q0, v0, np.zeros(n + m)])
+    state = np.concatenate([task.y0, np.zeros(n + m)])
     chunks = [np.empty((1, 1 + 3 * n + m))]
     given = (n, m, s, which, order, *coefficients, t0, t1, n_steps, 0.0 if tol is None else float(tol), float(loop_tol))
     began = time.process_time()
@@ -133,37 +121,28 @@ def solve_variant(
         code = kernels.run(Kit(system.functions), *given, state, where, chunks[-1], counters)
         chunks[-1] = chunks[-1][: counters[kernels.STEPS] - before]
     cpu = time.process_time() - began
-    return _result(f"{tableau.name}, {variant}", n, m, chunks, code, counters, cpu, limit), float(where[kernels.MU])
+    return _result(f"{tableau.name}, {variant}", n, chunks, code, counters, cpu, limit), float(where[kernels.MU])
 
 
 def _result(
-    name: str, n: int, m: int, chunks: list[Array], code: int, counters: NDArray[np.int64], cpu: float, limit: TimeLimit
+    name: str, n: int, chunks: list[Array], code: int, counters: NDArray[np.int64], cpu: float, limit: TimeLimit
 ) -> Result:
     rows = np.concatenate(chunks).T
     t = float(rows[0, -1])
-    message = f"{name} reached the end, t = {t:g}."
+    failure = ""
     if limit.exceeded:
-        message = limit.message(name, t, "take longer steps")
+        failure = limit.message(name, t, "take longer steps")
     elif code != kernels.DONE:
-        message = f"{name} failed after t = {t:.10g}: {REASONS[code]}. Take shorter steps."
-    return Result(
-        t=rows[0],
-        q=rows[1 : 1 + n],
-        v=rows[1 + n : 1 + 2 * n],
-        a=rows[1 + 2 * n : 1 + 3 * n],
-        lam=rows[1 + 3 * n :],
-        h=np.diff(rows[0]),
-        status=Status.SOLVER_FAILED if code != kernels.DONE or limit.exceeded else Status.REACHED_END,
-        message=message,
-        stats=Statistics(
-            n_accepted=int(counters[kernels.STEPS]),
-            n_rejected_error=int(counters[kernels.REFUSED]),
-            n_rejected_convergence=int(counters[kernels.DIVERGED]),
-            n_outer=int(counters[kernels.SWEEPS]),
-            n_inner=int(counters[kernels.NEWTON]),
-            n_evaluations=int(counters[kernels.EVALUATIONS]),
-            n_partitions=int(counters[kernels.PARTITIONS]),
-            n_factorizations=int(counters[kernels.FACTORIZATIONS]),
-            cpu_time=cpu,
-        ),
+        failure = f"{name} failed after t = {t:.10g}: {REASONS[code]}. Take shorter steps."
+    statistics = Statistics(
+        n_accepted=int(counters[kernels.STEPS]),
+        n_rejected_error=int(counters[kernels.REFUSED]),
+        n_rejected_convergence=int(counters[kernels.DIVERGED]),
+        n_outer=int(counters[kernels.SWEEPS]),
+        n_inner=int(counters[kernels.NEWTON]),
+        n_evaluations=int(counters[kernels.EVALUATIONS]),
+        n_partitions=int(counters[kernels.PARTITIONS]),
+        n_factorizations=int(counters[kernels.FACTORIZATIONS]),
+        cpu_time=cpu,
     )
+    return result_of(n, rows[0], rows[1:], f"{name} reached the end, t = {t:g}.", failure, statistics, np.diff(rows[0]))

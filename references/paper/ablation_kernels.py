@@ -1,13 +1,11 @@
 """The compiled steps of `paper.ablation`: one stage loop, in which variants differ by branches on `variant`."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
 
-from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve, lu_factor, lu_solve
-from twoloop.kernels.compile.caches import compile_kept, watch
+from references.equations.linear import cholesky, cholesky_solve, compiled_now, lu_factor, lu_solve
 from twoloop.kernels.data.common import CONSTANT_MASS, INTEGERS, KIT, MATRIX, VECTOR
 from twoloop.kernels.evaluation.partition import full_pivoting
 
@@ -58,20 +56,20 @@ def _matrices(f, w, t, q, W, counters):  # type: ignore[no-untyped-def]
         w.M[:, :] = 0.0
         f.mass(t, q, f.p, w.M)
         counters[FACTORIZATIONS] += 1
-        if not ldl_factor(w.M):
+        if not cholesky(w.M):
             return False
     w.Cq[:, :] = 0.0
     f.jacobian(t, q, f.p, w.Cq)
     for i in range(m):
         for j in range(n):
             W[i, j] = w.Cq[i, j]
-        ldl_solve(w.M, W[i])
+        cholesky_solve(w.M, W[i])
         for k in range(i + 1):
-            w.S[k, i] = 0.0
+            w.S[i, k] = 0.0
             for j in range(n):
-                w.S[k, i] += w.Cq[k, j] * W[i, j]
+                w.S[i, k] += w.Cq[k, j] * W[i, j]
     counters[FACTORIZATIONS] += 1
-    return ldl_factor(w.S)
+    return cholesky(w.S)
 
 
 @njit(error_model="numpy")
@@ -79,7 +77,7 @@ def _free(f, w, t, q, v, a, counters):  # type: ignore[no-untyped-def]
     """a = M^-1 Q."""
     a[:] = 0.0
     f.force(t, q, v, f.p, a)
-    ldl_solve(w.M, a)
+    cholesky_solve(w.M, a)
     counters[EVALUATIONS] += 1
 
 
@@ -103,7 +101,7 @@ def _accelerate(f, w, t, q, v, a, lam, W, counters):  # type: ignore[no-untyped-
         lam[i] = -lam[i]
         for j in range(a.size):
             lam[i] += w.Cq[i, j] * a[j]
-    ldl_solve(w.S, lam)
+    cholesky_solve(w.S, lam)
     _loaded(a, W, lam)
     return True
 
@@ -130,7 +128,7 @@ def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
             for j in range(m):
                 w.D[i, j] = w.Cq[i, w.order[j]]
         counters[FACTORIZATIONS] += 1
-        if not lu_factor(w.D, w.pivots) > 0.0:
+        if not lu_factor(w.D, w.pivots):
             return False
         if correction <= enough:
             break
@@ -178,7 +176,7 @@ def _project(f, w, t, q, v, counters):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy")
 def _least_change(w, W, x):  # type: ignore[no-untyped-def]
     """x -= M^-1 C_q^T S^-1 C; the largest change over max(1, |x|)."""
-    ldl_solve(w.S, w.C)
+    cholesky_solve(w.S, w.C)
     largest = 0.0
     for j in range(x.size):
         change = 0.0
@@ -325,15 +323,11 @@ def _error(n, tol, states):  # type: ignore[no-untyped-def]
     return np.sqrt(total / (2 * n))
 
 
-def _compile_now(function: Callable[..., Any]) -> Any:
-    """Compile for any mechanism and keep the machine code on disk until it or something that it calls changes."""
-    i8, f8 = types.int64, types.float64
-    sizes, tableau = (i8, i8, i8, i8, i8), (MATRIX, VECTOR, VECTOR, MATRIX)
-    signature = i8(KIT, *sizes, *tableau, f8, f8, i8, f8, f8, VECTOR, VECTOR, MATRIX, INTEGERS)
-    return compile_kept(function, signature, watch(function), error_model="numpy")
+_I8, _F8 = types.int64, types.float64
+_SIZES, _TABLEAU = (_I8,) * 5, (MATRIX, VECTOR, VECTOR, MATRIX)
 
 
-@_compile_now
+@compiled_now(_I8(KIT, *_SIZES, *_TABLEAU, _F8, _F8, _I8, _F8, _F8, VECTOR, VECTOR, MATRIX, INTEGERS))
 def run(  # type: ignore[no-untyped-def]
     f, n, m, s, variant, order, A, b, c, inverse, t0, t1, n_steps, tol, loop_tol, state, where, rows, counters
 ):
@@ -370,7 +364,7 @@ def run(  # type: ignore[no-untyped-def]
         return DONE if good else SINGULAR
     w.M[:, :] = 0.0
     f.mass(where[T], state[:n], f.p, w.M)
-    ldl_factor(w.M)
+    cholesky(w.M)
     states = np.zeros((4, state.size))  # beginning, end by one step, half way, end by two
     made = 0
     while made < rows.shape[0] and where[T] < t1:

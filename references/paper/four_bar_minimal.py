@@ -120,13 +120,7 @@ class MinimalFourBar:
         folded[back] = self.period - folded[back]
         state = self._dense(folded)
         angles = state[:3]
-        rates = _tangent(self._lengths, angles) * np.where(back, -state[3], state[3])
-        q, v = np.empty((9, times.size)), np.empty((9, times.size))
-        q[0::3], q[1::3] = _centres(self._lengths, np.cos(angles)), _centres(self._lengths, np.sin(angles))
-        v[0::3] = _centres(self._lengths, -np.sin(angles) * rates)
-        v[1::3] = _centres(self._lengths, np.cos(angles) * rates)
-        q[2::3], v[2::3] = angles, rates
-        return q, v
+        return absolute(self._lengths, angles, self.tangent(state) * np.where(back, -state[3], state[3]))
 
     def _swing(self, start: Array) -> Any:
         """Integrate from rest to the next position of rest."""
@@ -161,15 +155,11 @@ class MinimalFourBar:
 
     def coordinates(self, state: Array) -> Array:
         """Absolute coordinates (9,) of a state [th1, th2, th3, u]."""
-        q = np.empty(9)
-        q[0::3] = _centres(self._lengths, np.cos(state[:3]))
-        q[1::3] = _centres(self._lengths, np.sin(state[:3]))
-        q[2::3] = state[:3]
-        return q
+        return absolute(self._lengths, state[:3], self.tangent(state) * state[3])[0]
 
     def tangent(self, state: Array) -> Array:
         """Rates of the three angles of a state over its u."""
-        return _tangent(self._lengths, state[:3])
+        return tangent_of(self._lengths, state[:3])
 
     def rate(self, t: float, state: Array, torque: float = 0.0) -> Array:
         """(th', u') from Lagrange's equation for u, with a torque on the first bar.
@@ -178,7 +168,7 @@ class MinimalFourBar:
         """
         L, masses = self._lengths, self._masses
         angles, u = state[:3], state[3]
-        n = _tangent(L, angles)
+        n = tangent_of(L, angles)
         n_s = _tangent_rate(L, angles, n)
         c, s = np.cos(angles), np.sin(angles)
         x, x_s = _centres(L, -s * n), _centres(L, -s * n_s - c * n**2)
@@ -220,13 +210,23 @@ def _counted(rate: Callable[[float, Array], Array]) -> Callable[[float, Array], 
     return counted
 
 
+def absolute(lengths: Array, angles: Array, rates: Array) -> tuple[Array, Array]:
+    """Absolute coordinates and velocities (9,) or (9, n) of a chain of bars with these angles and their rates."""
+    q, v = np.empty((9, *angles.shape[1:])), np.empty((9, *angles.shape[1:]))
+    q[0::3], q[1::3] = _centres(lengths, np.cos(angles)), _centres(lengths, np.sin(angles))
+    v[0::3] = _centres(lengths, -np.sin(angles) * rates)
+    v[1::3] = _centres(lengths, np.cos(angles) * rates)
+    q[2::3], v[2::3] = angles, rates
+    return q, v
+
+
 def _centres(lengths: Array, directions: Array) -> Array:
     """One coordinate of the centres of a chain of bars with these direction cosines (3,) or (3, n)."""
     bars = lengths.reshape(-1, *(1,) * (directions.ndim - 1)) * directions
     return np.cumsum(bars, axis=0) - 0.5 * bars
 
 
-def _tangent(lengths: Array, angles: Array) -> Array:
+def tangent_of(lengths: Array, angles: Array) -> Array:
     """Direction in which the angles can move, (3,) or (3, n)."""
     L1, L2, L3 = lengths
     th1, th2, th3 = angles

@@ -8,7 +8,6 @@ meant. Numbers from here say what such formulas do; they are not numbers of ADAM
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,17 +15,15 @@ import numpy as np
 from numba import njit, types
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import TimeLimit, check_choice, check_run, user_call
-from references.equations.accelerations import accelerations
+from references.driver import Task, TimeLimit, check_choice, check_task, result_of, user_call
+from references.equations.linear import compiled_now, lu_factor, lu_solve
+from references.equations.ode import ode_result
 from references.scipy.index1 import solve_index1
-from twoloop.checks.arguments import check_positive, check_size, check_times
-from twoloop.checks.consistency import check_start
-from twoloop.kernels.algebra.linalg import lu_factor, lu_solve
-from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.checks.arguments import check_positive, check_size, check_span
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics, Status
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -52,22 +49,8 @@ _REASONS = {
     NOT_FINITE: "Newton's method meets values that are not finite",
 }
 NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # places in the counters
-_INTEGRATE = types.int64(
-    KIT,
-    types.int64,
-    MATRIX,
-    MATRIX,
-    types.int64,
-    types.int64,
-    types.float64,
-    types.float64,
-    types.int64,
-    MATRIX,
-    types.float64,
-    INTEGERS,
-    MATRIX,
-    INTEGERS,
-)
+_I8, _F8 = types.int64, types.float64
+_INTEGRATE = _I8(*(KIT, _I8, MATRIX, MATRIX, _I8, _I8, _F8, _F8, _I8, MATRIX, _F8, INTEGERS, MATRIX, INTEGERS))
 
 
 def solve_gear(
@@ -90,12 +73,9 @@ def solve_gear(
 
     Parameters
     ----------
-    system : ConstrainedSystem
-        The problem.
-    t_span : (float, float)
-        Start and end, s; a whole number of steps apart.
-    q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities.
+    system, t_span, q0, v0, time_limit : see `references.driver`
+        t_span is a whole number of steps long. An accurate start counts for the limit; the clock is looked at about
+        every `CALL` seconds.
     step : float
         Step size, s.
     order : int
@@ -116,9 +96,6 @@ def solve_gear(
     t_eval : array_like, optional
         Increasing times in t_span, t_span[0] and multiples of the step from there, at which to store the solution.
         None: every step.
-    time_limit : float, optional
-        Wall-clock time that the run may take, s, an accurate start included, looked at about
-        every `CALL` seconds. A run past it is a failed one. None: no limit.
 
     Returns
     -------
@@ -126,14 +103,9 @@ def solve_gear(
         `a` is the BDF derivative of v, `lam` (with the sign of M a + C_q^T lam = Q) what Newton's method found; in the
         states of the start that no formula made, both are those of eq. (6). `h` holds all steps made. Of the
         statistics: n_accepted, n_outer (Newton iterations) and n_factorizations (Newton matrices, their derivatives by
-        differences). When Newton's method fails, what was computed before it, `Status.SOLVER_FAILED` and the time. A
-        run that reaches the end may be wrong: nothing controls the error. At small steps an undamped motion loses
-        energy at the orders 1, 2, 5 and 6 and gains it at 3 and 4.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
+        differences). When Newton's method fails, the text has the time. A run that reaches the end may be wrong:
+        nothing controls the error. At small steps an undamped motion loses energy at the orders 1, 2, 5 and 6 and gains
+        it at 3 and 4.
 
     Notes
     -----
@@ -141,8 +113,8 @@ def solve_gear(
     coefficient, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
     Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] then has a condition number that does not grow as h becomes small.
     """
-    t0, t1, q0, v0, _ = check_run(system, t_span, q0, v0, None, time_limit)
     check_positive("step", step)
+    t0, t1 = check_span(t_span)
     n_steps = round((t1 - t0) / step)
     if n_steps < 1 or abs((t1 - t0) / step - n_steps) > WHOLE:
         raise ValueError(
@@ -152,70 +124,41 @@ def solve_gear(
         raise ValueError(f"order must be at most {HIGHEST}, BDF of higher order is unstable; given {order}")
     check_choice("start", start, STARTS)
     check_positive("newton_tol", newton_tol)
-    times = None if t_eval is None else check_times(t_eval, t0, t1, step)
-    check_start(system, t0, q0, v0)
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, step=step, takes_velocity_rows=False)
 
     h = (t1 - t0) / n_steps
     n_given = min(order, n_steps) if start == "accurate" else 1
     limit = TimeLimit(time_limit)
-    first = _first_states(system, np.array([t0 + k * h for k in range(n_given)]), q0, v0, limit)
+    first = _first_states(task, np.array([t0 + k * h for k in range(n_given)]), limit)
     if not first.success:
         message = f"The accurate start failed. {first.message}"
         if limit.passed():
             message = limit.message("The accurate start", float(first.t[-1]), "take start='ramp'")
         return replace(first, message=message)
-    keep = np.arange(n_steps + 1) if times is None else np.rint((times - t0) / h).astype(np.int64)
+    keep = np.arange(n_steps + 1) if task.times is None else np.rint((task.times - t0) / h).astype(np.int64)
     rows = np.empty((keep.size, 3 * system.n_q + system.n_c))
     counters = np.zeros(N_COUNTERS, dtype=np.int64)
     given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
     past = np.zeros((HIGHEST, given.shape[1]))
     code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
-    formulas = _formulas()
+    fixed = t0, h, order, _formulas(), float(newton_tol), keep, rows, counters
     with user_call as clock:
         while code == DONE and made < n_steps and not limit.passed():
             called = time.monotonic()
             last = min(made + stride, n_steps)
-            code = _integrate(
-                Kit(system.functions),
-                system.n_q,
-                given,
-                past,
-                made + 1,
-                last,
-                t0,
-                h,
-                order,
-                formulas,
-                float(newton_tol),
-                keep,
-                rows,
-                counters,
-            )
+            code = _integrate(Kit(system.functions), system.n_q, given, past, made + 1, last, *fixed)
             made = last
             stride *= 2 if time.monotonic() - called < CALL else 1
     return _result(system, order, t0, h, code, keep, rows, counters, clock.seconds or 0.0, limit)
 
 
-def _first_states(system: ConstrainedSystem, times: Array, q0: Array, v0: Array, limit: TimeLimit) -> Result:
+def _first_states(task: Task, times: Array, limit: TimeLimit) -> Result:
     """States at the first times; of a failed run those before its failure."""
-    if times.size > 1:
-        span = (float(times[0]), float(times[-1]))
-        return solve_index1(
-            system,
-            span,
-            q0,
-            v0,
-            "DOP853",
-            START_TOLERANCE,
-            START_TOLERANCE,
-            stabilisation="projection",
-            t_eval=times,
-            time_limit=limit.left(),
-        )
-    a, lam = accelerations(system, times, q0[:, None], v0[:, None])
-    return Result(
-        times, q0[:, None], v0[:, None], a, lam, np.empty(0), Status.REACHED_END, "the state given", Statistics()
-    )
+    if times.size == 1:
+        return ode_result(task.system, times, task.y0[:, None], "", "the state given", Statistics())
+    span, tolerances = (float(times[0]), float(times[-1])), (START_TOLERANCE, START_TOLERANCE)
+    options: dict[str, Any] = {"stabilisation": "projection", "t_eval": times, "time_limit": limit.left()}
+    return solve_index1(task.system, span, task.q0, task.v0, "DOP853", *tolerances, **options)
 
 
 def _formulas() -> Array:
@@ -246,32 +189,19 @@ def _result(
     limit: TimeLimit,
 ) -> Result:
     n, made, stored = system.n_q, int(counters[STEPS]), int(counters[STORED])
-    failed = code != DONE or limit.exceeded
-    message = f"BDF of order {order} reached the end, t = {t0 + made * h:g}."
+    name, failure = f"BDF of order {order}", ""
     if limit.exceeded:
-        message = limit.message(f"BDF of order {order}", t0 + made * h, "take a larger step")
+        failure = limit.message(name, t0 + made * h, "take a larger step")
     elif code != DONE:
-        message = (
-            f"BDF of order {order} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. Take a "
-            f"smaller step{' or a lower order' if order > 1 else ''}."
+        failure = (
+            f"{name} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. Take a smaller "
+            f"step{' or a lower order' if order > 1 else ''}."
         )
-    columns = rows[:stored].T
-    return Result(
-        t=np.asarray(t0 + h * keep[:stored], dtype=np.float64),
-        q=columns[:n],
-        v=columns[n : 2 * n],
-        a=columns[2 * n : 3 * n],
-        lam=columns[3 * n :],
-        h=np.full(made, h),
-        status=Status.SOLVER_FAILED if failed else Status.REACHED_END,
-        message=message,
-        stats=Statistics(
-            n_accepted=made,
-            n_outer=int(counters[NEWTON]),
-            n_factorizations=int(counters[MATRICES]),
-            cpu_time=cpu,
-        ),
+    statistics = Statistics(
+        n_accepted=made, n_outer=int(counters[NEWTON]), n_factorizations=int(counters[MATRICES]), cpu_time=cpu
     )
+    t, end = t0 + h * keep[:stored], f"{name} reached the end, t = {t0 + made * h:g}."
+    return result_of(n, np.asarray(t, dtype=np.float64), rows[:stored].T, end, failure, statistics, np.full(made, h))
 
 
 class _Space(NamedTuple):
@@ -338,7 +268,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
         if renew:
             _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J)
             counters[MATRICES] += 1
-            if not lu_factor(J, pivots) > 0.0:
+            if not lu_factor(J, pivots):
                 return SINGULAR if np.isfinite(r).all() else NOT_FINITE
         lu_solve(J, pivots, r)
         size, correction = 1.0, 0.0
@@ -357,27 +287,9 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
     return NOT_CONVERGED
 
 
-def _compile_now(function: Callable[..., Any]) -> Any:
-    """Compile for `_INTEGRATE` and keep the machine code on disk until it or something that it calls changes."""
-    return compile_kept(function, _INTEGRATE, watch(function), error_model="numpy")
-
-
-@_compile_now
+@compiled_now(_INTEGRATE)
 def _integrate(  # type: ignore[no-untyped-def]
-    f,
-    n,
-    given,
-    past,
-    first,
-    last,
-    t0,
-    h,
-    order,
-    formulas,
-    tol,
-    keep,
-    rows,
-    counters,
+    f, n, given, past, first, last, t0, h, order, formulas, tol, keep, rows, counters
 ):
     """Steps `first` to `last`; `keep` holds the numbers of those to store.
 

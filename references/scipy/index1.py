@@ -1,7 +1,7 @@
 """SciPy's solvers on the index-1 ODE y = [q, v] of any ConstrainedSystem: plain, Baumgarte's, or with projection.
 
 The accelerations are those of `equations.accelerations`; the right-hand side is compiled, and called from Python once
-an evaluation. Nothing here uses the integrator of twoloop, but its small dense factorisations are shared.
+an evaluation. Nothing here uses the integrator of twoloop.
 """
 
 import time
@@ -15,26 +15,17 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
-from references.driver import (
-    OutOfTimeError,
-    TimeLimit,
-    check_choice,
-    check_run,
-    check_tolerances,
-    longest_step,
-    user_call,
-)
-from references.equations.accelerations import OPTIONS, Equations, matrix_of, saddle_solve, schur_factors, times_inverse
+from references.driver import ADVICE, TimeLimit, check_choice, check_task, imported, longest_step, result_of, user_call
+from references.equations.accelerations import Equations, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
-from references.equations.nonholonomic import with_all_rows
-from references.equations.redundant_rows import on_independent_rows
+from references.equations.linear import OPTIONS
+from references.equations.rows import on_independent_rows
 from references.equations.straight_line import straight_line_jacobian
+from references.scipy.steps import Steps
 from twoloop.checks.arguments import check_positive
-from twoloop.checks.consistency import check_start
-from twoloop.kernels.algebra.linalg import ldl_solve
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics, Status
+from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -51,7 +42,6 @@ ALPHA = 10.0  # 1/s, see solve_index1
 
 PROJECTED = 1e-10  # correction of q, relative to max(1, |q|), at which a projection ends: what is left is its square
 MAX_PROJECTIONS = 10  # Newton iterations of a projection
-SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
 
 
 @on_independent_rows
@@ -74,19 +64,12 @@ def solve_index1(
 
     Parameters
     ----------
-    system : ConstrainedSystem
-        The problem. Its callbacks are compiled into a right-hand side at the first run (a few seconds).
-    t_span : (float, float)
-        Start and end, s; the end after the start.
-    q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities.
+    system, t_span, q0, v0, rtol, atol, time_limit, max_step : see `references.driver`
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr8", "Pr9"}
         The solver of `scipy.integrate`, or of extensisq (`PAIRS`: on the four-bar the best of its pairs from 1e-5 down,
         Pr9 at tight tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
         can be had as expressions of up to `straight_line.MOST_OPERATIONS`, without Baumgarte's terms; else they
         difference the right-hand side.
-    rtol, atol : float
-        SciPy's tolerances for q and v.
     stabilisation : {"none", "baumgarte", "projection"}
         `STABILISATIONS` describes each in a line fit for a table.
 
@@ -105,65 +88,45 @@ def solve_index1(
         linkage (period 2.25 s, DOP853, tolerances 1e-6 and 1e-9, 100 s) 10 costs 21 and 13 % more evaluations than no
         stabilisation, and its error is 1/300 and 1/35; from 20 on the cost grows with alpha: the ODE becomes stiff.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, by the solver's interpolant, in a second run of the
-        same steps that is not timed. None: every step.
-    time_limit : float, optional
-        Wall-clock time that the integration may take, s, looked at in every evaluation of the right-hand side. A run
-        past it is a failed one. None: no limit.
-    max_step : float, optional
-        The longest step that it may take, s. None: the length of t_span.
+        See `references.driver`. None: every step.
 
     Returns
     -------
     Result
-        `a` and `lam` (with the sign of M a + C_q^T lam = Q) computed from the stored q and v as in the right-hand
-        side, so with Baumgarte's terms where they are used. `h` holds all accepted steps. Of the statistics:
-        n_accepted; n_evaluations, all evaluations of the right-hand side, those for a difference Jacobian and after a
-        projection included, those for the interpolant not; n_factorizations, SciPy's LU count, for "Radau" and "BDF".
-        cpu_time is that of the integration, without the final `a` and `lam`. A failure gives what was computed before
-        it, `Status.SOLVER_FAILED` and the solver's text.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong: before any work, naming it. An exception of a Python callback comes through.
-    RuntimeError
-        If extensisq is asked for and not installed.
+        `a` and `lam` computed from the stored q and v as in the right-hand side, so with Baumgarte's terms where they
+        are used. `h` holds all accepted steps. Of the statistics: n_accepted; n_evaluations, all evaluations of the
+        right-hand side, those for a difference Jacobian and after a projection included, those for the interpolant not;
+        n_factorizations, SciPy's LU count, for "Radau" and "BDF".
     """
     _check_choices(method, stabilisation, alpha)
-    check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
-    check_start(system, t0, q0, v0)
-    system = with_all_rows(system)
-    solver_type = METHODS[method] if method in METHODS else _pair(method)
-
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol))
+    t0, t1, y0, times = task.t0, task.t1, task.y0, task.times
+    solver_type = METHODS[method] if method in METHODS else getattr(imported("extensisq"), method)
     strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0
-    equations = RightHandSide(system, t0, q0, strength)
-    y0 = np.concatenate([q0, v0])
-    equations.warm(t0, y0, stabilisation == "projection")
-    projected = stabilisation == "projection"
+    equations, projected = RightHandSide(task.system, t0, task.q0, strength), stabilisation == "projection"
+    equations.warm(t0, y0, projected)
     options: dict[str, Any] = {"rtol": float(rtol), "atol": float(atol)}
     options |= {} if max_step is None else {"max_step": longest_step(max_step, t1 - t0)}
     if method in IMPLICIT and (jacobian := equations.jacobian(t0, y0)):
         options["jac"] = jacobian
-    run = _Run(equations, None if times is None else times[:0], projected, time_limit)
+
+    def made(limit: TimeLimit) -> OdeSolver:
+        return solver_type(equations.function(limit), t0, y0, t1, **options)
+
+    limit, no_output = TimeLimit(time_limit), None if times is None else times[:0]
+    run = Steps(made, t0, y0, equations, equations.project if projected else None, no_output, limit)
     with user_call as clock:
-        run.go(solver_type, t0, y0, t1, options)
-    evaluations, shown = int(equations.counters[0]), run
-    if times is not None:
-        shown = _Run(equations, times[times <= run.ends[-1]], projected, None)
-        if times[0] <= run.ends[-1]:
-            shown.go(solver_type, t0, y0, t1, options)
-        run.failure = run.failure or shown.failure
-    return _result(method, equations, run, shown, evaluations, t1, clock.seconds or 0.0)
-
-
-def _pair(method: str) -> type[OdeSolver]:
-    try:
-        import extensisq
-    except ImportError as error:
-        raise RuntimeError("extensisq is not installed: make peers, or pip install 'twoloop[peers]'") from error
-    return getattr(extensisq, method)  # type: ignore[no-any-return]
+        run.go()
+    statistics = Statistics(
+        n_accepted=len(run.ends) - 1,
+        n_evaluations=int(equations.counters[0]),
+        n_factorizations=run.solver.nlu if isinstance(run.solver, Radau | BDF) else None,
+        cpu_time=clock.seconds or 0.0,
+    )
+    shown = run.again(times)
+    columns = np.concatenate([shown.states, *equations.at_points(shown.t, shown.states, equations.alpha)])
+    end = f"{method} reached the end, t = {t1:g}."
+    return result_of(system.n_q, shown.t, columns, end, run.message(method, ADVICE), statistics, np.diff(run.ends))
 
 
 def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None:
@@ -241,135 +204,6 @@ class RightHandSide(Equations):
         self.counters[:] = 0
 
 
-class _Run:
-    """The loop over a solver's steps, and what it stores."""
-
-    def __init__(
-        self, equations: RightHandSide, times: Array | None, projection: bool, time_limit: float | None
-    ) -> None:
-        self.equations, self.times, self.projection = equations, times, projection
-        self.limit = TimeLimit(time_limit)
-        self.ends: list[float] = []  # of the accepted steps
-        self.t: list[float] = []
-        self.y: list[Array] = []
-        self.failure = ""
-        self.n_factorizations: int | None = None
-
-    def go(self, solver_type: type[OdeSolver], t0: float, y0: Array, t1: float, options: dict[str, Any]) -> None:
-        """Integrate to t1 or to a failure, which leaves its text in `failure`."""
-        self.ends.append(t0)
-        if self.times is None or t0 in self.times[:1]:
-            self._store(t0, y0)
-        solver = None
-        try:
-            solver = solver_type(self.equations.function(self.limit), t0, y0, t1, **options)
-            while solver.status == "running" and not self.failure and not self._has_all():
-                self.failure = self._attempt(solver)
-                if not self.failure:
-                    self._accept(solver)
-        except OutOfTimeError:
-            self.failure = "out of time"
-        self.n_factorizations = solver.nlu if isinstance(solver, Radau | BDF) else None
-
-    def _has_all(self) -> bool:
-        """Whether the output times of a run that is for them alone are stored."""
-        return bool(self.times is not None and 0 < self.times.size == len(self.t))
-
-    def _attempt(self, solver: OdeSolver) -> str:
-        """Make a step, and return why it failed."""
-        try:
-            message = solver.step()
-        except ValueError as error:
-            # the implicit solvers' linear algebra refuses NaN in this way; a callback's own exception comes through
-            if self.equations.raised:
-                raise
-            return str(error)
-        if solver.status == "failed":
-            return str(message)
-        # LSODA would go on in both cases, without end in the second
-        if not np.isfinite(solver.y).all():
-            return f"the state at t = {solver.t:.10g} is not finite"
-        if solver.status == "running" and solver.t - self.ends[-1] < SMALLEST_STEP * np.spacing(abs(solver.t)):
-            return f"the step has shrunk to {solver.t - self.ends[-1]:.3g} s"
-        return ""
-
-    def _accept(self, solver: OdeSolver) -> None:
-        """Project and store what a step gave."""
-        t = float(solver.t)
-        due = [] if self.times is None else self._due(t)
-        inside = [moment for moment in due if moment != t]
-        if inside:
-            # before the projection: the interpolant belongs to the solver's own y and f
-            interpolant = solver.dense_output()
-            for moment in inside:
-                self._project_and_store(moment, interpolant(moment))
-        y = solver.y.copy()
-        if self.projection:
-            if not self._projected(t, y):
-                return
-            solver.y = y.copy()
-            if solver.status == "running":
-                solver.f = solver.fun(t, solver.y)
-        self.ends.append(t)
-        if self.times is None or len(due) > len(inside):
-            self._store(t, y)
-
-    def _due(self, t: float) -> list[float]:
-        """Output times after the last step's end and up to t."""
-        assert self.times is not None
-        first, last = np.searchsorted(self.times, [self.ends[-1], t], side="right")
-        return [float(moment) for moment in self.times[first:last]]
-
-    def _project_and_store(self, t: float, y: Array) -> None:
-        if not self.projection or self._projected(t, y):
-            self._store(t, y)
-
-    def _projected(self, t: float, y: Array) -> bool:
-        if self.equations.project(t, y):
-            return True
-        self.failure = f"the projection onto the constraints at t = {t:.10g} did not converge"
-        return False
-
-    def _store(self, t: float, y: Array) -> None:
-        self.t.append(t)
-        self.y.append(y)
-
-
-def _result(
-    method: str, equations: RightHandSide, run: _Run, shown: _Run, evaluations: int, t1: float, cpu: float
-) -> Result:
-    """The Result of what `shown` has stored, of a run that took so many evaluations."""
-    n = equations.system.n_q
-    t = np.array(shown.t)
-    states = np.array(shown.y).reshape(-1, 2 * n).T
-    a, lam = equations.at_points(t, states, equations.alpha)
-    message = f"{method} reached the end, t = {t1:g}."
-    if run.limit.exceeded:
-        message = run.limit.message(method, run.ends[-1], "take looser tolerances or another method")
-    elif run.failure:
-        message = (
-            f"{method} failed after t = {run.ends[-1]:.10g}: {run.failure.rstrip('.')}. "
-            "Look for a discontinuity, a singular position or a value that is not finite near this time, or try other "
-            "tolerances or another method."
-        )
-    return Result(
-        t=t,
-        q=states[:n],
-        v=states[n:],
-        a=a,
-        lam=lam,
-        h=np.diff(run.ends),
-        status=Status.SOLVER_FAILED if run.failure else Status.REACHED_END,
-        message=message,
-        stats=Statistics(
-            n_accepted=len(run.ends) - 1,
-            n_evaluations=evaluations,
-            n_factorizations=run.n_factorizations,
-            cpu_time=cpu,
-        ),
-    )
-
-
 @lru_cache(maxsize=64)
 def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
     """(t, y, n_c, alpha, p, factors, known, counters) -> y'."""
@@ -436,25 +270,11 @@ def _projection(
 
 @njit(**OPTIONS)
 def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
-    """x -= M^-1 C_q^T S^-1 C, and the largest change; infinite when S is singular. C is lost.
-
-    Where M is not positive definite, x changes by the d of M d + C_q^T mu = 0 and C_q d = C, which is the same.
-    """
-    m, n = Cq.shape
-    change = np.zeros(n)
-    if definite:
-        S, good = schur_factors(L, known, Cq)
-        if not good:
-            return np.inf
-        ldl_solve(S, C)
-        for i in range(m):
-            for j in range(n):
-                change[j] += Cq[i, j] * C[i]
-        times_inverse(L, known, change)
-    elif not saddle_solve(L, Cq, change, C):
+    """x -= d of M d + C_q^T mu = 0 and C_q d = C, and the largest change; infinite when that is singular. C is lost."""
+    change, largest = np.zeros(x.size), 0.0
+    if not solve_for(L, definite, known, Cq, change, C):
         return np.inf
-    largest = 0.0
-    for j in range(n):
+    for j in range(x.size):
         x[j] -= change[j]
         largest = max(largest, abs(change[j]))
         if not np.isfinite(change[j]):

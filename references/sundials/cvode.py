@@ -3,18 +3,17 @@
 The equations are those of `scipy.index1` without stabilisation. Without Python in its way: `sundials.cvode_c`.
 """
 
-from contextlib import suppress
+import io
+from contextlib import redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from references.driver import OutOfTimeError, TimeLimit, check_choice, check_run, check_tolerances, user_call
-from references.equations.nonholonomic import with_all_rows
-from references.equations.ode import ADVICE, ode_result, output_times, states_at
-from references.equations.redundant_rows import on_independent_rows
+from references.driver import ADVICE, OutOfTimeError, TimeLimit, check_choice, check_task, imported, user_call
+from references.equations.ode import ode_result
+from references.equations.rows import on_independent_rows
 from references.scipy.index1 import RightHandSide
-from twoloop.checks.consistency import check_start
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics
@@ -45,50 +44,27 @@ def solve_cvode(
 
     Parameters
     ----------
-    system : ConstrainedSystem
-        The problem. Its callbacks are compiled at the first run (a few seconds).
-    t_span : (float, float)
-        Start and end, s; the end after the start.
-    q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities.
+    system, t_span, q0, v0, rtol, atol, t_eval, time_limit : see `references.driver`
     method : {"Adams", "BDF"}
         Orders up to 12, or up to 5; both with Newton's iteration, scikit-sundae's only one.
-    rtol, atol : float
-        CVODE's tolerances.
-    t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, interpolated by CVODE, in a second run of the same
-        steps that is not timed. None: 1001 times, evenly.
-    time_limit : float, optional
-        Wall-clock time that the integration may take, s, looked at in every evaluation. None: no limit.
 
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states; `h` is empty. Of the statistics: n_evaluations, all calls of
-        the right-hand side, and cpu_time. A failure gives `Status.SOLVER_FAILED` and scikit-sundae's text.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong: before any work, naming it.
-    RuntimeError
-        If scikit-sundae is not installed.
+        `a` and `lam` from eq. (6) at the stored states. Of the statistics: n_evaluations, all calls of the right-hand
+        side.
     """
     check_choice("method", method, METHODS)
-    check_tolerances(rtol, atol)
-    t0, t1, q0, v0, times = check_run(system, t_span, q0, v0, t_eval, time_limit, takes_velocity_rows=True)
-    times = output_times(times, t0, t1)
-    check_start(system, t0, q0, v0, derivatives=False)
-    system = with_all_rows(system)
-    try:
-        from sksundae.cvode import CVODE
-    except ImportError as error:
-        raise RuntimeError("scikit-sundae is not installed: pip install 'twoloop[references]'") from error
+    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
+    CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
+    from references.sundials.ida import SMALLEST_STEP, states_at
 
-    equations, y0 = RightHandSide(system, t0, q0, 0.0), np.concatenate([q0, v0])
+    t0, t1, times, y0 = task.t0, task.t1, task.instants, task.y0
+    equations = RightHandSide(task.system, t0, task.q0, 0.0)
     y0.setflags(write=False)  # as CVODE hands it over, so that what is compiled here is what it calls
     equations.warm(t0, y0, False)
     options: dict[str, Any] = {"method": method, "rtol": float(rtol), "atol": float(atol), "max_num_steps": MOST_STEPS}
+    options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0}
     jacobian = equations.jacobian(t0, y0)
 
     def integrator(limit: TimeLimit) -> Any:
@@ -104,14 +80,14 @@ def solve_cvode(
 
     limit = TimeLimit(time_limit)
     timed, outcome = integrator(limit), None
-    with user_call as clock, suppress(OutOfTimeError):
+    with redirect_stdout(io.StringIO()), user_call as clock, suppress(OutOfTimeError):  # it prints its failures
         timed.init_step(t0, y0)
         outcome = timed.step(t1, tstop=t1)
     statistics = Statistics(n_evaluations=int(equations.counters[0]), cpu_time=clock.seconds or 0.0)
     if outcome is None:
         failure = limit.message("CVODE", t0, "take looser tolerances")
-        return ode_result(system, times[:0], np.empty((y0.size, 0)), failure, "", statistics)
+        return ode_result(task.system, times[:0], np.empty((y0.size, 0)), failure, "", statistics)
     failure = "" if outcome.success else f"CVODE failed after t = {outcome.t:.10g}: {outcome.message}. {ADVICE}"
     shown = states_at(integrator(TimeLimit(None)), (t0, t1), times[times <= outcome.t], y0)
     end = f"CVODE, {method}, reached the end, t = {t1:g}."
-    return ode_result(system, shown.t, shown.y.T, failure, end, statistics)
+    return ode_result(task.system, shown.t, shown.y.T, failure, end, statistics)

@@ -8,12 +8,12 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
 
-from references.sundials.ida_compiled import RAISED
+from references.equations.linear import SINGULAR, cholesky, cholesky_solve
 from references.sundials.library import REALS, library
+from references.sundials.loop import RAISED
 
 MOST_ITERATIONS = 10  # of Newton's, which is done after one or two
 AGAIN = 1  # what a projection returns that failed, for CVODE to try a shorter step
-SMALLEST_PIVOT = 1e-12  # of C_q C_q^T, relative to its diagonal: the row follows from those before
 
 
 @lru_cache(maxsize=64)
@@ -34,8 +34,8 @@ def projection_for_cvode(
     array_at = ctypes.CFUNCTYPE(REALS, ctypes.c_ssize_t)(ctypes.cast(array_of, ctypes.c_void_p).value or 0)
 
     @njit(error_model="numpy")
-    def factor(t, q, p, Cq, S):  # type: ignore[no-untyped-def]
-        """Cholesky's factor of C_q C_q^T at q, in the lower half of S; zero in the columns of redundant rows."""
+    def factors(t, q, p, Cq, S):  # type: ignore[no-untyped-def]
+        """Of C_q C_q^T at q, in the lower half of S; zero in the columns of redundant rows."""
         Cq[:, :] = 0.0
         jacobian(t, q, p, Cq)
         for i in range(m):
@@ -43,31 +43,12 @@ def projection_for_cvode(
                 S[i, k] = 0.0
                 for j in range(n):
                     S[i, k] += Cq[i, j] * Cq[k, j]
-        for k in range(m):
-            diagonal = S[k, k]
-            for j in range(k):
-                S[k, k] -= S[k, j] * S[k, j]
-            if S[k, k] <= SMALLEST_PIVOT * diagonal:
-                for i in range(k, m):
-                    S[i, k] = 0.0
-                continue
-            S[k, k] = np.sqrt(S[k, k])
-            for i in range(k + 1, m):
-                for j in range(k):
-                    S[i, k] -= S[i, j] * S[k, j]
-                S[i, k] /= S[k, k]
+        cholesky(S, SINGULAR)
 
     @njit(error_model="numpy")
     def shortest(Cq, S, r, x):  # type: ignore[no-untyped-def]
         """The shortest x (n,) with C_q x = r; r is used up."""
-        for i in range(m):
-            for j in range(i):
-                r[i] -= S[i, j] * r[j]
-            r[i] = r[i] / S[i, i] if S[i, i] != 0.0 else 0.0
-        for i in range(m - 1, -1, -1):
-            for j in range(i + 1, m):
-                r[i] -= S[j, i] * r[j]
-            r[i] = r[i] / S[i, i] if S[i, i] != 0.0 else 0.0
+        cholesky_solve(S, r)
         x[:] = 0.0
         for i in range(m):
             for j in range(n):
@@ -100,7 +81,7 @@ def projection_for_cvode(
         q, v = state[:n], state[n:]
         try:
             for iteration in range(MOST_ITERATIONS):
-                factor(t, q, p, Cq, S)
+                factors(t, q, p, Cq, S)
                 r[:] = 0.0
                 constraint(t, q, p, r)
                 shortest(Cq, S, r, x)
@@ -112,7 +93,7 @@ def projection_for_cvode(
                     break
                 if iteration == MOST_ITERATIONS - 1 or not np.isfinite(total):
                     return AGAIN
-            factor(t, q, p, Cq, S)
+            factors(t, q, p, Cq, S)
             r[:] = 0.0
             constraint_rate(t, q, p, r)
             remove(Cq, S, r, x, v)

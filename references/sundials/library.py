@@ -15,6 +15,17 @@ REALS = ctypes.POINTER(REAL)
 COUNTER = (INT, POINTER, POINTER)
 SUN_COMM_NULL = 0
 
+_OF_EACH = {  # of IDA and of CVODE, after IDA or CVode
+    "Free": (None, POINTER),
+    "SetUserData": (INT, POINTER, POINTER),
+    "SetLinearSolver": (INT, POINTER, POINTER, POINTER),
+    "SetJacFn": (INT, POINTER, POINTER),
+    "SetMaxNumSteps": (INT, POINTER, LONG),
+    **{f"Set{name}": (INT, POINTER, REAL) for name in ("MinStep", "MaxStep", "StopTime")},
+    "GetReturnFlagName": (POINTER, LONG),
+    **{f"GetNum{name}": COUNTER for name in ("Steps", "ErrTestFails", "StepSolveFails", "NonlinSolvIters", "JacEvals")},
+}
+
 # library: function: (what it returns, what it takes ...)
 FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
     "core": {
@@ -34,55 +45,27 @@ FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
     },
     "sunlinsoldense": {"SUNLinSol_Dense": (POINTER, POINTER, POINTER, POINTER)},
     "ida": {
+        **{f"IDA{name}": types for name, types in _OF_EACH.items()},
         "IDACreate": (POINTER, POINTER),
-        "IDAFree": (None, POINTER),
         "IDAInit": (INT, POINTER, POINTER, REAL, POINTER, POINTER),
         "IDAReInit": (INT, POINTER, REAL, POINTER, POINTER),
         "IDASVtolerances": (INT, POINTER, REAL, POINTER),
         "IDASetMaxOrd": (INT, POINTER, INT),
-        "IDASetUserData": (INT, POINTER, POINTER),
-        "IDASetLinearSolver": (INT, POINTER, POINTER, POINTER),
-        "IDASetJacFn": (INT, POINTER, POINTER),
-        "IDASetMaxNumSteps": (INT, POINTER, LONG),
-        "IDASetMinStep": (INT, POINTER, REAL),
-        "IDASetMaxStep": (INT, POINTER, REAL),
-        "IDASetStopTime": (INT, POINTER, REAL),
         "IDASolve": (INT, POINTER, REAL, POINTER, POINTER, POINTER, INT),
-        "IDAGetReturnFlagName": (POINTER, LONG),
-        "IDAGetNumSteps": COUNTER,
-        "IDAGetNumErrTestFails": COUNTER,
-        "IDAGetNumStepSolveFails": COUNTER,
-        "IDAGetNumNonlinSolvIters": COUNTER,
         "IDAGetNumResEvals": COUNTER,
-        "IDAGetNumJacEvals": COUNTER,
     },
     "cvode": {
+        **{f"CVode{name}": types for name, types in _OF_EACH.items()},
         "CVodeCreate": (POINTER, INT, POINTER),
-        "CVodeFree": (None, POINTER),
         "CVodeInit": (INT, POINTER, POINTER, REAL, POINTER),
         "CVodeReInit": (INT, POINTER, REAL, POINTER),
         "CVodeSStolerances": (INT, POINTER, REAL, REAL),
-        "CVodeSetLinearSolver": (INT, POINTER, POINTER, POINTER),
-        "CVodeSetJacFn": (INT, POINTER, POINTER),
         "CVodeSetProjFn": (INT, POINTER, POINTER),
-        "CVodeSetUserData": (INT, POINTER, POINTER),
         "SUNNonlinSol_FixedPoint": (POINTER, POINTER, INT, POINTER),
         "SUNNonlinSolFree_FixedPoint": (INT, POINTER),
         "CVodeSetNonlinearSolver": (INT, POINTER, POINTER),
-        "CVodeSetMaxNumSteps": (INT, POINTER, LONG),
-        "CVodeSetMinStep": (INT, POINTER, REAL),
-        "CVodeSetMaxStep": (INT, POINTER, REAL),
-        "CVodeSetStopTime": (INT, POINTER, REAL),
         "CVode": (INT, POINTER, REAL, POINTER, POINTER, INT),
-        "CVodeGetReturnFlagName": (POINTER, LONG),
-        "CVodeGetNumSteps": COUNTER,
-        "CVodeGetNumErrTestFails": COUNTER,
-        "CVodeGetNumStepSolveFails": COUNTER,
-        "CVodeGetNumNonlinSolvIters": COUNTER,
-        "CVodeGetNumRhsEvals": COUNTER,
-        "CVodeGetNumLinRhsEvals": COUNTER,
-        "CVodeGetNumLinSolvSetups": COUNTER,
-        "CVodeGetNumJacEvals": COUNTER,
+        **{f"CVodeGetNum{name}": COUNTER for name in ("RhsEvals", "LinRhsEvals", "LinSolvSetups")},
     },
 }
 
@@ -142,23 +125,6 @@ def context(stack: ExitStack) -> Any:
     stack.callback(sundials.SUNContext_Free, ctypes.byref(pointer))
     check("SUNContext_ClearErrHandlers", sundials.SUNContext_ClearErrHandlers(pointer))
     return pointer
-
-
-def counted(get: str, memory: Any) -> int:
-    """The number that a function IDAGet... or CVodeGet... tells."""
-    number = LONG()
-    check(get, getattr(library(), get)(memory, ctypes.byref(number)))
-    return number.value
-
-
-def flag_name(get: str, flag: int) -> str:
-    """SUNDIALS' name of a flag, by the function `get`; the text is ours to free."""
-    text = getattr(library(), get)(flag)
-    name = ctypes.string_at(text).decode()
-    free = ctypes.CDLL(None).free
-    free.argtypes, free.restype = [POINTER], None
-    free(text)
-    return name
 
 
 def _another_wheel(found: str) -> RuntimeError:

@@ -222,19 +222,16 @@ def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: in
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
-    from references.exudyn.four_bar import solve_exudyn
-    from references.exudyn.mechanisms import has_model, solve_exudyn_mechanism
+    from references.exudyn.mechanisms import has_model, solve_exudyn
 
     n_steps = round(case.t_end / step)
     store_every = max(1, n_steps // STORED)
     n_steps = store_every * round(n_steps / store_every)  # of which it asks for a multiple
-    more = {"store_every": store_every, "time_limit": case.time_limit, **options}
-    if has_model(case.problem):
-        return solve_exudyn_mechanism(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
-    if "L3" not in case.problem.parameters:  # of the four-bar linkage
+    if not has_model(case.problem):
         raise NotApplicable(
             f"Exudyn needs a model of its own for every mechanism; there is none of {case.problem.name!r}"
         )
+    more = {"store_every": store_every, "time_limit": case.time_limit, **options}
     return solve_exudyn(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
 
 

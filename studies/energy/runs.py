@@ -143,7 +143,7 @@ def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> 
 
 
 def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
-    from references.exudyn.four_bar import solve_exudyn
+    from references.exudyn.mechanisms import solve_exudyn
 
     n_steps = round(case.t_end / h)
     most = max(1, int(case.t_end / case.n_instants / h))

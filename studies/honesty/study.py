@@ -185,19 +185,9 @@ def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -
             return
 
 
-class unchecked:
+def unchecked() -> Any:
     """Context: references/ without the check of a start, which is ours."""
-
-    def __enter__(self) -> None:
-        self.patches = [
-            patch(f"references.{name}.check_start") for name in ("cvode_c", "heyoka_taylor", "ida", "ida_c", "index1")
-        ]
-        for each in self.patches:
-            each.start()
-
-    def __exit__(self, *_: object) -> None:
-        for each in self.patches:
-            each.stop()
+    return patch("references.driver.check_start")
 
 
 def unasked(rows: pd.DataFrame) -> pd.Series:

@@ -6,12 +6,14 @@ from functools import partial
 import numpy as np
 import pytest
 
+from references.casadi.integrators import solve_collocation
 from references.equations import expressions
 from references.equations.expressions import Expressions, NotSymbolic, functions_of
 from references.equations.ode import ode_result
 from references.equations.straight_line import Program, Value, program_of, straight_line
+from references.sundials.cvode_c import solve_cvode_c
 from studies.validation.study import MAKE
-from twoloop import ConstrainedSystem, Statistics
+from twoloop import ConstrainedSystem, Statistics, Status
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import double_pendulum, four_bar, heavy_top, n_four_bar, very_flexible_beam
 
@@ -55,14 +57,11 @@ def test_a_mass_that_no_rows_make_definite_is_refused():
         expressions._rows_for_mass(np.diag([1.0, 0.0]), np.array([[1.0, 0.0]]))
 
 
-def test_a_program_writes_each_operation_once_and_no_zeros():
+def test_a_program_writes_each_operation_once():
     program = Program()
     x, y = Value(program, "x"), Value(program, "y")
     assert (x * y).name == (y * x).name and program.operations == 1
-    assert (x + 0.0) is x and (1.0 * x) is x and 0.0 * x == 0.0 and (x - 0.0) is x and program.operations == 1
     assert (x - y).name != (y - x).name
-    with pytest.raises(TypeError, match=r"given 0\.5"):
-        _ = x**0.5
 
 
 @pytest.mark.parametrize("make", [four_bar, heavy_top, partial(n_four_bar, 2)])
@@ -91,3 +90,76 @@ def test_forces_of_exponentials_and_their_like_are_written_as_code():
     straight_line(system, 0.0, problem.q0, problem.v0)(0.3, y, rate)
     truth = ode_result(system, np.array([0.3]), y[:, None], "", "", Statistics()).a[:, 0]
     assert np.abs(rate[n:] - truth).max() < 1e-10 * np.abs(truth).max()
+
+
+# --- what solvers of expressions refuse, and how they fail
+
+
+def test_systems_without_expressions_are_refused():
+    pytest.importorskip("sksundae")
+    plain = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+        jacobian=lambda t, q: q[None, :],
+        gamma=lambda t, q, v: np.array([-(v @ v)]),
+    )
+    with pytest.raises(ValueError, match="are Python functions, not compiled ones"):
+        solve_cvode_c(plain, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
+
+
+def test_a_number_of_steps_that_is_none_is_named():
+    problem = four_bar()
+    start = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    with pytest.raises(ValueError, match="n_steps"):
+        solve_collocation(*start, 0)
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = 1.0
+
+
+@callback("force")
+def endless(t, q, v, p, Q):
+    Q[1] = -9.81 / (1.0 - t) ** 2
+
+
+@callback("force")
+def branching(t, q, v, p, Q):
+    Q[1] = -9.81 if t < 1.0 else -4.9
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    Cq[0, 0], Cq[0, 1] = q[0], q[1]
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    Qd[0] = -v[0] * v[0] - v[1] * v[1]
+
+
+def pendulum(force):
+    functions = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian, "gamma": gamma}
+    return ConstrainedSystem(n_q=2, n_c=1, name="pendulum", **functions)
+
+
+def test_a_failure_of_cvode_is_a_result_with_what_came_before_it():
+    pytest.importorskip("sksundae")
+    result = solve_cvode_c(pendulum(endless), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], t_eval=[0.0, 0.5, 1.5])
+    assert result.status is Status.SOLVER_FAILED and "CVODE failed after t = " in result.message
+    assert result.t.tolist() == [0.0, 0.5] and np.isfinite(result.q).all()
+
+
+def test_callbacks_that_branch_are_refused():
+    pytest.importorskip("sksundae")
+    with pytest.raises(ValueError, match="force of 'pendulum': it branches on"):
+        solve_cvode_c(pendulum(branching), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0])

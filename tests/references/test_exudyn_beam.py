@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from references.exudyn.beam import MODELS, solve_exudyn_beam
-from references.exudyn.four_bar import SOLVERS, solve_exudyn
+from references.exudyn.run import SOLVERS
 from references.sundials.ida import solve_ida
 from twoloop.mechanisms import ancf_beam, four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height
@@ -154,9 +154,3 @@ def test_wrong_arguments_are_named():
         solve_exudyn_beam(four_bar(), 1.0, 10)
     with pytest.raises(ValueError, match="n_elements must be at least 1"):
         solve_exudyn_beam(problem, 1.0, 10, n_elements=0)
-    with pytest.raises(ValueError, match="solver must be one of"):
-        solve_exudyn_beam(problem, 1.0, 10, solver="RK44")
-    with pytest.raises(ValueError, match="multiple of store_every = 3"):
-        solve_exudyn_beam(problem, 1.0, 10, store_every=3)
-    with pytest.raises(TypeError, match=r"problem must be a linkage of twoloop\.mechanisms\.four_bar"):
-        solve_exudyn(problem, 1.0, 10)

@@ -1,22 +1,16 @@
 """Rivals are put, timed and stopped as their users would do it: what is built, counted, limited, and said of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from references.casadi import integrators as casadi_integrators
 from references.casadi.integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
 from references.diffrax import dopri8 as diffrax_dopri8
-from references.driver import TimeLimit, user_call
+from references.driver import Task, TimeLimit, user_call
 from references.paper.four_bar_minimal import trajectory
 from references.scipy import fully_implicit, index1
 from references.scipy.index1 import solve_index1
-from references.sundials import cvode_c
 from references.sundials.cvode import solve_cvode
-from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.ida import solve_ida
-from references.sundials.ida_c import solve_ida_c
 from studies.bench.collector import Case, Run, attempt
 from studies.bench.solvers import CATALOGUE, RIVALS
 from studies.validation.study import MAKE
@@ -121,52 +115,6 @@ def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name, solvers):
         assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
 
 
-# --- the time of a call has no output in it
-
-TIMES = np.linspace(0.0, 2.0, 201)
-WITH_OUTPUT = {
-    "IDA from C": lambda *at, **more: solve_ida_c(*at, 1e-8, 1e-8, **more),
-    "IDA": lambda *at, **more: solve_ida(*at, "index1", 1e-8, 1e-8, **more),
-    "CVODE, Adams": lambda *at, **more: solve_cvode(*at, "Adams", 1e-8, 1e-8, **more),
-    "CVODE from C": lambda *at, **more: solve_cvode_c(*at, "Adams", 1e-8, 1e-8, **more),
-    "CVODE from C, BDF": lambda *at, **more: solve_cvode_c(*at, "BDF", 1e-8, 1e-8, **more),
-    "DOP853": lambda *at, **more: solve_index1(*at, "DOP853", 1e-8, 1e-8, **more),
-    "DOP853, projected": lambda *at, **more: solve_index1(*at, "DOP853", 1e-8, stabilisation="projection", **more),
-    "LSODA": lambda *at, **more: solve_index1(*at, "LSODA", 1e-8, 1e-8, **more),
-    "Radau": lambda *at, **more: solve_index1(*at, "Radau", 1e-6, 1e-6, **more),
-    "BDF": lambda *at, **more: solve_index1(*at, "BDF", 1e-6, 1e-6, **more),
-}
-
-
-@pytest.mark.parametrize("name", WITH_OUTPUT)
-def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
-    pytest.importorskip("sksundae")
-    solve = WITH_OUTPUT[name]
-    end, many = (solve(*start(PENDULUM, 2.0), t_eval=each) for each in ([2.0], TIMES))
-    assert end.success and many.success and np.array_equal(many.t, TIMES)
-    counts = [(each.stats.n_accepted, each.stats.n_evaluations, each.stats.n_factorizations) for each in (end, many)]
-    assert counts[0] == counts[1] and counts[0][1] > 10
-    # the second run takes the steps of the first: what is shown is the run that is timed
-    assert np.abs(end.q[:, -1] - many.q[:, -1]).max() < 1e-13
-    early = solve(*start(PENDULUM, 2.0), t_eval=[1.0])
-    assert np.abs(early.q[:, 0] - many.q[:, 100]).max() < 1e-13
-
-    late = solve(*start(PENDULUM, 2.0), t_eval=[0.0, 2.0], time_limit=1e-9)
-    assert late.status is Status.SOLVER_FAILED and late.t.tolist() in ([], [0.0])
-
-
-def test_the_second_run_of_cvode_takes_the_steps_of_the_first():
-    pytest.importorskip("sksundae")
-    system, _, q, v = start(PENDULUM, 2.0)
-    functions = cvode_c.Functions(
-        cvode_c._right_hand_side(system, 0.0, q.tobytes(), v.tobytes()), None, None, np.empty(0)
-    )
-    given = functions, np.concatenate([q, v]), 0.0, 2.0, cvode_c.METHODS["Adams"], 1e-8, 1e-8
-    runs = [cvode_c.integrate(*given, times, TimeLimit(None)) for times in (np.empty(0), np.array([2.0]), TIMES)]
-    counts = [replace(statistics, cpu_time=0.0) for *_, statistics in runs]
-    assert counts[0] == counts[1] == counts[2] and counts[0].n_accepted > 50
-
-
 def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
     made = []
     before = index1.METHODS["DOP853"]
@@ -177,14 +125,8 @@ def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
             return super().dense_output()
 
     monkeypatch.setitem(index1.METHODS, "DOP853", Watched)
-    assert solve_index1(*start(PENDULUM, 2.0), t_eval=TIMES).success
+    assert solve_index1(*start(PENDULUM, 2.0), t_eval=np.linspace(0.0, 2.0, 201)).success
     assert made and not any(made)  # outside of the user's call
-
-
-def test_a_run_past_its_limit_is_not_run_again_to_its_end():
-    for solve in (WITH_OUTPUT["DOP853"], WITH_OUTPUT["IDA from C"], WITH_OUTPUT["CVODE from C"]):
-        result = solve(*start(PENDULUM, 1e6), t_eval=[1e6], time_limit=0.01)
-        assert result.status is Status.SOLVER_FAILED and "time_limit" in result.message and result.t.size == 0
 
 
 # --- Jacobians
@@ -220,24 +162,13 @@ def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
 
 def test_solve_dae_differences_once_a_jacobian_and_is_told_the_rest():
     system, q, v = PENDULUM.system, PENDULUM.q0 + 0.1, PENDULUM.v0 + 0.2
-    run = fully_implicit._Run(system, None, None)
+    functions = fully_implicit.Functions(Task(system, system.n_c, 0.0, 1.0, q, v, None))
     y, yp = np.concatenate([q, v, np.zeros(2 * system.n_c)]), np.linspace(-1.0, 1.0, 2 * (system.n_q + system.n_c))
     known, calls = [np.zeros((y.size, y.size)) for _ in range(2)], []
-    matrix = run._matrix
+    matrix = functions.matrix
     for cj, into in zip((0.0, 1.0), known, strict=True):
-        matrix(0.3, y, yp, cj, into, *run._sizes_and_p)
-    run._matrix = lambda *given: calls.append(given[3]) or matrix(*given)
-    by_y, by_yp = run.jacobians(0.3, y, yp)
+        matrix(0.3, cj, y, yp, *functions.space, into.T)
+    functions.matrix = lambda *given: calls.append(given[1]) or matrix(*given)
+    by_y, by_yp = functions.jacobians(0.3, y, yp)
     assert calls == [0.0] and np.array_equal(by_y, known[0]) and np.count_nonzero(by_yp) > y.size / 2
     assert np.abs(known[1] - known[0] - by_yp).max() < 1e-6
-
-
-@pytest.mark.parametrize("method", ["Radau", "BDF"])
-def test_solve_dae_is_right_and_stops_in_time(method):
-    pytest.importorskip("solve_dae")
-    solve = fully_implicit.solve_fully_implicit
-    result = solve(*start(FOUR_BAR, 1.0), method, 1e-7, 1e-7)
-    assert result.success
-    assert np.abs(result.q[:, -1] - trajectory(FOUR_BAR.parameters, [1.0])[0][:, 0]).max() < 1e-4
-    late = solve(*start(FOUR_BAR, 1.0), method, 1e-7, 1e-7, time_limit=1e-9)
-    assert late.status is Status.SOLVER_FAILED and "time_limit" in late.message

@@ -10,11 +10,11 @@ import pytest
 from numba import njit
 
 from references.paper.four_bar_minimal import trajectory
-from references.sundials import ida_c
 from references.sundials import library as sundials
+from references.sundials import loop
 from references.sundials.ida import solve_ida
-from references.sundials.ida_c import OUTPUTS, solve_ida_c
-from references.sundials.ida_compiled import iteration_matrix_at, residual_at
+from references.sundials.ida_c import solve_ida_c
+from references.sundials.residual import ALL, FORMS, iteration_matrix_at, parts_of, residual_at, space_of
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
@@ -97,15 +97,6 @@ def pendulum(kind=GOOD):
 
 
 @pytest.mark.parametrize("tolerance", BOUNDS)
-def test_agrees_with_the_truth(tolerance):
-    result = run(10.0, tolerance)
-    q, _ = trajectory(PROBLEM.parameters, result.t)
-    assert result.status is Status.REACHED_END and "reached the end" in result.message
-    assert np.array_equal(result.t, np.linspace(0.0, 10.0, OUTPUTS))
-    assert np.abs(result.q - q).max() < BOUNDS[tolerance]
-
-
-@pytest.mark.parametrize("tolerance", BOUNDS)
 def test_is_what_ida_does_through_python(tolerance):
     times = np.linspace(0.0, 10.0, 101)
     arguments = PROBLEM.system, (0.0, 10.0), PROBLEM.q0, PROBLEM.v0, "stabilised", tolerance, tolerance
@@ -127,25 +118,26 @@ def test_moving_pivot_without_gamma_and_with_a_mass_that_varies():
         assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-4
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("system", "tangent"),
     [(PROBLEM.system, None), (pendulum()[0], None), (pendulum(SPRING)[0], spring_tangent)],
     ids=["four-bar", "moving pivot", "exact tangent"],
 )
-def test_jacobian_is_that_of_the_residual(system, tangent):
-    n, m, f = system.n_q, system.n_c, system.functions
+def test_jacobian_is_that_of_the_residual(system, tangent, form):
+    parts = parts_of(system, form, ALL)._replace(tangent=tangent)
+    residual, matrix = residual_at(parts), iteration_matrix_at(parts)
+    size = 2 * system.n_q + system.n_c * (1 if form == "index1" else 2)
     rng = np.random.default_rng(5)
-    t, cj, y, yp = 0.3, 7.0, rng.normal(size=2 * (n + m)), rng.normal(size=2 * (n + m))
-    residual = residual_at(*f[:5], n, m, system.constant_mass)
-    matrix = iteration_matrix_at(*f[:5], n, m, system.constant_mass, tangent)
-    space = system.functions.p, system.mass(t, y[:n]), np.zeros((m, n))
+    t, cj, y, yp = 0.3, 7.0, rng.normal(size=size), rng.normal(size=size)
+    space = space_of(system, form, t, y[: system.n_q].copy())
 
     def value(y, yp):
-        residual(t, y, yp, *space, res := np.zeros(y.size))
+        residual(t, y, yp, *space[:3], res := np.zeros(y.size))
         return res
 
     computed = np.zeros((y.size, y.size))
-    matrix(t, cj, y, yp, *space, np.zeros((n, n)), *np.zeros((3, y.size)), computed)
+    matrix(t, cj, y, yp, *space, computed)
     for j, e in enumerate(1e-5 * np.eye(y.size)):
         column = (value(y + e, yp + cj * e) - value(y - e, yp - cj * e)) / 2e-5
         assert np.abs(computed[j] - column).max() < 1e-5
@@ -154,13 +146,10 @@ def test_jacobian_is_that_of_the_residual(system, tangent):
 # --- output and statistics
 
 
-@pytest.mark.parametrize("times", [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0], [1e-13, 1.0 - 1e-13, 1.0]])
-def test_t_eval_gives_exactly_these_times(times):
+def test_output_next_to_the_ends():
+    times = [1e-13, 1.0 - 1e-13, 1.0]
     result = run(1.0, 1e-8, t_eval=times)
-    q, v = trajectory(PROBLEM.parameters, times)
-    assert result.t.tolist() == times and result.success and "t = 1." in result.message
-    assert result.q.shape == result.v.shape == result.a.shape == (9, len(times)) and result.lam.shape[0] == 8
-    assert np.abs(result.q - q).max() < 1e-5 and np.abs(result.v - v).max() < 1e-4
+    assert result.t.tolist() == times and np.abs(result.q - trajectory(PROBLEM.parameters, times)[0]).max() < 1e-5
 
 
 def test_counts_follow_the_tolerance_and_not_the_output():
@@ -192,8 +181,8 @@ def test_a_function_that_fails_comes_back_as_a_row(kind, flag, capfd):
 
 
 def test_too_many_steps_end_the_run(monkeypatch):
-    monkeypatch.setattr(ida_c, "MOST_STEPS", 20)
-    monkeypatch.setattr(ida_c, "STEPS_A_CALL", 10)
+    monkeypatch.setattr(loop, "MOST_STEPS", 20)
+    monkeypatch.setattr(loop, "STEPS_A_CALL", 10)
     result = run(10.0, 1e-8, t_eval=[1e-6, 10.0])
     assert result.status is Status.SOLVER_FAILED and "IDA_TOO_MUCH_WORK (-1)" in result.message
     assert result.t.tolist() == [1e-6]
@@ -219,24 +208,6 @@ def test_functions_that_from_python_compiles_are_taken():
     result = solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
     assert result.success
     assert np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4
-
-
-def test_wrong_arguments_are_named():
-    system, q0, v0 = PROBLEM.system, PROBLEM.q0, PROBLEM.v0
-    with pytest.raises(TypeError, match="system must be a ConstrainedSystem"):
-        solve_ida_c(PROBLEM, (0.0, 1.0), q0, v0)
-    with pytest.raises(ValueError, match="t_span must be"):
-        solve_ida_c(system, (1.0, 0.0), q0, v0)
-    with pytest.raises(ValueError, match="rtol must be positive"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0, rtol=0.0)
-    with pytest.raises(TypeError, match="atol must be a number"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0, atol="small")
-    with pytest.raises(ValueError, match="q0 is not consistent"):
-        solve_ida_c(system, (0.0, 1.0), q0 + 0.1, v0)
-    with pytest.raises(ValueError, match="v0 must have shape"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0[:3])
-    with pytest.raises(ValueError, match="t_eval must lie within"):
-        solve_ida_c(system, (0.0, 1.0), q0, v0, t_eval=[2.0])
 
 
 # --- the wheel

@@ -7,15 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from references.paper.four_bar_minimal import MinimalFourBar
-from references.scipy.index1 import METHODS, ONE_STEP, STABILISATIONS, solve_index1
+from references.scipy.index1 import ONE_STEP, STABILISATIONS, solve_index1
 from tests.problems import (
     force_residual,
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
     pendulum,
     violations,
     worst,
@@ -24,23 +18,6 @@ from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
 
 PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
-# position error at 10 s with the tolerances 1e-6 and 1e-8: three times what was measured, the scatter of tolerances
-# that differ by 2 % included, and more
-BOUNDS = {
-    ("default", "DOP853", "none"): (1.5e-4, 3e-7),
-    ("default", "DOP853", "baumgarte"): (1e-5, 1e-7),
-    ("default", "DOP853", "projection"): (1e-4, 2e-7),
-    ("default", "RK45", "none"): (2e-3, 2e-5),
-    ("default", "RK45", "baumgarte"): (1e-4, 1e-6),
-    ("default", "RK45", "projection"): (5e-5, 5e-7),
-    ("default", "LSODA", "none"): (1e-3, 1e-5),
-    ("default", "LSODA", "baumgarte"): (1e-3, 1e-5),
-    ("default", "Radau", "none"): (1e-5, None),
-    ("default", "BDF", "none"): (5e-3, None),
-    ("collinear", "DOP853", "none"): (3e-4, 3e-6),
-    ("collinear", "DOP853", "baumgarte"): (1e-4, 2e-7),
-    ("collinear", "DOP853", "projection"): (2e-4, 6e-7),
-}
 
 
 @cache
@@ -51,17 +28,6 @@ def truth(name):
 def run(name, t_end, *args, **options):
     problem = PROBLEMS[name]
     return solve_index1(problem.system, (0.0, t_end), problem.q0, problem.v0, *args, **options)
-
-
-@pytest.mark.parametrize(("name", "method", "stabilisation"), BOUNDS)
-def test_agrees_with_the_truth_and_follows_the_tolerance(name, method, stabilisation):
-    q, v = truth(name).states([10.0])
-    for tolerance, bound in zip((1e-6, 1e-8), BOUNDS[name, method, stabilisation], strict=True):
-        if bound is not None:
-            result = run(name, 10.0, method, tolerance, tolerance, stabilisation=stabilisation)
-            assert result.status is Status.REACHED_END and result.t[-1] == 10.0
-            assert worst(result.q[:, -1], q[:, 0]) < bound
-            assert worst(result.v[:, -1], v[:, 0]) < 20.0 * bound
 
 
 def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
@@ -119,37 +85,6 @@ def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabili
         assert worst(system.jacobian(t, q) @ a, system.gamma(t, q, v) - feedback) < 1e-11
 
 
-@pytest.mark.parametrize("stabilisation", STABILISATIONS)
-def test_time_dependent_constraints_without_a_gamma(stabilisation):
-    q, v = moving_pivot_state(0.0)
-    system = moving_pivot(gamma=False)
-    result = solve_index1(system, (0.0, 5.0), q, v, rtol=1e-9, atol=1e-9, stabilisation=stabilisation)
-    q, v = moving_pivot_state(result.t)
-    assert worst(result.q, q) < 1e-6 and worst(result.v, v) < 1e-6
-    bound = {"none": 1e-7, "baumgarte": 1e-8, "projection": 1e-14}[stabilisation]
-    assert violations(system, result)[0] < bound
-
-
-@pytest.mark.parametrize("stabilisation", STABILISATIONS)
-def test_full_mass_matrix_that_varies(stabilisation):
-    result = solve_index1(
-        oblique_pendulum(), (0.0, 3.0), *oblique_start(), rtol=1e-9, atol=1e-9, stabilisation=stabilisation
-    )
-    x, u, lam = oblique_point(result.t)
-    ours = oblique_to_point(result)
-    assert worst(ours[0], x) < 1e-7 and worst(ours[1], u) < 1e-6 and worst(result.lam[0], lam) < 1e-5
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_output_times(method):
-    times = np.array([0.5, 0.501, 1.25, 2.0])
-    free, result = run("default", 2.0, method, 1e-6, 1e-6), run("default", 2.0, method, 1e-6, 1e-6, t_eval=times)
-    assert np.array_equal(result.t, times)
-    assert result.stats.n_accepted == free.stats.n_accepted and np.array_equal(result.h, free.h)
-    assert worst(result.q[:, -1], free.q[:, -1]) == 0.0
-    assert worst(result.q, truth("default").states(times)[0]) < 1e-3
-
-
 @pytest.mark.parametrize("method", ONE_STEP)
 def test_interpolated_states_are_projected_too(method):
     times = np.linspace(0.0, 2.0, 101)
@@ -157,16 +92,6 @@ def test_interpolated_states_are_projected_too(method):
     position, velocity = violations(PROBLEMS["default"].system, result)
     assert np.array_equal(result.t, times) and position < 1e-14 and velocity < 1e-13
     assert worst(result.q, truth("default").states(times)[0]) < 1e-4
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_failure_comes_back_as_a_row(method):
-    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t < 0.7 else np.nan]))
-    result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], method, 1e-4, 1e-4)
-    assert result.status is Status.SOLVER_FAILED and not result.success
-    assert f"{method} failed after t = " in result.message and "Look for" in result.message
-    assert 0.5 < result.t[-1] <= 0.7 and result.q.shape == (2, result.t.size) and np.isfinite(result.q).all()
-    assert result.stats.n_accepted == result.h.size == result.t.size - 1
 
 
 def test_failure_of_a_projection_comes_back_as_a_row():
@@ -180,50 +105,8 @@ def test_failure_of_a_projection_comes_back_as_a_row():
     assert 0.0 < result.t[-1] <= 0.5
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_exception_of_a_callback_comes_through(method):
-    def force(t, q, v):
-        if t > 0.5:
-            raise ValueError("no force today")
-        return np.array([0.0, -9.81])
-
-    with pytest.raises(ValueError, match="no force today"):
-        solve_index1(pendulum(force=force), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], method, 1e-4, 1e-4)
-
-
 def test_lsoda_does_not_step_towards_a_singularity_without_end():
     system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 / max(0.0, 0.7 - t) ** 2]))
     result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "LSODA", 1e-4, 1e-4)
     assert result.status is Status.SOLVER_FAILED and "the step has shrunk" in result.message
     assert 0.69 < result.t[-1] <= 0.7 and result.stats.n_accepted < 20000
-
-
-@pytest.mark.parametrize(
-    ("changed", "error", "message"),
-    [
-        (
-            {"method": "Euler"},
-            ValueError,
-            "method must be one of DOP853, RK45, LSODA, Radau, BDF, Pr8, Pr9; given 'Euler'",
-        ),
-        ({"stabilisation": "glue"}, ValueError, "stabilisation must be one of none, baumgarte, projection"),
-        ({"stabilisation": "projection", "method": "LSODA"}, ValueError, "explicit one-step method, DOP853 or RK45"),
-        ({"stabilisation": "projection", "method": "Radau"}, ValueError, "given method='Radau'"),
-        ({"alpha": 5.0}, ValueError, "alpha belongs to stabilisation='baumgarte'"),
-        ({"stabilisation": "baumgarte", "alpha": -1.0}, ValueError, "alpha must be positive"),
-        ({"stabilisation": "baumgarte", "alpha": "2"}, TypeError, "alpha must be a number"),
-        ({"rtol": 0.0}, ValueError, "rtol must be positive"),
-        ({"atol": np.inf}, ValueError, "atol must be positive and finite"),
-        ({"t_span": (1.0, 0.0)}, ValueError, "t_span must be"),
-        ({"q0": np.zeros(3)}, ValueError, "q0 must have shape"),
-        ({"v0": np.full(9, np.nan)}, ValueError, "v0 must be finite"),
-        ({"q0": PROBLEMS["default"].q0 + 0.01}, ValueError, "q0 is not consistent"),
-        ({"t_eval": [0.5, 0.4]}, ValueError, "t_eval must be strictly increasing"),
-        ({"system": PROBLEMS["default"]}, TypeError, "system must be a ConstrainedSystem"),
-    ],
-)
-def test_wrong_arguments_are_named(changed, error, message):
-    problem = PROBLEMS["default"]
-    given = {"system": problem.system, "t_span": (0.0, 1.0), "q0": problem.q0, "v0": problem.v0, **changed}
-    with pytest.raises(error, match=message):
-        solve_index1(**given)

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from references.casadi.integrators import solve_cvodes, solve_idas
-from references.equations.duals import Dual, functions_on_duals
-from references.equations.expressions import FUNCTIONS, functions_of
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials import cvode_c
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.cvode_projection import projection_for_cvode
+from references.sundials.ida import NOT_TESTED, tolerances
 from references.sundials.ida_c import solve_ida_c
-from references.sundials.ida_options import NOT_TESTED, tolerances
 from studies.bench.figures import STYLES
 from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
 from twoloop import ConstrainedSystem, callback
@@ -128,14 +126,6 @@ def test_the_jacobian_of_the_accelerations_is_their_derivative(name):
     assert np.abs(columns - differences).max() < 1e-5 * np.abs(differences).max()
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_of_duals_have_their_derivatives(name):
-    plain = functions_of(math)
-    made = functions_on_duals(plain)[name](Dual(0.4, {2: 3.0}))
-    assert made.value == plain[name](0.4)
-    assert made.by[2] == pytest.approx(3.0 * (plain[name](0.4 + 1e-6) - plain[name](0.4 - 1e-6)) / 2e-6, rel=1e-8)
-
-
 def test_cvode_takes_the_analytic_jacobian_and_differences_of_what_is_too_long(monkeypatch):
     pytest.importorskip("sksundae")
     exact = run(solve_cvode_c, PENDULUM, "BDF", 1e-9, 1e-9, t_end=2.0)
@@ -196,11 +186,6 @@ def test_the_projection_is_the_shortest_one_and_projects_the_error():
     free = np.eye(3) - np.linalg.pinv(Cq) @ Cq
     assert np.abs(free @ alone[3:]).max() < 1e-14
     assert np.allclose(err, np.concatenate([free @ estimate[:3], free @ estimate[3:]]), rtol=0.0, atol=1e-13)
-
-
-def test_adams_is_not_projected():
-    with pytest.raises(ValueError, match=r"projected needs method 'BDF'.*; given 'Adams'"):
-        run(solve_cvode_c, PENDULUM, "Adams", projected=True)
 
 
 def test_each_set_up_is_run_beside_the_others_and_drawn_as_itself():

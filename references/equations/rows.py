@@ -1,8 +1,9 @@
-"""Rows of C_q that follow from others, for solvers whose matrices they would make singular.
+"""Rows of C_q and of A for other solvers: those of A v + b = 0 below those of C, and none that follow from others.
 
-A user of such a solver leaves them out of the mechanism. So do the adapters of IDA, CVODE, SciPy and solve_dae; those
-of solvers that take expressions do it in `references.equations.expressions`. A row that depends on others at the start
-may become independent later, so every row left out is checked at the end of the run.
+To eq. (6) rows A v + b = 0 are further rows of C_q a = Q_d. Rows that follow from others would make the matrices of
+most solvers singular: a user of such a solver leaves them out of the mechanism. So do the adapters of IDA, CVODE, SciPy
+and solve_dae; those of solvers that take expressions do it in `references.equations.expressions`. A row that depends on
+others at the start may become independent later, so every row left out is checked at the end of the run.
 """
 
 from collections.abc import Callable
@@ -24,6 +25,33 @@ RANK = 1e-9  # of a row, which follows from those before it where it differs fro
 HOLDS = 1e-6  # of the largest coordinate, 1 at least: how far a position may be from a row that was left out ...
 BEYOND = 1e3  # ... in addition to this many times its distance from the rows that were kept
 ROWS = ("constraint", "jacobian", "constraint_rate", "gamma")
+NOT_WITH_MORE_ROWS = (
+    *("kinematics", "reaction_by_q", "force_by_q", "force_by_v"),
+    *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
+)
+
+
+@lru_cache(maxsize=64)
+def with_all_rows(system: ConstrainedSystem) -> ConstrainedSystem:
+    """The system for solvers that take its accelerations: A, b and Q_a stand below C_q, C_t and Q_d.
+
+    C of these rows is zero: what projects positions leaves them alone, what projects velocities takes them. A system
+    without such rows is returned as it is.
+
+    Raises
+    ------
+    ValueError
+        If Q_a, or Q_d of other rows, is not given.
+    """
+    if system.n_a == 0:
+        return system
+    missing = {"nonholonomic_gamma", *(["gamma"] if system.n_c else [])} - system.given.keys()
+    if missing:
+        raise ValueError(
+            f"system must give {' and '.join(sorted(missing))} for the adapters of other solvers, as it has rows "
+            f"A v + b = 0; {system.name!r} does not"
+        )
+    return _with_rows(system, tuple(range(system.n_c + system.n_a)), 0)
 
 
 def on_independent_rows(solve: Solve[Rest]) -> Solve[Rest]:
@@ -46,7 +74,7 @@ def on_independent_rows(solve: Solve[Rest]) -> Solve[Rest]:
                 f"q0 must satisfy all constraints of {system.name!r}: row(s) {broken} of C_q follow from others at t = "
                 f"{start[0]:g}, and contradict them. Correct these constraints, or leave them out"
             )
-        some = _with_rows(system, kept)
+        some = _with_rows(system, kept, system.n_a)
         result = solve(some, t_span, q0, *rest, **options)
         if result.t.size and (broken := _broken(system, kept, float(result.t[-1]), result.q[:, -1])):
             message = (
@@ -95,15 +123,17 @@ def _broken(system: ConstrainedSystem, kept: tuple[int, ...], t: float, q: Array
 
 
 @lru_cache(maxsize=64)
-def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...]) -> ConstrainedSystem:
-    given = {kind: function for kind, function in system.given.items() if kind not in ("kinematics", "reaction_by_q")}
-    f = system.functions
-    made = _selected(kept, system.n_c, *(getattr(f, kind) for kind in ROWS))
-    given |= {kind: made[kind] for kind in ROWS if kind in given}
+def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...], n_a: int) -> ConstrainedSystem:
+    """The system with these rows, of C and below them of A, as rows of C; and, as they are, n_a rows of A."""
+    f, left_out = system.functions, ("kinematics", "reaction_by_q") if n_a == system.n_a else NOT_WITH_MORE_ROWS
+    given = {kind: function for kind, function in system.given.items() if kind not in left_out}
+    below = None if n_a == system.n_a else (f.nonholonomic, f.nonholonomic_rate, f.nonholonomic_gamma)
+    made = _rows(kept, system.n_c, system.n_a - n_a, *(getattr(f, kind) for kind in ROWS), below)
+    given |= {kind: made[kind] for kind in ROWS if kind in given or below is not None}
     return ConstrainedSystem(
         n_q=system.n_q,
         n_c=len(kept),
-        n_a=system.n_a,
+        n_a=n_a,
         parameters=f.p,
         constant_mass=system.constant_mass,
         name=system.name,
@@ -112,41 +142,50 @@ def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...]) -> ConstrainedS
 
 
 @lru_cache(maxsize=64)
-def _selected(
+def _rows(
     kept: tuple[int, ...],
     m: int,
+    n_a: int,
     constraint: Dispatcher,
     jacobian: Dispatcher,
     constraint_rate: Dispatcher,
     gamma: Dispatcher,
+    below: tuple[Dispatcher, Dispatcher, Dispatcher] | None,
 ) -> dict[str, Dispatcher]:
-    """The callbacks of the rows that are kept, of m."""
+    """The callbacks of the rows that are kept, of m of C and below them n_a of A."""
+    nonholonomic, nonholonomic_rate, nonholonomic_gamma = below or (jacobian, constraint_rate, gamma)
 
     @callback("constraint")
     def some_constraints(t, q, p, C):  # type: ignore[no-untyped-def]
-        of_all = np.zeros(m)
-        constraint(t, q, p, of_all)
+        of_all = np.zeros(m + n_a)
+        constraint(t, q, p, of_all[:m])
         for i in range(C.size):
             C[i] = of_all[kept[i]]
 
     @callback("jacobian")
     def some_rows(t, q, p, Cq):  # type: ignore[no-untyped-def]
-        of_all = np.zeros((m, q.size))
-        jacobian(t, q, p, of_all)
+        of_all = np.zeros((m + n_a, q.size))
+        jacobian(t, q, p, of_all[:m])
+        if n_a > 0:
+            nonholonomic(t, q, p, of_all[m:])
         for i in range(Cq.shape[0]):
             Cq[i] = of_all[kept[i]]
 
     @callback("constraint_rate")
     def some_rates(t, q, p, Ct):  # type: ignore[no-untyped-def]
-        of_all = np.zeros(m)
-        constraint_rate(t, q, p, of_all)
+        of_all = np.zeros(m + n_a)
+        constraint_rate(t, q, p, of_all[:m])
+        if n_a > 0:
+            nonholonomic_rate(t, q, p, of_all[m:])
         for i in range(Ct.size):
             Ct[i] = of_all[kept[i]]
 
     @callback("gamma")
     def some_gammas(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
-        of_all = np.zeros(m)
-        gamma(t, q, v, p, of_all)
+        of_all = np.zeros(m + n_a)
+        gamma(t, q, v, p, of_all[:m])
+        if n_a > 0:
+            nonholonomic_gamma(t, q, v, p, of_all[m:])
         for i in range(Qd.size):
             Qd[i] = of_all[kept[i]]
 

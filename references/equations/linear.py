@@ -1,0 +1,103 @@
+"""Compiled linear algebra of the references: their own, so that nothing of twoloop's is in what it is compared with."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from twoloop.kernels.compile.caches import compile_kept, watch
+
+SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
+
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+
+
+def compiled_now(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile for any mechanism, and keep the machine code on disk until it or something that it calls changes."""
+    return lambda function: compile_kept(function, signature, watch(function), error_model="numpy")
+
+
+@njit(**OPTIONS)
+def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
+    """Cholesky's factor of A in its lower half, with the reciprocals of the pivots; whether A is definite.
+
+    A pivot that is no more than `lost` times what stood there is zero, and so is its column: `cholesky_solve` leaves
+    that unknown out.
+    """
+    n, definite = A.shape[0], True
+    for k in range(n):
+        before = A[k, k]
+        for j in range(k):
+            A[k, k] -= A[k, j] * A[k, j]
+        definite = definite and A[k, k] > lost * abs(before)
+        if A[k, k] <= lost * abs(before):  # not so of NaN, which stays
+            for i in range(k, n):
+                A[i, k] = 0.0
+            continue
+        A[k, k] = 1.0 / np.sqrt(A[k, k])
+        for i in range(k + 1, n):
+            for j in range(k):
+                A[i, k] -= A[i, j] * A[k, j]
+            A[i, k] *= A[k, k]
+    return definite
+
+
+@njit(**OPTIONS)
+def cholesky_solve(L, x):  # type: ignore[no-untyped-def]
+    """x becomes A^-1 x, of the A of these factors."""
+    n = x.size
+    for i in range(n):
+        for j in range(i):
+            x[i] -= L[i, j] * x[j]
+        x[i] *= L[i, i]
+    for i in range(n - 1, -1, -1):
+        x[i] *= L[i, i]
+        for j in range(i):
+            x[j] -= L[i, j] * x[i]
+
+
+@njit(**OPTIONS)
+def lu_factor(A, pivots):  # type: ignore[no-untyped-def]
+    """A becomes its factors, with scaled row exchanges, row k with row pivots[k].
+
+    Returns False where A is singular or has values that are not finite.
+    """
+    n, scale = A.shape[0], np.zeros(A.shape[0])
+    for i in range(n):
+        for j in range(n):
+            scale[i] = max(scale[i], abs(A[i, j]))
+    for k in range(n):
+        pivot, largest = k, 0.0
+        for i in range(k, n):
+            if abs(A[i, k]) > largest * scale[i]:
+                pivot, largest = i, abs(A[i, k]) / scale[i]
+        if not SINGULAR < largest < np.inf:
+            return False
+        pivots[k], scale[pivot] = pivot, scale[k]
+        if pivot != k:
+            for j in range(n):
+                moved = A[k, j]
+                A[k, j] = A[pivot, j]
+                A[pivot, j] = moved
+        for i in range(k + 1, n):
+            if A[i, k] != 0.0:
+                A[i, k] /= A[k, k]
+                for j in range(k + 1, n):
+                    A[i, j] -= A[i, k] * A[k, j]
+    return True
+
+
+@njit(**OPTIONS)
+def lu_solve(A, pivots, x):  # type: ignore[no-untyped-def]
+    """x becomes A^-1 x, of the A of these factors."""
+    n = x.size
+    for k in range(n):
+        x[k], x[pivots[k]] = x[pivots[k]], x[k]
+    for k in range(n):
+        for j in range(k):
+            x[k] -= A[k, j] * x[j]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            x[k] -= A[k, j] * x[j]
+        x[k] /= A[k, k]

@@ -1,0 +1,162 @@
+"""The loop over the steps of a solver with SciPy's interface: what it stores, how it ends."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.driver import OutOfTimeError, TimeLimit
+
+Array = NDArray[np.float64]
+
+SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
+
+
+class Steps:
+    """Steps of one run.
+
+    Parameters
+    ----------
+    make : callable
+        limit -> the solver at its start; the limit is looked at in every evaluation.
+    t0, y0 : float, ndarray
+        That start: y, or [y, y'].
+    callbacks : object
+        `raised` says whether a callback of the system raised: such an exception comes through, the solver's do not.
+    project : callable or None
+        (t, y) -> whether y, which it moves onto the constraints, is on them.
+    times : ndarray or None
+        When to store the state, by the solver's interpolant; None: at the end of every step.
+    limit : TimeLimit
+
+    Attributes
+    ----------
+    ends : list of float
+        The start, and the ends of the accepted steps, s.
+    failure : str
+        Why it ended, "": it has not failed.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[TimeLimit], Any],
+        t0: float,
+        y0: Array,
+        callbacks: Any,
+        project: Callable[[float, Array], bool] | None,
+        times: Array | None,
+        limit: TimeLimit,
+    ):
+        self.make, self.t0, self.y0, self.callbacks, self.project = make, t0, y0, callbacks, project
+        self.times, self.limit = times, limit
+        self.ends: list[float] = []
+        self._t: list[float] = []
+        self._y: list[Array] = []
+        self.failure = ""
+        self.solver: Any = None
+
+    @property
+    def t(self) -> Array:
+        """When states were stored."""
+        return np.array(self._t)
+
+    @property
+    def states(self) -> Array:
+        """The states that were stored, one a column: y, or [y, y']."""
+        return np.array(self._y).reshape(-1, self.y0.size).T
+
+    def go(self) -> None:
+        """Integrate to the solver's end or to a failure."""
+        self.ends.append(self.t0)
+        if self.times is None or self.t0 in self.times[:1]:
+            self._store(self.t0, self.y0)
+        try:
+            self.solver = self.make(self.limit)
+            while self.solver.status == "running" and not self.failure and not self._has_all():
+                self.failure = self._attempt()
+                if not self.failure:
+                    self._accept()
+        except OutOfTimeError:
+            self.failure = "out of time"
+        except ValueError as error:  # the implicit solvers' linear algebra refuses NaN in this way
+            if self.callbacks.raised:
+                raise
+            self.failure = str(error)
+
+    def again(self, times: Array | None) -> "Steps":
+        """The same steps, untimed, with the states at those of the times that were reached; itself for None."""
+        if times is None:
+            return self
+        given = self.make, self.t0, self.y0, self.callbacks, self.project
+        shown = Steps(*given, times[times <= self.ends[-1]], TimeLimit(None))
+        if times[0] <= self.ends[-1]:
+            shown.go()
+        self.failure = self.failure or shown.failure
+        return shown
+
+    def message(self, name: str, advice: str) -> str:
+        """What is said of a failure; "" if there was none."""
+        if self.limit.exceeded:
+            return self.limit.message(name, self.ends[-1], "take looser tolerances or another method")
+        failed = f"{name} failed after t = {self.ends[-1]:.10g}: {self.failure.rstrip('.')}. {advice}"
+        return failed if self.failure else ""
+
+    def _has_all(self) -> bool:
+        """Whether the output times of a run that is for them alone are stored."""
+        return bool(self.times is not None and 0 < self.times.size == len(self._t))
+
+    def _state(self) -> Array:
+        solver = self.solver
+        return np.concatenate([solver.y, solver.yp]) if hasattr(solver, "yp") else solver.y.copy()
+
+    def _attempt(self) -> str:
+        """Make a step, and return why it failed."""
+        solver, message = self.solver, self.solver.step()
+        if solver.status == "failed":
+            return str(message)
+        # LSODA would go on in both cases, without end in the second
+        if not np.isfinite(self._state()).all():
+            return f"the state at t = {solver.t:.10g} is not finite"
+        if solver.status == "running" and solver.t - self.ends[-1] < SMALLEST_STEP * np.spacing(abs(solver.t)):
+            return f"the step has shrunk to {solver.t - self.ends[-1]:.3g} s"
+        return ""
+
+    def _accept(self) -> None:
+        """Project and store what a step gave."""
+        solver, t = self.solver, float(self.solver.t)
+        due = [] if self.times is None else self._due(t)
+        inside = [moment for moment in due if moment != t]
+        if inside:
+            # before the projection: the interpolant belongs to the solver's own y and f
+            interpolant = solver.dense_output()
+            for moment in inside:
+                state = np.array(interpolant(moment)).ravel()
+                if self._projected(moment, state):
+                    self._store(moment, state)
+        y = self._state()
+        if self.project is not None:
+            if not self._projected(t, y):
+                return
+            solver.y = y.copy()
+            if solver.status == "running":
+                solver.f = solver.fun(t, solver.y)
+        self.ends.append(t)
+        if self.times is None or len(due) > len(inside):
+            self._store(t, y)
+
+    def _due(self, t: float) -> list[float]:
+        """Output times after the last step's end and up to t."""
+        assert self.times is not None
+        first, last = np.searchsorted(self.times, [self.ends[-1], t], side="right")
+        return [float(moment) for moment in self.times[first:last]]
+
+    def _projected(self, t: float, y: Array) -> bool:
+        if self.project is None or self.project(t, y):
+            return True
+        self.failure = f"the projection onto the constraints at t = {t:.10g} did not converge"
+        return False
+
+    def _store(self, t: float, y: Array) -> None:
+        self._t.append(t)
+        self._y.append(y)

@@ -1,0 +1,161 @@
+"""IDA's or CVODE's memory, and the one loop over their steps that both are driven by from compiled code."""
+
+import ctypes
+import itertools
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.driver import TimeLimit, longest_step, user_call
+from references.sundials.library import LONG, POINTER, REAL, check, context, library, made
+from twoloop.run.record import Statistics
+
+Array = NDArray[np.float64]
+
+SMALLEST_STEP = 1e-12  # of the length of t_span; without one they shrink their steps towards a NaN without end
+MOST_STEPS = 10**9  # the clock is looked at before
+STEPS_A_CALL = 100  # between two looks at the clock
+NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
+RAISED = -1  # what a callback returns that shall not be called again
+COUNTERS = {
+    "n_accepted": ("Steps",),
+    "n_rejected_error": ("ErrTestFails",),
+    "n_rejected_convergence": ("StepSolveFails",),
+    "n_outer": ("NonlinSolvIters",),
+}
+
+
+class Memory:
+    """The memory of IDA (`kind` "IDA") or CVODE ("CVode") over its vectors, which are the rows of `state`."""
+
+    def __init__(self, stack: ExitStack, kind: str, state: Array, span: tuple[float, float], *given: int):
+        self.kind, self.state, self.start, self.span = kind, state, state.copy(), span
+        self.stack, self.own, self.sundials = stack, context(stack), library()
+        self.vectors = [self.vector(values) for values in state]
+        free = getattr(self.sundials, f"{kind}Free")
+        self.memory = made(stack, f"{kind}Create", lambda pointer: free(ctypes.byref(pointer)), *given, self.own)
+        self.reached = REAL(span[0])
+
+    def vector(self, values: Array) -> Any:
+        """SUNDIALS' vector over an array."""
+        free = self.sundials.N_VDestroy
+        return made(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
+
+    def call(self, name: str, *arguments: Any) -> None:
+        """Call one of its functions, which must return 0."""
+        check(f"{self.kind}{name}", getattr(self.sundials, f"{self.kind}{name}")(self.memory, *arguments))
+
+    def solve_dense(self, jacobian: Any) -> None:
+        """Newton's method with a dense matrix; None: a Jacobian by differences."""
+        # not banded: ordered by nodes, the beam of 4 elements has bandwidths 23 and 21 of 64, and nothing to gain
+        size, destroy = self.state.shape[1], self.sundials.SUNMatDestroy
+        matrix = made(self.stack, "SUNDenseMatrix", destroy, size, size, self.own)
+        linear = made(self.stack, "SUNLinSol_Dense", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own)
+        self.call("SetLinearSolver", linear, matrix)
+        if jacobian is not None:
+            self.call("SetJacFn", jacobian.address)
+
+    def bound_steps(self, max_step: float | None) -> None:
+        """Set its limits on steps, and its end."""
+        t0, t1 = self.span
+        self.call("SetMaxNumSteps", STEPS_A_CALL)
+        self.call("SetMaxStep", longest_step(max_step, t1 - t0))
+        self.call("SetMinStep", SMALLEST_STEP * (t1 - t0))
+        self.call("SetStopTime", t1)
+
+    def restart(self) -> None:
+        """Begin at the start, as one does who keeps the memory."""
+        self.state[:] = self.start
+        self.call("ReInit", self.span[0], *self.vectors)
+        self.reached.value = self.span[0]
+
+    def solve(self, stop: float, mode: int) -> int:
+        """Its flag after steps to `stop`, or after one."""
+        place = ctypes.byref(self.reached)
+        if self.kind == "IDA":
+            return int(self.sundials.IDASolve(self.memory, stop, place, *self.vectors, mode))
+        return int(self.sundials.CVode(self.memory, stop, *self.vectors, place, mode))
+
+    def go_to_the_end(self, limit: TimeLimit) -> int:
+        """Its last flag; past the time limit that of a run stopped at its greatest number of steps."""
+        flag = TOO_MUCH_WORK
+        for calls in itertools.count(1):
+            flag = TOO_MUCH_WORK if limit.passed() else self.solve(self.span[1], NORMAL)
+            if flag != TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
+                break
+        return flag
+
+    def rows_at(self, times: Array) -> Array:
+        """The state (n_t, k n) at times that the same steps have reached before, or at those before a failure."""
+        flag, rows = 0, np.empty((times.size, self.state.size))
+        for k, stop in enumerate(times.tolist()):
+            if stop > self.span[0]:
+                if k == 0 or times[k - 1] <= self.span[0]:  # the length of the first step depends on where it goes
+                    self.solve(self.span[1], ONE_STEP)
+                while flag != TSTOP_RETURN:
+                    flag = self.solve(stop, NORMAL)
+                    if flag != TOO_MUCH_WORK:
+                        break
+                if flag < 0:
+                    return rows[:k]
+            rows[k] = self.state.ravel()
+        return rows
+
+    def counted(self, what: str) -> int:
+        """One of its counters."""
+        number = LONG()
+        self.call(f"GetNum{what}", ctypes.byref(number))
+        return number.value
+
+    def failure(self, flag: int, limit: TimeLimit, advice: str) -> str:
+        """What is said of a run that ended with this flag."""
+        name, t = self.kind.upper(), self.reached.value
+        if limit.exceeded:
+            return limit.message(name, t, "take looser tolerances")
+        if flag >= 0:
+            return ""
+        return f"{name} failed after t = {t:.10g} with {self.flag_name(flag)} ({flag}). {advice}"
+
+    def flag_name(self, flag: int) -> str:
+        """SUNDIALS' name of a flag; the text is ours to free."""
+        text = getattr(self.sundials, f"{self.kind}GetReturnFlagName")(flag)
+        name = ctypes.string_at(text).decode()
+        free = ctypes.CDLL(None).free
+        free.argtypes, free.restype = [POINTER], None
+        free(text)
+        return name
+
+
+def run(
+    kind: str,
+    start: Array,
+    span: tuple[float, float],
+    given: tuple[int, ...],
+    set_up: Callable[[Memory], None],
+    times: Array,
+    time_limit: float | None,
+    counters: Mapping[str, tuple[str, ...]],
+    advice: str,
+) -> tuple[Array, Array, str, Statistics]:
+    """The times that were reached, the states there as rows, why it failed ("": it did not), and the statistics.
+
+    Timed is a second use of a memory, as SUNDIALS' guides have it: ReInit, and steps to the end without output. The
+    output has a memory of its own: CVODE's ReInit does not forget when it projected last.
+    """
+    with ExitStack() as stack:
+        solver = Memory(stack, kind, start.copy(), span, *given)
+        set_up(solver)
+        limit = TimeLimit(time_limit)
+        with user_call as clock:
+            solver.restart()
+            flag = solver.go_to_the_end(limit)
+        counts = {name: sum(map(solver.counted, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
+        failure, kept = solver.failure(flag, limit, advice), times[times <= solver.reached.value]
+    with ExitStack() as stack:
+        solver = Memory(stack, kind, start.copy(), span, *given)
+        set_up(solver)
+        rows = solver.rows_at(kept)
+    return kept[: len(rows)], rows, failure, Statistics(cpu_time=clock.seconds or 0.0, **counts)

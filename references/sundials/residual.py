@@ -1,0 +1,219 @@
+"""IDA's residual and the derivatives of it as machine code, from the callbacks of a ConstrainedSystem.
+
+IDA solves F(t, y, y') = 0. The index-3 equations are brought to index 1 in one of two ways, of which `FORMS` has a line
+fit for a table:
+
+"index1": unknowns q, v, lam; q' = v, M v' + C_q^T lam = Q, C_q v' = Q_d. Drifts off the constraints.
+
+"stabilised": Gear, Gupta and Leimkuhler (1985) with the multipliers as time derivatives of further unknowns Lam, Mu;
+q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. Rows A v + b = 0 stand below C_q v + C_t = 0; their
+Mu is zero.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from references.equations.accelerations import compiled_gamma
+from references.equations.linear import OPTIONS
+from references.equations.ode import accelerations
+from twoloop.kernels.compile.callbacks import stand_in
+from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+FORMS = {
+    "index1": "index 1: C_q v' = Q_d; multipliers out of the error test (atol 1e12)",
+    "stabilised": "GGL, integrated multipliers: C = 0 and C_q v + C_t = 0; multipliers' integrals in the error test",
+}
+ALL = 10**9  # rows that are of C: there are none of A v + b = 0 below
+DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
+
+
+class Parts(NamedTuple):
+    """What the functions of a system are compiled of; they take the sizes from M and C_q.
+
+    `positions`: how many rows are of C. `tangent`: dQ/dq, if nothing of the force is to be differenced.
+    """
+
+    index1: bool
+    mass: Dispatcher
+    force: Dispatcher
+    constraint: Dispatcher
+    jacobian: Dispatcher
+    constraint_rate: Dispatcher
+    gamma: Callable[..., None]
+    tangent: Dispatcher | None
+    positions: int
+    constant_mass: bool
+
+
+def parts_of(system: ConstrainedSystem, form: str, positions: int) -> Parts:
+    """Those of a system."""
+    f, index1 = system.functions, form == "index1"
+    gamma = compiled_gamma(system) if index1 else f.gamma
+    functions = f.mass, f.force, f.constraint, f.jacobian, f.constraint_rate, gamma, own_tangent(system)
+    return Parts(index1, *functions, positions, system.constant_mass)
+
+
+def own_tangent(system: ConstrainedSystem) -> Dispatcher | None:
+    """The system's dQ/dq, if it gives one and the force does not depend on v: nothing of it is then differenced."""
+    flags = system.functions.flags
+    exact = flags[FORCE_BY_Q_GIVEN] == 1 and flags[FORCE_BY_V_GIVEN] == 0
+    return system.functions.force_by_q if exact else None
+
+
+def start_of(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> Array:
+    """Unknowns and their derivatives at the start (2, size); accelerations and multipliers by eq. (6)."""
+    m = system.n_c
+    a, lam = (each[:, 0] for each in accelerations(system, np.array([t0]), np.concatenate([q, v])[:, None]))
+    zeros = np.zeros(m)
+    if form == "index1":
+        return np.array([np.concatenate([q, v, lam]), np.concatenate([v, a, zeros])])
+    return np.array([np.concatenate([q, v, zeros, zeros]), np.concatenate([v, a, lam, zeros])])
+
+
+def columns_of(form: str, n: int, m: int, y: Array, yp: Array) -> Array:
+    """Rows [q v a lam] (3 n_q + n_c, n_t) of unknowns and their derivatives (size, n_t)."""
+    lam = (y if form == "index1" else yp)[2 * n : 2 * n + m]
+    return np.concatenate([y[: 2 * n], yp[n : 2 * n], lam])
+
+
+def space_of(system: ConstrainedSystem, form: str, t0: float, q0: Array) -> tuple[Array, ...]:
+    """The arrays that the functions below take: p, M, which stays if it is constant, C_q, dQ/dq, and scratch."""
+    n, m = system.n_q, system.n_c
+    scratch = np.zeros((3, 2 * n + (m if form == "index1" else 2 * m)))
+    return system.functions.p, np.array(system.mass(t0, q0)), np.zeros((m, n)), np.zeros((n, n)), *scratch
+
+
+@lru_cache(maxsize=64)
+def residual_at(parts: Parts) -> Callable[..., None]:
+    """(t, y, y', p, M, Cq, res) -> None: the residual; M and C_q are left as they are at q."""
+    index1, mass, force, constraint, jacobian, constraint_rate, gamma, _, positions, constant_mass = parts
+
+    @njit(**OPTIONS)
+    def residual(t, y, yp, p, M, Cq, res):  # type: ignore[no-untyped-def]
+        m, n = Cq.shape
+        q, v, a = y[:n], y[n : 2 * n], yp[n : 2 * n]
+        if not constant_mass:
+            M[:, :] = 0.0
+            mass(t, q, p, M)
+        Cq[:, :] = 0.0
+        jacobian(t, q, p, Cq)
+        res[:] = 0.0
+        force(t, q, v, p, res[n : 2 * n])
+        if index1:
+            gamma(t, q, v, p, res[2 * n :])
+        else:
+            constraint(t, q, p, res[2 * n : 2 * n + m])
+            constraint_rate(t, q, p, res[2 * n + m :])
+        for i in range(n):
+            total = -res[n + i]
+            for j in range(n):
+                total += M[i, j] * a[j]
+            res[n + i] = total
+            res[i] = yp[i] - v[i]
+        for k in range(m):
+            if index1:
+                lam, mu, row = y[2 * n + k], 0.0, 2 * n + k
+                rate = -res[row]
+            else:
+                lam, mu, row = yp[2 * n + k], yp[2 * n + m + k], 2 * n + m + k
+                rate = res[row]
+            for i in range(n):
+                res[i] += Cq[k, i] * mu
+                res[n + i] += Cq[k, i] * lam
+                rate += Cq[k, i] * (a[i] if index1 else v[i])
+            res[row] = rate
+        if not index1:
+            for k in range(positions, m):
+                res[2 * n + k] = y[2 * n + m + k]
+
+    return residual  # type: ignore[no-any-return]
+
+
+@njit
+def _no_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
+    """Stand in for the force in what is differenced beside an exact tangent."""
+
+
+@lru_cache(maxsize=64)
+def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
+    """(t, cj, y, y', p, M, Cq, K, moved, here, there, J) -> None: dF/dy + cj dF/dy', J[j] its column j.
+
+    J arrives full of zeros. With a tangent, what is differenced is the residual without the force.
+    """
+    index1, mass, force, _, jacobian, _, gamma, tangent, positions, constant_mass = parts
+    exact = tangent is not None
+    add_tangent = stand_in("force_by_q") if tangent is None else tangent
+    differenced = residual_at(parts._replace(force=_no_force if exact else force, tangent=None))
+    by_velocities = index1 or not exact
+
+    @njit(**OPTIONS)
+    def of_velocities(t, q, v, p, m, out):  # type: ignore[no-untyped-def]
+        n = q.size
+        out[: n + m] = 0.0
+        if not exact:
+            force(t, q, v, p, out[:n])
+        if index1:
+            gamma(t, q, v, p, out[n : n + m])
+
+    @njit(**OPTIONS)
+    def iteration_matrix(t, cj, y, yp, p, M, Cq, K, moved, here, there, J):  # type: ignore[no-untyped-def]
+        m, n = Cq.shape
+        moved[:] = y
+        q, v = moved[:n], moved[n : 2 * n]
+        if not constant_mass:
+            M[:, :] = 0.0
+            mass(t, q, p, M)
+        Cq[:, :] = 0.0
+        jacobian(t, q, p, Cq)
+        for j in range(n):  # columns of v and of the multipliers
+            J[n + j, j] = -1.0
+            for i in range(n):
+                J[n + j, n + i] = cj * M[i, j]
+            for k in range(m):
+                if index1:
+                    J[n + j, 2 * n + k] = cj * Cq[k, j]
+                    J[2 * n + k, n + j] = Cq[k, j]
+                else:
+                    J[n + j, 2 * n + m + k] = Cq[k, j]
+                    J[2 * n + k, n + j] = J[2 * n + m + k, j] = cj * Cq[k, j]
+                    J[j, 2 * n + k] = Cq[k, j] if k < positions else 0.0
+        if not index1:
+            for k in range(positions, m):
+                J[2 * n + m + k, 2 * n + k] = 1.0
+        if by_velocities:
+            of_velocities(t, q, v, p, m, here)
+            for j in range(n):
+                step = DIFFERENCE * max(1.0, abs(y[n + j]))
+                v[j] = y[n + j] + step
+                of_velocities(t, q, v, p, m, there)
+                v[j] = y[n + j]
+                for i in range(n + m if index1 else n):
+                    J[n + j, n + i] -= (there[i] - here[i]) / step
+        differenced(t, moved, yp, p, M, Cq, here)
+        for j in range(n):  # columns of q
+            step = DIFFERENCE * max(1.0, abs(y[j]))
+            q[j] = y[j] + step
+            differenced(t, moved, yp, p, M, Cq, there)
+            q[j] = y[j]
+            for i in range(2 * n):
+                J[j, i] = (there[i] - here[i]) / step
+            for i in range(2 * n if index1 else 2 * n + m, y.size):  # C_q stands above
+                J[j, i] = (there[i] - here[i]) / step
+            J[j, j] += cj
+        if exact:
+            K[:, :] = 0.0
+            add_tangent(t, q, v, p, K)
+            for j in range(n):
+                for i in range(n):
+                    J[j, n + i] -= K[i, j]
+
+    return iteration_matrix  # type: ignore[no-any-return]
