@@ -10,7 +10,7 @@ from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, o
 from twoloop.generate.lane_code import OwnLanes
 from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.straight_line import Choice
-from twoloop.methods.taylor import compiled_order
+from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -88,17 +88,14 @@ class LaneRuns:
         from twoloop.kernels import lanes
 
         starts, code = self.starts, self.own.code
-        n, n_rows, order = code.n, code.n_rows, compiled_order(rtol, float(atol.min())) + 1
+        n, n_rows, order = code.n, code.n_rows, order_in_lanes(rtol, float(atol.min())) + 1
         numbers = self.own.numbers(starts.parameters[rows])
         room = _aligned(lanes.places(n, n_rows, code.n_numbers, order)[-1] + code.scratch_size(order), lanes.LANES)
         redundant = bool(code.equations.redundant.conditions)
         settings = np.array([n, n_rows, order, redundant], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
-        kept = np.zeros((3 * n + n_rows) * lanes.LANES)
         given = np.ascontiguousarray(starts.q[rows]), np.ascontiguousarray(starts.v[rows])
-        lanes.advance_lanes(
-            self.own.function, settings, control, times, numbers, *given, *out, status, n_steps, room, kept
-        )
+        lanes.advance_lanes(self.own.function, settings, control, times, numbers, *given, *out, status, n_steps, room)
 
     def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
         """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""

@@ -49,12 +49,18 @@ from twoloop.kernels.lanes import (
     OWN_LANES,
     REDUNDANT,
     SERIES,
+    TAKE,
     THERE,
 )
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+# log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points, highest power first: good to 2e-06
+# and 1e-07, for the lengths of steps
+LOG2 = (-0.02512320329, 0.2700374574, -1.247962495, 3.249466561, -5.301709109, 6.089895763, -3.03460285)
+EXP2 = (0.001340043216, 0.009676037098, 0.05550327214, 0.2402210736, 0.6931472067, 1.000000075)
+LARGEST_POWER, SMALLEST = 1000.0, 1e-300
 AT_ONCE = 8  # sums in one loop, in registers
 BUILD_SECONDS = 1e-3  # for a quantity, about
 LARGEST = 1500  # operations of a series, which take some seconds to compile
@@ -135,6 +141,28 @@ class LaneEmitter(Emitter):
         """The smaller of two numbers."""
         return self.builder.select(self.builder.fcmp_ordered("<", a, b), a, b)
 
+    def logarithm(self, x: Value) -> Value:
+        """log2 x to a hundredth of a per cent of 1, of positive numbers."""
+        builder = self.builder
+        bits = builder.bitcast(x, WHOLE)
+        exponent = builder.sub(builder.lshr(bits, self.whole(52)), self.whole(1023))
+        rest = builder.or_(builder.and_(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
+        return self.add(builder.sitofp(exponent, LANE), self._polynomial(LOG2, builder.bitcast(rest, LANE)))
+
+    def exponential(self, x: Value) -> Value:
+        """2^x to a hundredth of a per cent."""
+        builder = self.builder
+        x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
+        whole = self.function("rint", x)
+        bits = builder.shl(builder.add(builder.fptosi(whole, WHOLE), self.whole(1023)), self.whole(52))
+        return self.multiply(builder.bitcast(bits, LANE), self._polynomial(EXP2, self.subtract(x, whole)))
+
+    def _polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
+        total = self.constant(coefficients[0])
+        for coefficient in coefficients[1:]:
+            total = self.fused(total, x, self.constant(coefficient))
+        return total
+
     def largest_of(self, a: Value, b: Value) -> Value:
         """The larger of two numbers; the first where it is NaN, which stays."""
         return self.builder.select(self.builder.fcmp_unordered(">", a, b), a, b)
@@ -177,6 +205,8 @@ class LaneCode:
             self._rows(program.rows, program.row_places),
             self._rows(program.balance, program.balance_places),
         )
+        self._carried = self._shared_sums()
+        self.sums_ahead = sorted(set(self._carried.values()))
         for operation in (*self.early, *self.late):
             self._factors(operation)
             if operation.kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT):
@@ -184,7 +214,8 @@ class LaneCode:
         self.r = self.solution.n_kept
         self.c = self.r + self.n
         self.divisors = self.c + self.n_rows
-        self.table = self.divisors + len(self._divisors)
+        self.carried = self.divisors + len(self._divisors)
+        self.table = self.carried + len(self.sums_ahead)
         self.width = len(self._slots)
         self.structure = self._structure(program)
         self.n_numbers = self.numbers.n_varying
@@ -233,9 +264,28 @@ class LaneCode:
         """The place in a row of a factor: a form, or ("scaled", form), which is multiplied by its order."""
         return self._slots.setdefault(key, len(self._slots))
 
+    def _shared_sums(self) -> dict[int, tuple[int, int]]:
+        """Pairs of factors of sines by the result of a product of a cosine, or a sine, and the rate of its angle.
+
+        (cos x) x' is the derivative of sin x, so that what is known of the product's coefficient of one order is the
+        sum for the sine of the next, over the unit of time.
+        """
+        pairs: dict[Any, tuple[int, int]] = {}
+        for operation in self.early:
+            terms, _ = operation.first
+            if operation.kind == SINE and all(1 <= i <= self.n for i, _ in terms):
+                rate = tuple((i + self.n, c) for i, c in terms)
+                for result, pair in zip(reversed(operation.results), self._factors(operation), strict=True):
+                    pairs[((result, 1.0),), rate] = pair
+        products = [each for each in self.early if each.kind == PENDING and not each.first[1] and not each.second[1]]
+        known = {each.results[0]: pairs.get((each.first[0], each.second[0])) for each in products}
+        return {result: pair for result, pair in known.items() if pair is not None}
+
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
         """Places of the factors X and Y of the products that are summed up for each result."""
         kind, results, first, second = operation
+        if results[0] in getattr(self, "_carried", ()):
+            return []
         own = [self._slot(((result, 1.0),), 0.0) for result in results]
         if kind in (PRODUCT, PENDING):
             return [(self._slot(*first), self._slot(*second))]
@@ -262,7 +312,7 @@ class LaneCode:
         for j in range(n):
             emit.store(inputs[1 + j], out, j)
             emit.store(emit.multiply(unit, inputs[1 + n + j]), out, n + j)
-        for place in range(self.r, self.divisors):
+        for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
             emit.store(emit.constant(0.0), scratch, place)
         row = _Row(self, emit, emit.pointer(scratch, self.table))
         known = Quantities(emit, lambda i: inputs[i])
@@ -297,8 +347,11 @@ class LaneCode:
                 size = emit.function("fabs", emit.load(row, j))
                 largest = emit.larger(emit.multiply(size, emit.larger(of_q, emit.multiply(factor, of_v))), largest)
             found.append(largest)
-        for place, value in zip((lanes.LAST, lanes.BEFORE), found, strict=True):
-            emit.store(value, room, place)
+        logarithms = [
+            emit.divide(emit.logarithm(emit.larger(value, emit.constant(SMALLEST))), emit.number(power))
+            for value, power in zip(found, (order, builder.sub(order, INTEGER(1))), strict=True)
+        ]
+        emit.store(emit.exponential(emit.negative(emit.larger(*logarithms))), room, lanes.LENGTH)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The state and its accelerations by the series, X units of time on, by Horner's scheme."""
@@ -359,6 +412,13 @@ class LaneCode:
         emit.store(worst, room, lanes.DEFECT)
         emit.store(off, room, lanes.OFF)
 
+    def take(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+        """The end of an accepted step becomes the state."""
+        at = self._at(emit, order, control, room)
+        accepted = emit.builder.fcmp_ordered("!=", emit.load(room, lanes.ACCEPTED), emit.constant(0.0))
+        for k in range(2 * self.n):
+            emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
+
     def _tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
         def at(place: int) -> Value:
             return emit.splat(emit.builder.load(emit.builder.gep(control, [INTEGER(place)], inbounds=True)))
@@ -386,6 +446,12 @@ class LaneCode:
         row = _Row(self, emit, self._row(emit, scratch, k))
         inverse = emit.divide(emit.constant(1.0), order)
         self._operate(emit, known, self.early, row, scratch, k, order, inverse)
+        ahead = self._sums(emit, self.sums_ahead, scratch, following)
+        for place, pair in enumerate(self.sums_ahead):
+            emit.store(ahead[pair], scratch, self.carried + place)
+        per_unit = emit.divide(emit.constant(1.0), unit)
+        for result, pair in self._carried.items():
+            known.define(result, emit.multiply(per_unit, ahead[pair]))
         scale = emit.negative(emit.divide(order, unit))
         c = [zero] * self.n_rows
         for place, (terms, _) in self.rows:
@@ -406,7 +472,7 @@ class LaneCode:
         row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, INTEGER(1))))
         for operations, values, into in ((self.early, known, row), (self.late, before, row_before)):
             for operation in operations:
-                if operation.kind == PENDING:
+                if operation.kind == PENDING and operation.results[0] not in self._carried:
                     into.store(operation.second, values.sum(operation.second[0]))
         self._operate(emit, known, self.late, row, scratch, k, order, inverse)
         for place, (terms, _) in self.balance:
@@ -426,7 +492,7 @@ class LaneCode:
             row.store(first, x, "if used")
             divisor = None
             if kind == PENDING:
-                if operations is self.early:
+                if operations is self.early and results[0] not in self._carried:
                     row.store(second, known.sum(*second))
                 values = [zero]
             elif kind == PRODUCT:
@@ -454,11 +520,10 @@ class LaneCode:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _sums(
-        self, emit: LaneEmitter, operations: list[Operation], scratch: Value, order: Value
+        self, emit: LaneEmitter, pairs: list[tuple[int, int]], scratch: Value, order: Value
     ) -> dict[tuple[int, int], Value]:
         """Of pairs of factors, the sum of X[j] Y[order - j] over 0 < j < order."""
         builder = emit.builder
-        pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums: dict[tuple[int, int], Value] = {}
         for begin in range(0, len(pairs), AT_ONCE):
             some = pairs[begin : begin + AT_ONCE]
@@ -485,10 +550,15 @@ class LaneCode:
         inverse: Value,
     ) -> None:
         """An order that is not 0; of what waits, what is known before."""
-        sums = self._sums(emit, operations, scratch, k)
+        pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
+        there = {pair: self.carried + place for place, pair in enumerate(self.sums_ahead) if pair in pairs}
+        sums = self._sums(emit, [pair for pair in pairs if pair not in there], scratch, k)
+        sums |= {pair: emit.load(scratch, place) for pair, place in there.items()}
         begin = emit.pointer(scratch, self.table)
         for operation in operations:
             kind, results, (first, _), (second, _) = operation
+            if results[0] in self._carried:
+                continue
             totals = [sums[pair] for pair in self._factors(operation)]
             at = [(emit.load(begin, x), emit.load(begin, y)) for x, y in self._factors(operation)]
             u = None if kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT) and not first else known.sum(first)
@@ -654,9 +724,19 @@ class OwnLanes:
 
 def _source(code: LaneCode) -> tuple[Any, ...]:
     """What `compile_kept` takes."""
-    tasks = (code.series, code.lengths, code.evaluate, code.closer, code.nearer, code.there, code.redundant, code.judge)
+    tasks = (
+        code.series,
+        code.lengths,
+        code.evaluate,
+        code.closer,
+        code.nearer,
+        code.there,
+        code.redundant,
+        code.judge,
+        code.take,
+    )
     given: dict[str, Any] = {"order": i8, "control": VECTOR, "room": VECTOR}
-    series_, lengths, evaluate, closer, nearer, there, redundant, judge = (
+    series_, lengths, evaluate, closer, nearer, there, redundant, judge, take = (
         emitted(task, types.none, emitter=LaneEmitter, **given) for task in tasks
     )
 
@@ -677,6 +757,8 @@ def _source(code: LaneCode) -> tuple[Any, ...]:
             redundant(order, control, room)
         elif task == JUDGE:
             judge(order, control, room)
+        elif task == TAKE:
+            take(order, control, room)
 
     return own, OWN_LANES, (_stamp(), code.structure)
 

@@ -15,14 +15,15 @@ LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
 # tasks of the code made for a mechanism, on what lies in `room`
 (
     SERIES,  # coefficients about STATE at T, in units of time UNIT
-    LENGTHS,  # LAST, BEFORE: the last two terms over the tolerances
+    LENGTHS,  # LENGTH of the step at which the last two terms are within the tolerances, in units
     EVALUATE,  # NEW and FOUND: the state and its accelerations by the series, X units of time on
     CLOSER,  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
     NEARER,  # the same and velocities, and A and LAM there
     THERE,  # A at NEW as it stands
     REDUNDANT,  # whether rows that do not count hold at NEW
     JUDGE,  # DEFECT and OFF: of a step H from STATE by PREDICTED to NEW
-) = range(8)
+    TAKE,  # NEW becomes STATE where ACCEPTED
+) = range(9)
 # vectors in `room`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
 (
     T,
@@ -32,11 +33,9 @@ LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
     X,
     FINE,  # 1: of the lanes that a task is for; what it leaves 1 could be done
     MOVED,
-    LAST,
-    BEFORE,
     DEFECT,
     OFF,
-    LENGTH,  # of the step by the series, in units
+    LENGTH,
     LONGEST,  # that the step may be, s
     SHARE,  # of its length that the step may have, after it was refused
     WORST,  # defect within the step
@@ -49,7 +48,7 @@ LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
     ON_CONSTRAINTS,
     ACCEPTED,
     N_FIELDS,
-) = range(24)
+) = range(22)
 # (task, order, control, room)
 OWN_LANES = types.void(types.int64, types.int64, VECTOR, VECTOR)
 CODE = types.FunctionType(OWN_LANES)
@@ -173,22 +172,17 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
 
 
 @compiled
-def _choose_steps(room, control, order, status):
+def _choose_steps(room, control, status):
     """The step of each lane; how many places are to be looked at within the longest."""
     n_places, t1 = 0, control[T1]
     for k in range(LANES):
         room[H * LANES + k] = room[WORST * LANES + k] = 0.0
         if room[RUNNING * LANES + k] == 1.0:
-            last, before, least = room[LAST * LANES + k], room[BEFORE * LANES + k], -np.inf
-            if last > 0.0:
-                least = np.log(last) / order
-            if before > 0.0:
-                least = max(least, np.log(before) / (order - 1))
-            length, unit, t = np.exp(-least), room[UNIT * LANES + k], room[T * LANES + k]
-            h = min(length * unit * room[SHARE * LANES + k], room[LONGEST * LANES + k])
+            unit, t = room[UNIT * LANES + k], room[T * LANES + k]
+            h = min(room[LENGTH * LANES + k] * unit * room[SHARE * LANES + k], room[LONGEST * LANES + k])
             if h >= t1 - t:
                 h = t1 - t
-            room[LENGTH * LANES + k], room[H * LANES + k] = length, h
+            room[H * LANES + k] = h
             if not (room[FINE * LANES + k] == 1.0 and h > SHORTEST * max(abs(t), abs(t1))):
                 _leave(room, status, k)
                 room[H * LANES + k] = 0.0
@@ -290,42 +284,40 @@ def _between(code, order, control, room, n, new, times, out_q, out_v):
 
 
 @compiled
-def _take_over(room, control, n, state, new, a, kept, times, out_q, out_v, out_a, status, n_steps):
-    """The ends of accepted steps become the states; runs that have reached the end are written out."""
+def _write_ends(room, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
+    """What is at the ends of runs whose last steps were accepted."""
     for k in range(LANES):
-        if room[ACCEPTED * LANES + k] == 0.0:
+        if room[ACCEPTED * LANES + k] == 0.0 or room[H * LANES + k] != control[T1] - room[T * LANES + k]:
             continue
-        run, h = int(room[WHICH * LANES + k]), room[H * LANES + k]
-        n_steps[run] += 1
-        at_end = h == control[T1] - room[T * LANES + k]
-        room[T * LANES + k] = control[T1] if at_end else room[T * LANES + k] + h
-        room[UNIT * LANES + k] = min(room[LENGTH * LANES + k] * room[UNIT * LANES + k], GROWTH * h)
-        room[REFUSED * LANES + k] = 0.0
-        for j in range(2 * n):
-            room[(state + j) * LANES + k] = kept[j * LANES + k]
-        if at_end:
-            room[RUNNING * LANES + k], status[run] = 0.0, ENDED
-            for j in range(out_a.shape[1]):
-                out_a[run, j] = kept[(2 * n + j) * LANES + k]
-            for j in range(n):
-                for wanted in range(int(room[REACHED * LANES + k]), times.size):
-                    out_q[run, j, wanted] = kept[j * LANES + k]
-                    out_v[run, j, wanted] = kept[(n + j) * LANES + k]
+        run = int(room[WHICH * LANES + k])
+        room[RUNNING * LANES + k], status[run] = 0.0, ENDED
+        for j in range(n):
+            out_q[run, j, last], out_v[run, j, last] = room[(new + j) * LANES + k], room[(new + n + j) * LANES + k]
+        for j in range(n + n_rows):  # LAM is behind A
+            out_a[run, j] = room[(a + j) * LANES + k]
 
 
-@kernel(
-    types.void(
-        CODE, INTEGERS, VECTOR, VECTOR, TABLE, TABLE, TABLE, STATES, STATES, TABLE, INTEGERS, INTEGERS, VECTOR, VECTOR
-    )
-)
-def advance_lanes(code, settings, control, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, room, kept):
+@compiled
+def _go_on(room, control, n_steps):
+    """Time goes on in the lanes whose steps were accepted."""
+    for k in range(LANES):
+        if room[ACCEPTED * LANES + k] == 1.0:
+            h, t = room[H * LANES + k], room[T * LANES + k]
+            n_steps[int(room[WHICH * LANES + k])] += 1
+            room[T * LANES + k] = control[T1] if h == control[T1] - t else t + h
+            room[UNIT * LANES + k] = min(room[LENGTH * LANES + k] * room[UNIT * LANES + k], GROWTH * h)
+            room[REFUSED * LANES + k] = 0.0
+
+
+@kernel(types.void(CODE, INTEGERS, VECTOR, VECTOR, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 2, VECTOR))
+def advance_lanes(code, settings, control, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, room):
     """Make runs, one for each row of `numbers`, from t0 to t1.
 
     times : (n_t,) at which states are wanted, the last of them t1; out_q, out_v : (n_runs, n, n_t); out_a : (n_runs,
-    n + n_rows), accelerations and multipliers at t1; kept : ((3 n + n_rows) LANES,).
+    n + n_rows), accelerations and multipliers at t1.
     """
     n, n_rows, order, n_numbers = settings[N], settings[N_ROWS], settings[ORDER], numbers.shape[1]
-    state, new, _, _, a, _, _, _, _ = _places(n, n_rows, n_numbers, order)
+    _, new, _, _, a, _, _, _, _ = _places(n, n_rows, n_numbers, order)
     next_run = 0
     for field in (T, AHEAD, H, X, RUNNING, WHICH):
         _set(room, field, 0.0)
@@ -339,14 +331,12 @@ def advance_lanes(code, settings, control, times, numbers, q0, v0, out_q, out_v,
         _set(room, FINE, 1.0)
         code(SERIES, order, control, room)
         code(LENGTHS, order, control, room)
-        n_places = _choose_steps(room, control, order, status)
+        n_places = _choose_steps(room, control, status)
         if n_places > 0:
             _look_within(code, order, control, room, n_places, n_steps)
         _make_steps(code, order, control, room, n, n_rows, n_numbers, settings[CHECKS_REDUNDANT], status)
-        for i in range(2 * n * LANES):
-            kept[i] = room[new * LANES + i]
-        for i in range((n + n_rows) * LANES):  # LAM is behind A
-            kept[2 * n * LANES + i] = room[a * LANES + i]
+        code(TAKE, order, control, room)
+        _write_ends(room, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:
             _between(code, order, control, room, n, new, times, out_q, out_v)
-        _take_over(room, control, n, state, new, a, kept, times, out_q, out_v, out_a, status, n_steps)
+        _go_on(room, control, n_steps)

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 LOWEST, HIGHEST = 4, 40  # orders that may be asked for
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
 PER_DIGIT_COMPILED, LEAST_COMPILED = 1.25, 7.5  # the same of code made for the mechanism
+LEAST_IN_LANES = 5.5
 FIXED = 19  # order of constant steps
 FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
 PADDED = 8  # operations of a table are a multiple of this
@@ -29,6 +30,11 @@ PADDED = 8  # operations of a table are a multiple of this
 def compiled_order(rtol: float, atol: float) -> int:
     """The order that tolerances ask for of code made for a mechanism."""
     return _order(rtol, atol, LEAST_COMPILED, PER_DIGIT_COMPILED)
+
+
+def order_in_lanes(rtol: float, atol: float) -> int:
+    """The same of code for lanes."""
+    return _order(rtol, atol, LEAST_IN_LANES, PER_DIGIT_COMPILED)
 
 
 def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
