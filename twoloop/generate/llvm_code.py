@@ -226,7 +226,7 @@ def emitted(emit: Callable[..., Any], result: Any, emitter: Callable[..., Emitte
     ----------
     emit : method
         Gets vectors as pointers to their first elements; returns the result, None for `types.none`. Numba keeps what
-        this returns for ever, so that it holds the method's object weakly: it must live until it is compiled.
+        this returns permanently, so that it holds the method's object weakly: it must live until it is compiled.
     result : numba type
     emitter : callable
     **arguments : numba types

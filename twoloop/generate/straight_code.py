@@ -115,7 +115,7 @@ def function_of(graph: Graph, outputs: Outputs, numbers: Coefficients) -> Any:
     """A function for code that numba compiles: of inputs, of the values of `numbers`, and of vectors to fill.
 
     It returns whether the conditions hold and what it computes is finite, and fills the vectors only then. Numba keeps
-    it for ever; what it is written from must live until it is compiled.
+    it permanently; what it is written from must live until it is compiled.
     """
     graph_there, outputs_there, numbers_there = weakref.ref(graph), weakref.ref(outputs), weakref.ref(numbers)
 
