@@ -409,7 +409,8 @@ class Run:
         """Go on with the plan that takes over where values of this one are not finite."""
         assert self.plan.substitute is not None
         self.plan = replace(self.plan.substitute, inner=self.plan.inner, numbers=self.plan.numbers)
-        self.kit = kit_with(self.functions, self.plan)
+        self.kit = kit_with(self.system, self.functions._replace(flags=self.functions.flags.copy()), self.plan)
+        self.functions = self.kit.functions
         self.memory = self.plan.memory.copy()
         self.substituted = True
         self._control_by(self.plan)

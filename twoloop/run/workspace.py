@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
 SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+MOST_KITS = 16  # that are kept with a system
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
@@ -29,7 +30,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     given = ("flags", system.functions.flags.tobytes())
     flags = system.remembered_at(given, t0, (q0,), lambda: _flags(system, t0, q0)).copy()
     functions = system.functions._replace(flags=flags)
-    return common.Kit(functions, inner_loop) if plan is None else kit_with(functions, plan)
+    return common.Kit(functions, inner_loop) if plan is None else kit_with(system, functions, plan)
 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -50,14 +51,24 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return flags
 
 
-def kit_with(functions: Any, plan: Plan) -> common.Kit:
-    """The same callbacks and flags, with what another plan calls."""
+def kit_with(system: ConstrainedSystem, functions: Any, plan: Plan) -> common.Kit:
+    """The same callbacks and flags, with what another plan calls; kept with the system for the next run."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    functions.flags[common.STRAIGHT] = plan.inner is not None
-    steps = (plan.step, plan.first, plan.second)
-    parts = (plan.own, plan.instead, plan.numbers, plan.own_numbers)
-    return common.Kit(functions, plan.inner or inner_loop, *steps, inner_loop, *parts)
+    flags = functions.flags
+    flags[common.STRAIGHT] = plan.inner is not None
+    called = (plan.inner or inner_loop, plan.step, plan.first, plan.second)
+    read = (plan.numbers, plan.own_numbers)
+    kept: dict[Any, common.Kit] = system.remembered("kits", dict)
+    key = (flags.tobytes(), *called, plan.own, plan.instead, *map(id, read))  # which a kit that is kept holds
+    if key in kept:
+        return kept[key]
+    made = common.Kit(functions, *called, inner_loop, plan.own, plan.instead, *read)
+    if flags[common.FORM] != common.AUGMENTED:  # which a run may change
+        if len(kept) == MOST_KITS:
+            del kept[next(iter(kept))]
+        kept[key] = made
+    return made
 
 
 def workspace(
