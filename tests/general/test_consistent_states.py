@@ -68,20 +68,3 @@ def test_a_guess_that_does_not_say_on_which_assembly_it_is_is_refused():
         consistent_states(system, 0.0, q, np.zeros(2), keep=[0])
     found, _ = consistent_states(system, 0.0, q[:1], np.zeros(2), keep=[0])
     assert np.abs(found - [[0.6, 0.8]]).max() < 1e-15
-
-
-@pytest.mark.parametrize(
-    ("changed", "says"),
-    [
-        ({"q": np.zeros((2, 3))}, r"q must have shape \(9,\) or \(n_runs, 9\)"),
-        ({"v": np.zeros((2, 9))}, "q, v and parameters must have a row for each run; rows given: q 3, v 2"),
-        ({"keep": [9]}, "keep must hold indices from 0 to 8"),
-        ({"t": np.inf}, "t must be finite"),
-    ],
-)
-def test_wrong_input_is_named(changed, says):
-    problem = mechanisms.four_bar()
-    q, v = guesses(problem, 3)
-    given = {"t": 0.0, "q": q, "v": v, "keep": None} | changed
-    with pytest.raises(ValueError, match=says):
-        consistent_states(problem.system, given["t"], given["q"], given["v"], keep=given["keep"])

@@ -166,7 +166,7 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str)
     try:
         check_start(system_of(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
     except ValueError as error:
-        raise ValueError(f"run {run}: {error}s for many starts at once, twoloop.consistent_states") from error
+        raise ValueError(f"run {run}: {error}, or many starts at once by twoloop.consistent_states") from error
 
 
 def _message(status: Any, in_lanes: Any, why: str) -> str:

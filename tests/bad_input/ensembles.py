@@ -1,0 +1,90 @@
+"""Ensembles, many starts and integrators that cannot be made."""
+
+import numpy as np
+
+from tests.bad_input.case import Case
+from twoloop import Integrator, consistent_states, ensemble
+from twoloop.mechanisms import four_bar
+
+LINKAGE = four_bar()
+THREE = np.tile(LINKAGE.q0, (3, 1))
+
+
+def many(q0=THREE, v0=LINKAGE.v0, t_span=(0.0, 0.1), system=LINKAGE.system, **options):
+    return ensemble(system, t_span, q0, v0, **options)
+
+
+def states(q=THREE, v=LINKAGE.v0, t=0.0, **options):
+    return consistent_states(LINKAGE.system, t, q, v, **options)
+
+
+def moved(run, by):
+    q = THREE.copy()
+    q[run] += by
+    return q
+
+
+def of_ensemble(what, call, words, advice, error=ValueError):
+    return Case("ensemble", what, call, error, words, advice)
+
+
+def of_states(what, call, words, advice):
+    return Case("consistent_states", what, call, ValueError, words, advice)
+
+
+def of_integrator(what, call, words, advice, error=ValueError):
+    return Case("Integrator", what, call, error, words, advice)
+
+
+A_ROW = "give a row for each run, or one for all"
+ENSEMBLES = [
+    of_ensemble("starts as columns", lambda: many(THREE.T), r"q0 must have shape \(9,\) or \(n_runs, 9\)", A_ROW),
+    of_ensemble(
+        "fewer parameters than runs",
+        lambda: many(parameters=np.ones((2, 4))),
+        "a row for each run; rows given: q0 3, parameters 2",
+        A_ROW,
+    ),
+    of_ensemble(
+        "one vector of parameters",
+        lambda: many(parameters=[1.0, 2.0, 1.5, 3.0]),
+        r"parameters must have shape \(n_runs, 4\)",
+        "give a row for each run, or `system.with_parameters(p)`",
+    ),
+    of_ensemble(
+        "a start off the constraints",
+        lambda: many(moved(2, 0.1)),
+        "run 2: q0 is not consistent",
+        "put all starts on the constraints by `consistent_states`",
+    ),
+    of_ensemble("a start with a NaN", lambda: many(moved(1, np.nan)), "q0 must be finite; row 1 is not", "look at it"),
+    of_ensemble("`threads=0`", lambda: many(threads=0), "threads must be at least 1", "leave it out: all cores"),
+    of_ensemble(
+        "a problem in place of its system",
+        lambda: many(system=LINKAGE),
+        "give its system, problem.system",
+        "give `problem.system`",
+        TypeError,
+    ),
+    of_states("guesses as columns", lambda: states(THREE.T), r"q must have shape \(9,\) or \(n_runs, 9\)", A_ROW),
+    of_states(
+        "a guess that leads nowhere",
+        lambda: states(moved(1, -LINKAGE.q0)),
+        "guess 1: ",
+        "give a guess that is nearer to an assembled position",
+    ),
+    of_states("`keep=[9]` of nine coordinates", lambda: states(keep=[9]), "keep must hold indices", "count from 0"),
+    of_integrator(
+        "`tol=1e-6`",
+        lambda: Integrator(LINKAGE.system, tol=1e-6),
+        "Integrator has no option 'tol'",
+        "give `rtol` and `atol`",
+        TypeError,
+    ),
+    of_integrator(
+        "other parameters than there are",
+        lambda: Integrator(LINKAGE.system).run((0.0, 1.0), LINKAGE.q0, LINKAGE.v0, [1.0]),
+        "parameters of 'four-bar' must be 4 numbers",
+        "give as many as `system.parameters` has",
+    ),
+]
