@@ -108,7 +108,8 @@ def _together(system: ConstrainedSystem, starts: Starts, kept: list[int]) -> tup
     fine &= equations.on_one_assembly(q, q - starts.q)
     v = starts.v.copy()
     G, rate = equations.of("rows", q), equations.of("rates", q)
-    v[:, equations.free] += _least_change(G[:, :, equations.free], -(np.einsum("rij,rj->ri", G, v) + rate))
+    for _ in range(2):  # once more for what rounding of a large change leaves
+        v[:, equations.free] += _least_change(G[:, :, equations.free], -(np.einsum("rij,rj->ri", G, v) + rate))
     return q, v, fine & np.isfinite(v).all(axis=1)
 
 

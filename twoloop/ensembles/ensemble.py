@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
 from twoloop.ensembles.in_lanes import LaneRuns, threads_of
 from twoloop.ensembles.runs import Runs
-from twoloop.ensembles.starts import AT_ROUNDING, Starts, all_starts, system_of
+from twoloop.ensembles.starts import Starts, all_starts, system_of
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
@@ -19,6 +19,7 @@ from twoloop.solve import check_method, solve_dae
 Array = NDArray[np.float64]
 
 IN_LANES = ("auto", "Taylor")  # methods that go in lanes
+NEAR = 1e4  # times rounding of its terms: an equation of a start that needs no closer look
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
 
@@ -130,7 +131,7 @@ def _in_lanes(
     q, v, n_steps = out
     system, starts = lanes.system, lanes.starts
     for name, off in zip(("q0", "v0"), lanes.off(), strict=True):
-        for run in np.flatnonzero(~(off <= AT_ROUNDING)).tolist():
+        for run in np.flatnonzero(~(off <= NEAR)).tolist():
             _check_start(system, starts, run, name)
     within = times[times > starts.t0]
     ends = within if within.size and within[-1] == t1 else np.append(within, t1)

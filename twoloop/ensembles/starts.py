@@ -82,8 +82,9 @@ def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
 
 
 def over_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> Array:
-    """The largest of some values G x + rate, or of constraints, over what rounding may leave of its terms."""
-    terms = np.einsum("...ij,...j->...i", np.abs(rows), np.abs(state)) + np.abs(rate)
+    """The largest of some values G x + rate, or of constraints, over what rounding of the largest x may leave of it."""
+    largest = np.abs(state).max(axis=-1, keepdims=True, initial=0.0)
+    terms = np.abs(rows).sum(axis=-1) * largest + np.abs(rate)
     with np.errstate(divide="ignore", invalid="ignore"):
         off: Array = np.where(values == 0.0, 0.0, np.abs(values) / (np.finfo(float).eps * terms))
     return off.max(axis=-1, initial=0.0)

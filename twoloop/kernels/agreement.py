@@ -75,7 +75,7 @@ def disagreement(f, sizes, t, share, atol, parameters, q, v, a, lam, room, worst
 
 @kernel(types.void(KIT, INTEGERS, f8, TABLE, TABLE, VECTOR, VECTOR))
 def violation(f, sizes, t, parameters, q, room, worst):
-    """Of each position the largest |C| over |C_q| |q|.
+    """Of each position the largest |C| over the sum of its row of |C_q| times the largest coordinate.
 
     room : (n_c (n + 1),).
     """
@@ -87,9 +87,11 @@ def violation(f, sizes, t, parameters, q, room, worst):
             f.p[first + j] = parameters[k, j]
         f.constraint(t, q[k], f.p, C)
         f.jacobian(t, q[k], f.p, G)
-        worst[k] = 0.0
+        far, worst[k] = 0.0, 0.0
+        for j in range(n):
+            far = max(far, abs(q[k, j]))
         for i in range(n_c):
-            terms = 0.0
+            row = 0.0
             for j in range(n):
-                terms += abs(G[i, j] * q[k, j])
-            worst[k] = max(worst[k], _off(C[i], terms))
+                row += abs(G[i, j])
+            worst[k] = max(worst[k], _off(C[i], row * far))
