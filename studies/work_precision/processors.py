@@ -40,6 +40,7 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
     """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
+    made_on = rows.groupby("case")["processor"].first()  # a mechanism is measured on one
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
@@ -48,16 +49,18 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
         for case, error, standing in found:
             for who, at in standing.items():
                 if at["verdict"] in ("ahead", "behind", "undecided"):
-                    line = {"processor": rows["processor"].iloc[0], "commit": commit[1] if commit else ""}
+                    line = {"processor": made_on[case], "commit": commit[1] if commit else ""}
                     line |= {"time": time, "case": case, "error": error}
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
     return pd.DataFrame(lines, columns=["processor", "commit", "time", *PLACE, "ratio", "verdict"])
 
 
 def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
-    """What stands in the file for other processors, and what was made on this one."""
+    """What stands in the file for mechanisms on other processors, and what was made on this one."""
     before = pd.read_csv(path) if path.is_file() else made[:0]
-    return pd.concat([before[~before["processor"].isin(made["processor"])], made], ignore_index=True)
+    place = ["processor", "case"]
+    again = before.set_index(place).index.isin(made.set_index(place).index)
+    return pd.concat([before[~again], made], ignore_index=True)
 
 
 def kept(output: Output, rows: pd.DataFrame, stamp: str, found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:

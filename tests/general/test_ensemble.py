@@ -153,7 +153,7 @@ def test_what_cannot_go_in_lanes_says_why(made):
 
 def test_a_few_runs_do_not_wait_for_a_compiler(made, monkeypatch):
     monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 0.0)
-    monkeypatch.setattr("twoloop.generate.lane_code.OwnLanes.seconds_to_build", 10.0)
+    monkeypatch.setattr("twoloop.generate.own_lanes.OwnLanes.seconds_to_build", 10.0)
     system, q, v, parameters, *_ = made
     runs = ensemble(system, (0.0, 0.1), q[:3], v[:3], parameters=parameters[:3])
     assert runs.singly.all() and "to compile them does not pay" in runs.message

@@ -1,4 +1,4 @@
-"""Machine code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
+"""Code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
 
 The operations are those of `series`, `straight_line` and `straight_code`. Coefficients are read, a vector each, so that
 runs may have parameters of their own. Factors of products stand in rows, one for each order; a factor that several
@@ -7,26 +7,20 @@ products share stands there once.
 
 import hashlib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import types
 from numpy.typing import NDArray
 
-from twoloop.generate import coefficients, llvm_code, llvm_trigonometry, series, straight_code, straight_line
-from twoloop.generate.coefficients import Coefficient, Coefficients, Terms
-from twoloop.generate.known_numbers import Record
-from twoloop.generate.llvm_code import DOUBLE, INTEGER, INTRINSICS, WORD, Emitter, Quantities, Value, emitted
+from twoloop.generate import llvm_trigonometry, straight_code
+from twoloop.generate.coefficients import Coefficients, Terms
+from twoloop.generate.lane_emitter import LaneEmitter
+from twoloop.generate.llvm_code import INTEGER, Quantities, Value
 from twoloop.generate.series import SeriesProgram, Sums, Table, series_program
 from twoloop.generate.straight_code import conditions_hold, results_of
 from twoloop.generate.straight_line import Choice, Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels import lanes
-from twoloop.kernels.compile.caches import Newest, compile_kept, is_kept, sources_folder
-from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.control.defect import ROUNDING
 from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
 from twoloop.kernels.evaluation.operations import (
@@ -39,137 +33,12 @@ from twoloop.kernels.evaluation.operations import (
     SINE,
     SQUARE_ROOT,
 )
-from twoloop.kernels.lanes import (
-    CLOSER,
-    EVALUATE,
-    JUDGE,
-    LANES,
-    LENGTHS,
-    NEARER,
-    OWN_LANES,
-    REDUNDANT,
-    SERIES,
-    TAKE,
-    THERE,
-)
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points, highest power first: good to 2e-06
-# and 1e-07, for the lengths of steps
-LOG2 = (-0.02512320329, 0.2700374574, -1.247962495, 3.249466561, -5.301709109, 6.089895763, -3.03460285)
-EXP2 = (0.001340043216, 0.009676037098, 0.05550327214, 0.2402210736, 0.6931472067, 1.000000075)
-LARGEST_POWER, SMALLEST = 1000.0, 1e-300
 AT_ONCE = 8  # sums in one loop, in registers
-BUILD_SECONDS = 1e-3  # for a quantity, about
 LARGEST = 1500  # operations of a series, which take some seconds to compile
-
-i8 = types.int64
-LANE, MASK, WHOLE = (ir.VectorType(kind, LANES) for kind in (DOUBLE, ir.IntType(1), INTEGER))
-
-
-class LaneEmitter(Emitter):
-    """Appends operations on vectors of one number for each lane; places in memory are counted in such vectors."""
-
-    double, integer, bit = LANE, WHOLE, MASK
-    constants: Value  # where numbers stand that all lanes have in common
-
-    def splat(self, value: Value) -> Value:
-        """A number of all lanes."""
-        vector = self.builder.insert_element(ir.VectorType(value.type, LANES)(ir.Undefined), value, WORD(0))
-        zeros = ir.Constant(ir.VectorType(WORD, LANES), [0] * LANES)
-        return self.builder.shuffle_vector(vector, vector, zeros)
-
-    def known(self, number: float) -> Value:
-        """A number that is known, or read: of all lanes, or one for each."""
-        if not isinstance(number, Coefficient) or number.varies:
-            return super().known(number)
-        value = self.builder.load(self.builder.gep(self.constants, [INTEGER(number.place)], inbounds=True))
-        value.set_metadata("invariant.load", self.builder.module.add_metadata([]))
-        return self.splat(value)
-
-    def constant(self, value: float) -> Value:
-        """A number that stands in the code."""
-        return ir.Constant(LANE, [float(value)] * LANES)
-
-    def whole(self, value: int) -> Value:
-        """An integer that stands in the code, of those that go with numbers."""
-        return ir.Constant(WHOLE, [value] * LANES)
-
-    def number(self, integer: Value) -> Value:
-        """An integer as a number."""
-        return self.splat(self.builder.sitofp(integer, DOUBLE))
-
-    def pointer(self, base: Value, *places: Value | int) -> Value:
-        """A pointer some vectors further on."""
-        scaled = (
-            INTEGER(place * LANES) if isinstance(place, int) else self.builder.mul(place, INTEGER(LANES))
-            for place in places
-        )
-        for place in scaled:
-            base = self.builder.gep(base, [place], inbounds=True)
-        return base
-
-    def load(self, base: Value, place: int = 0) -> Value:
-        """The vector at a place."""
-        return self.builder.load(self.builder.bitcast(self.pointer(base, place), LANE.as_pointer()), align=8)
-
-    def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Put a vector at a place."""
-        self.builder.store(value, self.builder.bitcast(self.pointer(base, place), LANE.as_pointer()), align=8)
-
-    def fused(self, a: Value, b: Value, c: Value) -> Value:
-        """a b + c, rounded once."""
-        return self.builder.call(self._intrinsic("llvm.fma", 3), [a, b, c])
-
-    def function(self, name: str, x: Value) -> Value:
-        """A function of LLVM, of all lanes, or of libm, lane by lane."""
-        if name in INTRINSICS:
-            return self.builder.call(self._intrinsic(INTRINSICS[name], 1), [x])
-        made, one = LANE(ir.Undefined), Emitter(self.builder)
-        for lane in range(LANES):
-            value = one.function(name, self.builder.extract_element(x, WORD(lane)))
-            made = self.builder.insert_element(made, value, WORD(lane))
-        return made
-
-    def larger(self, a: Value, b: Value) -> Value:
-        """The larger of two numbers."""
-        return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
-
-    def smaller(self, a: Value, b: Value) -> Value:
-        """The smaller of two numbers."""
-        return self.builder.select(self.builder.fcmp_ordered("<", a, b), a, b)
-
-    def logarithm(self, x: Value) -> Value:
-        """log2 x to a hundredth of a per cent of 1, of positive numbers."""
-        builder = self.builder
-        bits = builder.bitcast(x, WHOLE)
-        exponent = builder.sub(builder.lshr(bits, self.whole(52)), self.whole(1023))
-        rest = builder.or_(builder.and_(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
-        return self.add(builder.sitofp(exponent, LANE), self._polynomial(LOG2, builder.bitcast(rest, LANE)))
-
-    def exponential(self, x: Value) -> Value:
-        """2^x to a hundredth of a per cent."""
-        builder = self.builder
-        x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
-        whole = self.function("rint", x)
-        bits = builder.shl(builder.add(builder.fptosi(whole, WHOLE), self.whole(1023)), self.whole(52))
-        return self.multiply(builder.bitcast(bits, LANE), self._polynomial(EXP2, self.subtract(x, whole)))
-
-    def _polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        total = self.constant(coefficients[0])
-        for coefficient in coefficients[1:]:
-            total = self.fused(total, x, self.constant(coefficient))
-        return total
-
-    def largest_of(self, a: Value, b: Value) -> Value:
-        """The larger of two numbers; the first where it is NaN, which stays."""
-        return self.builder.select(self.builder.fcmp_unordered(">", a, b), a, b)
-
-    def _intrinsic(self, name: str, n: int) -> Value:
-        module, full = self.builder.module, f"{name}.v{LANES}f64"
-        return module.globals.get(full) or ir.Function(module, ir.FunctionType(LANE, [LANE] * n), full)
 
 
 class Operation(NamedTuple):
@@ -196,7 +65,7 @@ class LaneCode:
         program = series_program(system, parameters)
         if program.n_operations > LARGEST:
             raise Untraceable(f"its series takes more than {LARGEST} operations")
-        self._slots: dict[Any, int] = {}
+        self.slots: dict[Any, int] = {}
         self._divisors: dict[int, int] = {}
         self.first = 1 + 3 * self.n + self.n_rows
         self.early = self._operations(program.early, self.first)
@@ -205,7 +74,8 @@ class LaneCode:
             self._rows(program.rows, program.row_places),
             self._rows(program.balance, program.balance_places),
         )
-        self._carried = self._shared_sums()
+        self._carried: dict[int, tuple[int, int]] = {}  # see _shared_sums
+        self._carried |= self._shared_sums()
         self.sums_ahead = sorted(set(self._carried.values()))
         for operation in (*self.early, *self.late):
             self._factors(operation)
@@ -216,7 +86,7 @@ class LaneCode:
         self.divisors = self.c + self.n_rows
         self.carried = self.divisors + len(self._divisors)
         self.table = self.carried + len(self.sums_ahead)
-        self.width = len(self._slots)
+        self.width = len(self.slots)
         self.structure = self._structure(program)
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearer, equations.redundant, self.solution.kept]
@@ -229,7 +99,7 @@ class LaneCode:
 
     def _structure(self, program: SeriesProgram) -> str:
         equations, numbers = self.equations, self.numbers
-        told: list[Any] = [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self._slots]
+        told: list[Any] = [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.slots]
         for outputs in (equations.there, equations.closer, equations.nearer, equations.redundant, self.solution.kept):
             if outputs is not None:
                 told += [{name: len(forms) for name, forms in outputs.arrays.items()}, len(outputs.conditions)]
@@ -262,7 +132,7 @@ class LaneCode:
 
     def _slot(self, *key: Any) -> int:
         """The place in a row of a factor: a form, or ("scaled", form), which is multiplied by its order."""
-        return self._slots.setdefault(key, len(self._slots))
+        return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
         """Pairs of factors of sines by the result of a product of a cosine, or a sine, and the rate of its angle.
@@ -284,7 +154,7 @@ class LaneCode:
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
         """Places of the factors X and Y of the products that are summed up for each result."""
         kind, results, first, second = operation
-        if results[0] in getattr(self, "_carried", ()):
+        if results[0] in self._carried:
             return []
         own = [self._slot(((result, 1.0),), 0.0) for result in results]
         if kind in (PRODUCT, PENDING):
@@ -348,7 +218,7 @@ class LaneCode:
                 largest = emit.larger(emit.multiply(size, emit.larger(of_q, emit.multiply(factor, of_v))), largest)
             found.append(largest)
         logarithms = [
-            emit.divide(emit.logarithm(emit.larger(value, emit.constant(SMALLEST))), emit.number(power))
+            emit.divide(emit.logarithm(value), emit.number(power))
             for value, power in zip(found, (order, builder.sub(order, INTEGER(1))), strict=True)
         ]
         emit.store(emit.exponential(emit.negative(emit.larger(*logarithms))), room, lanes.LENGTH)
@@ -659,7 +529,7 @@ class _Row:
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
         """Put a factor in its place; "if used": it may have none."""
-        place = self.code._slots.get(tuple(key)) if when else self.code._slots[tuple(key)]
+        place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
         if place is not None and place not in self.stored and value is not None:
             self.stored.add(place)
             self.emit.store(value, self.base, place)
@@ -675,105 +545,3 @@ def _store_mask(emit: LaneEmitter, room: Value, mask: Value) -> None:
 
 def _keep_fine(emit: LaneEmitter, room: Value, holds: Value) -> None:
     _store_mask(emit, room, emit.builder.and_(_chosen(emit, room), holds))
-
-
-_COMPILED = Newest()
-
-
-class OwnLanes:
-    """Machine code of a mechanism for lanes, and the numbers that it reads for any parameters.
-
-    Parameters
-    ----------
-    system : ConstrainedSystem
-    choice : Choice
-    values, varying
-        Of a `Record`: generic parameters, and which of them differ from run to run.
-
-    Raises
-    ------
-    Untraceable
-        Saying why the equations cannot be had.
-    """
-
-    def __init__(self, system: ConstrainedSystem, choice: Choice, values: Array, varying: Sequence[int]):
-        if system.n_a > 0:
-            raise Untraceable("it has nonholonomic rows")
-        self.record = Record(values.tolist(), varying)
-        self.code = LaneCode(system, choice, self.record.parameters)
-        self._function: Dispatcher | None = _COMPILED.get(self.code.structure)
-
-    @property
-    def function(self) -> Dispatcher:
-        """The code, compiled when it is first asked for."""
-        if self._function is None:
-            self._function = _COMPILED[self.code.structure] = compile_kept(*_source(self.code), **_options())
-        return self._function
-
-    @property
-    def seconds_to_build(self) -> float:
-        """About what the code takes to compile, s; 0 where it is there or on the disk."""
-        if self._function is not None or is_kept(*_source(self.code), **_options()):
-            return 0.0
-        return BUILD_SECONDS * self.code.n_quantities
-
-    def numbers(self, parameters: Array) -> Array:
-        """What the code reads for parameters (n_runs, n_p)."""
-        return self.code.numbers.for_parameters(self.record, parameters)
-
-
-def _source(code: LaneCode) -> tuple[Any, ...]:
-    """What `compile_kept` takes."""
-    tasks = (
-        code.series,
-        code.lengths,
-        code.evaluate,
-        code.closer,
-        code.nearer,
-        code.there,
-        code.redundant,
-        code.judge,
-        code.take,
-    )
-    given: dict[str, Any] = {"order": i8, "control": VECTOR, "room": VECTOR}
-    series_, lengths, evaluate, closer, nearer, there, redundant, judge, take = (
-        emitted(task, types.none, emitter=LaneEmitter, **given) for task in tasks
-    )
-
-    def own(task, order, control, room):  # type: ignore[no-untyped-def]
-        if task == SERIES:
-            series_(order, control, room)
-        elif task == LENGTHS:
-            lengths(order, control, room)
-        elif task == EVALUATE:
-            evaluate(order, control, room)
-        elif task == CLOSER:
-            closer(order, control, room)
-        elif task == NEARER:
-            nearer(order, control, room)
-        elif task == THERE:
-            there(order, control, room)
-        elif task == REDUNDANT:
-            redundant(order, control, room)
-        elif task == JUDGE:
-            judge(order, control, room)
-        elif task == TAKE:
-            take(order, control, room)
-
-    return own, OWN_LANES, (_stamp(), code.structure)
-
-
-def _options() -> dict[str, Any]:
-    from twoloop.kernels.compile.linking import KernelCompiler
-    from twoloop.kernels.data import common
-
-    return {"folder": sources_folder(), "pipeline_class": KernelCompiler, **common.OPTIONS}
-
-
-def _stamp() -> str:
-    """A digest of what writes the code."""
-    digest = hashlib.sha256()
-    for module in (series, straight_line, straight_code, coefficients, llvm_code, llvm_trigonometry):
-        digest.update(Path(str(module.__file__)).read_bytes())
-    digest.update(Path(__file__).read_bytes())
-    return digest.hexdigest()
