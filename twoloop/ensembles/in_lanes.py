@@ -47,11 +47,16 @@ class LaneRuns:
     def off(self) -> tuple[Array, Array]:
         """max|C| and max|C_q v + C_t| of the starts, over what rounding may leave of their terms."""
         starts, equations = self.starts, self.own.code.equations.equations
-        arrays = OnArrays(equations.graph, self.own.record, starts.parameters)
         kinds = [equations.of(kind) for kind in ("constraint", "jacobian", "constraint_rate")]
-        C, G, rate = arrays.evaluate(kinds, starts.t0, starts.q, starts.v)
-        faster = np.einsum("rij,rj->ri", G, starts.v) + rate
-        return over_rounding(C, G, starts.q), over_rounding(faster, G, starts.v, rate)
+        off = np.empty((2, len(starts.q)))
+        for begin in range(0, len(starts.q), LARGEST):
+            rows = slice(begin, begin + LARGEST)
+            q, v = starts.q[rows], starts.v[rows]
+            arrays = OnArrays(equations.graph, self.own.record, starts.parameters[rows])
+            C, G, rate = arrays.evaluate(kinds, starts.t0, q, v)
+            faster = np.einsum("rij,rj->ri", G, v) + rate
+            off[:, rows] = over_rounding(C, G, q), over_rounding(faster, G, v, rate)
+        return off[0], off[1]
 
     def make(
         self, t1: float, times: Array, rtol: float, atol: Array, threads: int, out_q: Array, out_v: Array
