@@ -221,6 +221,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")
     }
     geometry = rows[rows["group"] == GEOMETRY]
+    refused = rows[rows["message"].notna()] if "message" in rows else rows[:0]
+    found["refused"] = refused[["way", "case", "message"]].to_dict("records")
     found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
     return found
 
@@ -230,7 +232,7 @@ def figure_of(rows: pd.DataFrame) -> Figure:
     made = rows[(rows["group"] == GROUP) & rows["tol"].notna() & (rows["n_failed"] == 0)]
     cases = list(dict.fromkeys(made["case"]))
     width = 3.4 * len(cases) + 1.2
-    figure, panels = plt.subplots(1, len(cases), figsize=(width, 3.6), layout="constrained", squeeze=False)
+    figure, panels = plt.subplots(1, len(cases), figsize=(width, 3.9), layout="constrained", squeeze=False)
     colors = dict(zip((ENSEMBLE, SINGLE, HEYOKA, DIFFRAX), (figures.BLUE, figures.RED, "black", "gray"), strict=True))
     for axes, case in zip(panels[0], cases, strict=True):
         for way, own in made[made["case"] == case].groupby("way", sort=False):
@@ -240,7 +242,8 @@ def figure_of(rows: pd.DataFrame) -> Figure:
         axes.invert_xaxis()
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of a run (µs)")
-    panels[0][-1].legend(fontsize=8)
+    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize=9, frameon=False)
     return figure
 
 
@@ -253,11 +256,14 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     for each in found["cases"]:
         for way in (ENSEMBLE, SINGLE, HEYOKA, DIFFRAX):
             cells = [number(1e6 * at["run_s"][way]) if way in at["run_s"] else "–" for at in each["at"]]
-            lines.append([each["case"], way, *cells])
+            lines += [[each["case"], way, *cells]] if any(way in at["run_s"] for at in each["at"]) else []
     ready = {"ways": table(["runs of", "way", *(power(error) for error in ERRORS)], lines)}
     columns = ["runs", "wall-clock time (s)", "CPU time (s)", "failed", "made singly"]
     fields = ("n_runs", "wall", "cpu", "n_failed", "n_singly")
-    geometry = [[number(each[name]) for name in fields] for each in found["geometry"]]
+    geometry = [
+        [number(each[name]) if name in ("wall", "cpu") else f"{each[name]:,.0f}" for name in fields]
+        for each in found["geometry"]
+    ]
     ready["geometry"] = table(columns, geometry)
     output.write("ensembles.md", render("ensembles", found, ready, stamp=line, quick=output.call.quick))
 

@@ -79,4 +79,6 @@ def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:
             raise ValueError(f"problems must have the callbacks of the first, {first.name!r}; given {problem.name!r}")
     states = np.array([np.concatenate([problem.q0, problem.v0]) for problem in problems])
     parameters = np.array([problem.system.functions.p for problem in problems])
-    return Expressions(first.system, 0.0, first.q0, first.v0, of_parameters=True), states, parameters
+    vary = bool((parameters != parameters[0]).any())  # else they are numbers in the expressions
+    equations = Expressions(first.system, 0.0, first.q0, first.v0, of_parameters=vary)
+    return equations, states, parameters if vary else parameters[:, :0]

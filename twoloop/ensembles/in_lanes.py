@@ -2,6 +2,7 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +42,9 @@ class LaneRuns:
         self.system, self.starts = system, starts
         generic, varying = generic_parameters(starts.parameters)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        key = ("lanes", choice, generic.tobytes(), tuple(varying))
-        self.own: OwnLanes = system.remembered(key, lambda: OwnLanes(system, choice, generic, varying))
+        kind = ("lanes", choice, tuple(varying))  # of which the latest is kept
+        make = partial(OwnLanes, system, choice, generic, varying)
+        self.own: OwnLanes = system.remembered_at(kind, 0.0, (generic,), make)
 
     def off(self) -> tuple[Array, Array]:
         """max|C| and max|C_q v + C_t| of the starts, over what rounding may leave of their terms."""
