@@ -29,7 +29,8 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
         rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
     made = found.get("work_precision", {})
-    return rows + _of_kinds(made.get("rivals", {}).get("mechanisms", [])) + _often(made.get("first_calls", []))
+    rows += _of_kinds(made.get("rivals", {}).get("mechanisms", [])) + _often(made.get("first_calls", []))
+    return rows + _at_once(found.get("ensembles", {}).get("cases", []))
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
@@ -102,6 +103,17 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     if len(parts) > 1:
         parts[1] = f"of ours {parts[1]}"
     return [{"what": "run many times", "take": "; ".join(parts) + " (at one tolerance)"}] if parts else []
+
+
+def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Who is the cheapest at most errors where many runs are one call, by mechanism."""
+    by_way: dict[str, list[str]] = {}
+    for each in cases:
+        won = Counter(min(at["run_s"], key=at["run_s"].get) for at in each["at"] if at["run_s"])
+        if won:
+            by_way.setdefault(won.most_common(1)[0][0], []).append(each["case"])
+    parts = [f"`{way}` on {listed(names)}" for way, names in sorted(by_way.items(), key=lambda item: -len(item[1]))]
+    return [{"what": "run thousands of times in one call", "take": "; ".join(parts)}] if parts else []
 
 
 def _from_run(line: Mapping[str, Any]) -> str:

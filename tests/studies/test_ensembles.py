@@ -6,6 +6,7 @@ import pytest
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
 from studies import ensembles
+from studies.bench import takes
 from studies.bench.cli import StudyError
 from studies.bench.render import render
 from studies.ensembles import DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, SINGLE, TOLERANCES
@@ -83,6 +84,12 @@ def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():
     )
     at = {line["error"]: line for line in found["cases"][0]["at"]}
     assert at[1e-6]["verdict"] == "ahead" and at[1e-6]["ratio"] == pytest.approx(4.0, rel=1e-6)
+
+
+def test_the_first_screen_says_who_is_the_cheapest():
+    for times, way in (({ENSEMBLE: 0.01, HEYOKA: 0.05}, ENSEMBLE), ({ENSEMBLE: 0.05, HEYOKA: 0.01}, HEYOKA)):
+        (line,) = takes.takes({"ensembles": ensembles.findings_of(rows(**times))}, [])
+        assert line == {"what": "run thousands of times in one call", "take": f"`{way}` on linkages"}
 
 
 def test_a_way_with_failed_runs_is_not_the_cheapest():
