@@ -221,8 +221,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")
     }
     geometry = rows[rows["group"] == GEOMETRY]
-    refused = rows[rows["message"].notna()] if "message" in rows else rows[:0]
-    found["refused"] = refused[["way", "case", "message"]].to_dict("records")
+    refused = rows.reindex(columns=["way", "case", "message"]).dropna()
+    found["refused"] = refused.to_dict("records")
     found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
     return found
 
