@@ -74,7 +74,7 @@ def test_sentences_follow_the_rows():
     assert "`twoloop.ensemble` takes the least time: the best of the others takes 5.0 to 5.0 times as long." in text
     text = said({ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05})
     assert f"ahead of the best of the others in 0 and behind in {len(ERRORS)} of {len(ERRORS)} pairs" in text
-    assert "10000 four-bar linkages" in text and "none failed" in text
+    assert "10,000 four-bar linkages" in text and "none failed" in text
 
 
 def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():
