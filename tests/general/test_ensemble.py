@@ -151,6 +151,14 @@ def test_what_cannot_go_in_lanes_says_why(made):
     assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()
 
 
+def test_lanes_that_do_not_end_where_the_first_run_does_are_not_believed(made, monkeypatch):
+    monkeypatch.setattr("twoloop.ensembles.ensemble.FAR", 1e-6)
+    system, q, v, parameters, *_, runs = made
+    other = ensemble(system, SPAN, q[:9], v[:9], parameters=parameters[:9], t_eval=runs.t)
+    assert other.singly.all() and "the first run ends elsewhere by itself" in other.message
+    assert np.abs(other.q - runs.q[:9]).max() < 1e-6
+
+
 def test_a_few_runs_do_not_wait_for_a_compiler(made, monkeypatch):
     monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 0.0)
     monkeypatch.setattr("twoloop.generate.own_lanes.OwnLanes.seconds_to_build", 10.0)

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 IN_LANES = ("auto", "Taylor")  # methods that go in lanes
 NEAR = 1e4  # times rounding of its terms: an equation of a start that needs no closer look
+FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
 
@@ -127,7 +128,13 @@ def _in_lanes(
     threads: int,
     out: tuple[Array, Array, Any],
 ) -> NDArray[np.bool_]:
-    """Which runs were made in lanes; the first is there already, and tells whether lanes agree with it."""
+    """Which runs were made in lanes; the first is there already, made singly, and has to end where lanes have it.
+
+    Raises
+    ------
+    Untraceable
+        If it does not.
+    """
     q, v, n_steps = out
     system, starts = lanes.system, lanes.starts
     for name, off in zip(("q0", "v0"), lanes.off(), strict=True):
@@ -141,6 +148,9 @@ def _in_lanes(
     fine = (made == 1) & np.isfinite(new_q).all(axis=(1, 2))
     last = np.ascontiguousarray(new_q[:, :, -1]), np.ascontiguousarray(new_v[:, :, -1])
     fine[lanes.disagree(t1, float(atol.min()), fine, *last, at_end)] = False
+    allowed = FAR * (atol + rtol * np.abs(q[0, :, -1]))
+    if fine[0] and times[-1] == t1 and (np.abs(last[0][0] - q[0, :, -1]) > allowed).any():
+        raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
     fine[0] = False
     n = len(within)
     q[fine, :, len(times) - n :], v[fine, :, len(times) - n :] = new_q[fine, :, :n], new_v[fine, :, :n]
