@@ -87,10 +87,12 @@ def stamp(command: str) -> str:
             versions.append(f"{package} (not installed)")
     machine = f"{processor()}, {os.cpu_count()} cores"
     system = f"{platform.system()}, Python {platform.python_version()}"
-    return "; ".join([f"`{command}`", date.today().isoformat(), f"commit {_commit()}", machine, system, *versions])
+    return "; ".join([f"`{command}`", date.today().isoformat(), f"commit {commit()}", machine, system, *versions])
 
 
-def _commit() -> str:
+def commit() -> str:
+    """The commit of this checkout, and whether it has changes."""
+
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 

@@ -30,7 +30,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Output, Row
 from studies.compare import GROUP, runs_of
-from studies.work_precision import first_calls, goals, minimal, processors, rivals, scaling
+from studies.work_precision import again, first_calls, goals, minimal, processors, rivals, scaling
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
@@ -134,6 +134,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"fitted": scaling.FITTED, "rigid": scaling.RIGID}
     findings |= {"first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
     in_angles = part(rows, minimal.GROUP)
+    findings["measured"] = again.findings_of(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)

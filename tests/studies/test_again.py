@@ -1,0 +1,51 @@
+"""Parts of work_precision that are measured again take the place of their rows, with commit and processor."""
+
+import pandas as pd
+import pytest
+
+from studies.bench import cli
+from studies.bench.cli import StudyError
+from studies.bench.store import Output
+from studies.work_precision import again, first_calls, rivals
+
+
+def rows(*lines):
+    return pd.DataFrame([dict(zip(("group", "case", "call_s", "processor"), line, strict=True)) for line in lines])
+
+
+KEPT = rows(
+    (rivals.GROUP, "four-bar", 1.0, "old"),
+    (rivals.GROUP, "double pendulum", 2.0, "old"),
+    (first_calls.GROUP, "four-bar", 3.0, "old"),
+    ("compare", "four-bar", 4.0, "old"),
+)
+
+
+def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
+    new = rows((rivals.GROUP, "four-bar", 9.0, "new")).assign(commit="abc")
+    made = again.replaced(KEPT, "four-bar", new)
+    assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
+    assert again.findings_of(made) == [
+        {"processor": "old", "commit": "", "n": 1},
+        {"processor": "new", "commit": "abc", "n": 1},
+    ]
+    calls = again.replaced(KEPT, again.FIRST_CALLS, rows((first_calls.GROUP, "four-bar", 8.0, "new")))
+    assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
+
+
+def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
+    (tmp_path / "work_precision.csv").write_text(f"# full work_precision; stamp\n{KEPT.to_csv(index=False)}")
+    call = cli.parse("work_precision", None, ["--out", str(tmp_path)])
+    monkeypatch.setattr(again.cli, "parse", lambda *_: call)
+    monkeypatch.setattr(again, "measured", lambda name, kept: rows((rivals.GROUP, name, 9.0, "")))
+    again.main(["double pendulum"])
+    with Output(call) as output:
+        made, line = output.load_rows()
+    assert line == "stamp" and made["call_s"].tolist() == [1.0, 3.0, 4.0, 9.0]
+    assert made["processor"].tolist()[-1] == cli.processor() and made["commit"].tolist()[-1] == cli.commit()
+
+
+@pytest.mark.parametrize("words", [[], ["five-bar"]])
+def test_parts_are_named(words):
+    with pytest.raises(StudyError, match=r"parts are four-bar, four-bar, second, .*first calls"):
+        again.main(words)
