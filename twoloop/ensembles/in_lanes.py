@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 PLACES = 100  # of a run, at least as many at which the equations are looked at
-SMALLEST, LARGEST = 64, 4096  # runs of a block; numbers of all of a block's runs are made at once
-FOR_EACH = 4  # blocks for each thread, so that all end at about the same time
+SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
+FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
 SAMPLE = 64  # runs that are compared where callbacks are called in Python
 
@@ -67,7 +67,8 @@ class LaneRuns:
         n_runs = len(self.starts.q)
         status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
-        size = int(np.clip(n_runs // (FOR_EACH * threads), SMALLEST, LARGEST))
+        n_blocks = 1 if threads == 1 else FOR_EACH * threads
+        size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
         blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
 
         def block(rows: slice) -> None:
