@@ -1,4 +1,4 @@
-"""Measure single mechanisms, or the first calls, again: `python -m studies.work_precision.again NAME ...`.
+"""Measure single mechanisms, or other parts, again: `python -m studies.work_precision.again NAME ...`.
 
 The whole study takes hours. Each part that this has measured takes the place of its rows in work_precision.csv at once,
 with the commit and the processor that it was made on; `python -m studies.work_precision --redraw` then writes the
@@ -13,27 +13,28 @@ import pandas as pd
 from studies.bench import cli
 from studies.bench.cli import StudyError
 from studies.bench.store import KeptRows, Output
-from studies.work_precision import first_calls, rivals
+from studies.work_precision import first_calls, minimal, rivals
 
 FIRST_CALLS = "first calls"
+WHOLE = {FIRST_CALLS: first_calls, minimal.GROUP: minimal}  # parts that are groups of rows
 
 
 def parts() -> list[str]:
     """Names of what can be measured again."""
-    return [*rivals.problems(False), FIRST_CALLS]
+    return [*rivals.problems(False), *WHOLE]
 
 
 def measured(name: str, kept: KeptRows) -> pd.DataFrame:
     """The rows of one part."""
-    if name == FIRST_CALLS:
-        return first_calls.collect(kept, False)
+    if name in WHOLE:
+        return WHOLE[name].collect(kept, False)
     return rivals.collect([run for run in rivals.runs(False) if run.case.name == name], kept)
 
 
 def replaced(rows: pd.DataFrame, name: str, new: pd.DataFrame) -> pd.DataFrame:
     """All rows with those of one part in the place of what stood there."""
-    group = rows["group"] == (first_calls.GROUP if name == FIRST_CALLS else rivals.GROUP)
-    old = group if name == FIRST_CALLS else group & (rows["case"] == name)
+    group = rows["group"] == (WHOLE[name] if name in WHOLE else rivals).GROUP
+    old = group if name in WHOLE else group & (rows["case"] == name)
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)
 

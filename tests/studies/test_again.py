@@ -47,5 +47,5 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("words", [[], ["five-bar"]])
 def test_parts_are_named(words):
-    with pytest.raises(StudyError, match=r"parts are four-bar, four-bar, second, .*first calls"):
+    with pytest.raises(StudyError, match=r"parts are four-bar, four-bar, second, .*first calls, minimal coordinates"):
         again.main(words)
