@@ -33,7 +33,7 @@ def measured(name: str, kept: KeptRows) -> pd.DataFrame:
 
 def replaced(rows: pd.DataFrame, name: str, new: pd.DataFrame) -> pd.DataFrame:
     """All rows with those of one part in the place of what stood there."""
-    group = rows["group"] == (WHOLE[name] if name in WHOLE else rivals).GROUP
+    group = rows["group"] == WHOLE.get(name, rivals).GROUP
     old = group if name in WHOLE else group & (rows["case"] == name)
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)

@@ -123,6 +123,14 @@ def versions() -> dict[str, str]:
     return found
 
 
+def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
+    """The rows of mechanisms that were measured on the processor on which the others were."""
+    if "processor" not in rows or "processor" not in others:
+        return rows
+    made_on = others.groupby("case")["processor"].first()
+    return rows[rows["processor"] == rows["case"].map(made_on)]
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report; the findings."""
     everywhere = tables.medians(part(rows, rivals.GROUP))
@@ -133,7 +141,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
     findings |= {"fitted": scaling.FITTED, "rigid": scaling.RIGID}
     findings |= {"first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
-    in_angles = part(rows, minimal.GROUP)
+    in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
     findings["measured"] = again.findings_of(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)

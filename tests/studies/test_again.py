@@ -6,7 +6,7 @@ import pytest
 from studies.bench import cli
 from studies.bench.cli import StudyError
 from studies.bench.store import Output
-from studies.work_precision import again, first_calls, rivals
+from studies.work_precision import again, first_calls, rivals, study
 
 
 def rows(*lines):
@@ -49,3 +49,9 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
 def test_parts_are_named(words):
     with pytest.raises(StudyError, match=r"parts are four-bar, four-bar, second, .*first calls, minimal coordinates"):
         again.main(words)
+
+
+def test_only_what_ran_on_one_processor_is_compared():
+    own = rows(("m", "four-bar", 1.0, "old"), ("m", "double pendulum", 2.0, "new"))
+    others = rows((rivals.GROUP, "four-bar", 1.0, "new"), (rivals.GROUP, "double pendulum", 2.0, "new"))
+    assert study.on_the_same_processor(own, others)["call_s"].tolist() == [2.0]
