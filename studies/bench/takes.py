@@ -29,8 +29,9 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
         rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
     made = found.get("work_precision", {})
-    rows += _of_kinds(made.get("rivals", {}).get("mechanisms", [])) + _often(made.get("first_calls", []))
-    return rows + _at_once(found.get("ensembles", {}).get("cases", []))
+    often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
+    rows += _of_kinds(made.get("rivals", {}).get("mechanisms", []))
+    return rows + ([{"what": "run many times", "take": "; ".join(often)}] if often else [])
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
@@ -94,7 +95,7 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
     return solver if 2 * n > won.total() else ""
 
 
-def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
     """From which run on code for the mechanism pays, by the first calls, where it does."""
     paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
     sides = ([line for line in paying if line["solver"].endswith(", compiled") is ours] for ours in (False, True))
@@ -102,10 +103,10 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     parts = [f"{call(line['solver'])}, which pays {_from_run(line)}" for line in best if line is not None]
     if len(parts) > 1:
         parts[1] = f"of ours {parts[1]}"
-    return [{"what": "run many times", "take": "; ".join(parts) + " (at one tolerance)"}] if parts else []
+    return ["; ".join(parts) + " (at one tolerance)"] if parts else []
 
 
-def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:
     """Who is the cheapest at most errors where many runs are one call, by mechanism."""
     by_way: dict[str, list[str]] = {}
     for each in cases:
@@ -113,7 +114,7 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         if won:
             by_way.setdefault(won.most_common(1)[0][0], []).append(each["case"])
     parts = [f"`{way}` on {listed(names)}" for way, names in sorted(by_way.items(), key=lambda item: -len(item[1]))]
-    return [{"what": "run thousands of times in one call", "take": "; ".join(parts)}] if parts else []
+    return [f"in one call {', '.join(parts)}"] if parts else []
 
 
 def _from_run(line: Mapping[str, Any]) -> str:

@@ -89,7 +89,7 @@ def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():
 def test_the_first_screen_says_who_is_the_cheapest():
     for times, way in (({ENSEMBLE: 0.01, HEYOKA: 0.05}, ENSEMBLE), ({ENSEMBLE: 0.05, HEYOKA: 0.01}, HEYOKA)):
         (line,) = takes.takes({"ensembles": ensembles.findings_of(rows(**times))}, [])
-        assert line == {"what": "run thousands of times in one call", "take": f"`{way}` on linkages"}
+        assert line == {"what": "run many times", "take": f"in one call `{way}` on linkages"}
 
 
 def test_a_way_with_failed_runs_is_not_the_cheapest():

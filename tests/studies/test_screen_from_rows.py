@@ -10,7 +10,14 @@ from studies.bench import figures, index
 from studies.bench.cli import REPORTS, ROOT
 from tests.studies.test_first_screen import differing
 
-TOLD = ("work_precision", "table3", "honesty", "robustness", "energy")  # of these the screen says something
+TOLD = (
+    "work_precision",
+    "table3",
+    "honesty",
+    "robustness",
+    "energy",
+    "ensembles",
+)  # of these the screen says something
 
 
 def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, monkeypatch):
