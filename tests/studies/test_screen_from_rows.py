@@ -17,7 +17,7 @@ TOLD = (
     "robustness",
     "energy",
     "ensembles",
-)  # of these the screen says something
+)  # which it quotes
 
 
 def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, monkeypatch):
