@@ -53,6 +53,22 @@ def test_callbacks_that_cannot_be_traced_go_one_by_one():
     assert np.abs(np.linalg.norm(made, axis=1) - parameters[:, 0]).max() < 1e-12
 
 
+def test_velocities_that_the_callbacks_deny_are_found_again_one_by_one():
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.zeros(2),
+        constraint=lambda t, q, p: np.array([q[0] - p[0] * t]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0]]),
+        constraint_rate=lambda t, q, p: np.array([-float(p[0])]),  # which symbols do not see
+        parameters=[1.0],
+    )
+    parameters = np.array([[1.0], [2.0], [3.0]])
+    q, v = consistent_states(system, 0.5, [0.4, 0.0], [0.0, 1.0], parameters=parameters)
+    assert np.abs(q[:, 0] - 0.5 * parameters[:, 0]).max() < 1e-14 and np.abs(v[:, 0] - parameters[:, 0]).max() < 1e-14
+
+
 def test_a_guess_that_is_too_far_is_named():
     problem = mechanisms.four_bar()
     q, v = guesses(problem, 3)

@@ -134,6 +134,30 @@ def test_what_lanes_cannot_see_is_found_and_made_singly(force, compiled):
         assert np.abs(runs.q[run, :, -1] - known.q[:, -1]).max() < 1e-6
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_one_run_of_many_that_is_unlike_the_others_is_found(compiled):
+    """A branch on a parameter that only one run takes, and a parameter that only one run has otherwise."""
+    n_runs, one = 150, 77
+    _, q, v, parameters = pendulums(n_runs)
+    parameters[:, 0], parameters[:, 2] = 1.0, 9.0
+    parameters[one] = 2.0, parameters[one, 1], 20.0
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v, p: np.array([p[0] - 3.0, -p[2] if p[2] < 15.0 else -3.0]),
+        constraint=lambda t, q, p: np.array([0.5 * (q @ q - p[1] ** 2)]),
+        parameters=parameters[0],  # and no jacobian: it is derived
+        compile=compiled,
+    )
+    runs = ensemble(system, (0.0, 0.5), q, v, parameters=parameters)
+    assert np.flatnonzero(runs.singly).tolist() == [0, one]
+    for run in (5, one):
+        own = system.with_parameters(parameters[run])
+        known = solve_dae(own, (0.0, 0.5), q[run], v[run], method="DOP853", rtol=1e-10, atol=1e-10)
+        assert np.abs(runs.q[run, :, -1] - known.q[:, -1]).max() < 1e-6
+
+
 def test_what_cannot_go_in_lanes_says_why(made):
     system, q, v, parameters, *_ = made
     knife = mechanisms.knife_edge()

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import check_finite, check_indices
 from twoloop.ensembles.starts import (
     AT_ROUNDING,
+    NEAR,
     Starts,
     all_starts,
     generic_parameters,
@@ -45,8 +46,8 @@ def consistent_states(
     """Project many guesses onto the constraints, each by the least change, as `consistent_state` does with one.
 
     Guesses that are near the constraints are moved together, by Gauss-Newton on the equations that the callbacks were
-    traced to; each result is compared with what the callbacks themselves say. The others, and systems whose callbacks
-    cannot be traced, go through `consistent_state` one by one.
+    traced to; each result is compared with what the callbacks themselves say. The others, and systems with nonholonomic
+    rows or whose callbacks cannot be traced, go through `consistent_state` one by one.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ def consistent_states(
             made_q[rows], made_v[rows], fine[rows] = _together(system, part, kept)
         except Untraceable:
             break
-    fine &= _off(system, starts, made_q) <= AT_ROUNDING * np.finfo(float).eps
+    fine &= _off(system, starts, made_q, made_v) <= NEAR * np.finfo(float).eps
     for run in np.flatnonzero(~fine).tolist():
         try:
             found = consistent_state(system_of(system, starts, run), t, starts.q[run], starts.v[run], keep=keep)
@@ -92,12 +93,12 @@ def consistent_states(
     return made_q, made_v
 
 
-def _off(system: ConstrainedSystem, starts: Starts, q: Array) -> Array:
-    """What the callbacks say of positions: the largest |C| over its terms."""
+def _off(system: ConstrainedSystem, starts: Starts, q: Array, v: Array) -> Array:
+    """What the callbacks say of states: the largest |C| and |C_q v + C_t| over what their terms come to."""
     from twoloop.kernels.agreement import violation
 
-    worst = np.zeros(len(q))
-    violation(*kit_to_write(system), starts.t0, starts.parameters, q, np.zeros(system.n_c * (system.n_q + 1)), worst)
+    room, worst = np.zeros(system.n_c * (system.n_q + 2)), np.zeros(len(q))
+    violation(*kit_to_write(system), starts.t0, starts.parameters, q, v, room, worst)
     return worst
 
 
@@ -107,7 +108,7 @@ def _together(system: ConstrainedSystem, starts: Starts, kept: list[int]) -> tup
     q, fine = equations.gauss_newton(starts.q)
     fine &= equations.on_one_assembly(q, q - starts.q)
     v = starts.v.copy()
-    G, rate = equations.of("rows", q), equations.of("rates", q)
+    G, rate = equations.of("jacobian", q), equations.of("constraint_rate", q)
     for _ in range(2):  # once more for what rounding of a large change leaves
         v[:, equations.free] += _least_change(G[:, :, equations.free], -(np.einsum("rij,rj->ri", G, v) + rate))
     return q, v, fine & np.isfinite(v).all(axis=1)
@@ -117,14 +118,15 @@ class _Rows:
     """The constraints of guesses, and their derivatives by coordinates that may move."""
 
     def __init__(self, system: ConstrainedSystem, starts: Starts, free: list[int]):
+        if system.n_a > 0:
+            raise Untraceable("it has nonholonomic rows")
         generic, varying = generic_parameters(starts.parameters)
         record = Record(generic.tolist(), varying)
         equations = Equations(system, record.parameters)
         self._forms = {
             "constraint": equations.of("constraint"),
             "jacobian": equations.of("jacobian"),
-            "rows": np.vstack([equations.of("jacobian"), equations.of("nonholonomic")]),
-            "rates": np.concatenate([equations.of("constraint_rate"), equations.of("nonholonomic_rate")]),
+            "constraint_rate": equations.of("constraint_rate"),
         }
         self._arrays = OnArrays(equations.graph, record, starts.parameters)
         self.t, self.v, self.free = starts.t0, starts.v, free

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
 from twoloop.ensembles.in_lanes import LaneRuns, threads_of
 from twoloop.ensembles.runs import Runs
-from twoloop.ensembles.starts import Starts, all_starts, system_of
+from twoloop.ensembles.starts import NEAR, Starts, all_starts, system_of
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
@@ -19,7 +19,6 @@ from twoloop.solve import check_method, solve_dae
 Array = NDArray[np.float64]
 
 IN_LANES = ("auto", "Taylor")  # methods that go in lanes
-NEAR = 1e4  # times rounding of its terms: an equation of a start that needs no closer look
 FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
@@ -46,7 +45,7 @@ def ensemble(
     parameters go through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run:
     a run that comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other
     methods. The first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of
-    each other run is compared with what was found there (of 64 runs where callbacks are plain Python).
+    each other run is compared with what was found there.
 
     Parameters
     ----------

@@ -21,7 +21,6 @@ PLACES = 100  # of a run, at least as many at which the equations are looked at
 SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
 FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
-SAMPLE = 64  # runs that are compared where callbacks are called in Python
 
 
 class LaneRuns:
@@ -111,8 +110,6 @@ class LaneRuns:
 
         system, n = self.system, self.system.n_q
         which = np.flatnonzero(made)
-        if system.called_in_python:
-            which = which[:: 1 + len(which) // SAMPLE]
         if which.size == 0:
             return []
         room, worst = np.zeros(n * (n + 1) + system.n_c * (n + 3)), np.zeros(len(which))

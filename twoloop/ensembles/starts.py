@@ -12,6 +12,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
+NEAR = 1e4  # the same of one that needs no closer look
 GENERIC = 16  # runs of which generic parameters are a mean
 
 
@@ -75,10 +76,11 @@ def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
 
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     """Parameters between those of some runs, bound by no rule but a linear one of all, and which of them vary."""
-    rows = parameters[:: max(1, len(parameters) // GENERIC)]
-    varying = np.flatnonzero((parameters != parameters[:1]).any(axis=0)).tolist()
+    varies = (parameters != parameters[:1]).any(axis=0)
+    ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # what one run alone has counts
+    rows = parameters[np.concatenate([np.arange(0, len(parameters), max(1, len(parameters) // GENERIC)), *ends])]
     weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
-    return np.where((parameters == parameters[:1]).all(axis=0), rows[0], weights @ rows / weights.sum()), varying
+    return np.where(varies, weights @ rows / weights.sum(), parameters[0]), np.flatnonzero(varies).tolist()
 
 
 def over_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> Array:

@@ -53,8 +53,8 @@ class Operation(NamedTuple):
 class LaneCode:
     """Writes the code of a mechanism, whose numbers depend on parameters as `record` has it.
 
-    `scratch` holds, lane vectors each: what the factors keep; r and c; the divisors of inverse functions; and rows of
-    factors of order 0, 1 and so on.
+    `scratch` holds, lane vectors each: what the factors keep; r; the divisors of inverse functions; and rows of
+    factors of order 0, 1 and so on, behind sums that are carried to the next order.
     """
 
     def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any):
@@ -82,8 +82,7 @@ class LaneCode:
             if operation.kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT):
                 self._divisors[operation.results[0]] = len(self._divisors)
         self.r = self.solution.n_kept
-        self.c = self.r + self.n
-        self.divisors = self.c + self.n_rows
+        self.divisors = self.r + self.n
         self.carried = self.divisors + len(self._divisors)
         self.table = self.carried + len(self.sums_ahead)
         self.width = len(self.slots)
@@ -381,8 +380,8 @@ class LaneCode:
                 elif kind == SQUARE_ROOT:
                     divisor = emit.add(values[0], values[0])
             if kind in (SINE, EXPONENTIAL, LOGARITHM, ARCTANGENT):
-                argument = ((results[0], 1.0),) if kind in (LOGARITHM, ARCTANGENT) else first
-                row.store(("scaled", *(argument if argument is first else (argument, 0.0))), zero)
+                scaled = (((results[0], 1.0),), 0.0) if kind in (LOGARITHM, ARCTANGENT) else first
+                row.store(("scaled", *scaled), zero)
             if divisor is not None:
                 emit.store(emit.divide(one, divisor), scratch, self.divisors + self._divisors[results[0]])
             for result, value in zip(results, values, strict=True):
@@ -431,7 +430,7 @@ class LaneCode:
                 continue
             totals = [sums[pair] for pair in self._factors(operation)]
             at = [(emit.load(begin, x), emit.load(begin, y)) for x, y in self._factors(operation)]
-            u = None if kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT) and not first else known.sum(first)
+            u = known.sum(first)
             row.store(operation.first, u, "if used")
             if kind == PENDING:
                 values = [emit.add(totals[0], emit.multiply(u, at[0][1]))]
@@ -530,7 +529,7 @@ class _Row:
     def store(self, key: Any, value: Value, when: str = "") -> None:
         """Put a factor in its place; "if used": it may have none."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
-        if place is not None and place not in self.stored and value is not None:
+        if place is not None and place not in self.stored:
             self.stored.add(place)
             self.emit.store(value, self.base, place)
 

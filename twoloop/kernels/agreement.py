@@ -14,7 +14,9 @@ def _off(value, allowed):
     """A residual over what is allowed."""
     if not np.isfinite(value):
         return np.inf
-    return abs(value) / allowed if allowed > 0.0 else 0.0
+    if value == 0.0:
+        return 0.0
+    return abs(value) / allowed if allowed > 0.0 else np.inf
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, f8, TABLE, TABLE, TABLE, TABLE, TABLE, VECTOR, VECTOR))
@@ -73,25 +75,27 @@ def disagreement(f, sizes, t, share, atol, parameters, q, v, a, lam, room, worst
         worst[k] = largest
 
 
-@kernel(types.void(KIT, INTEGERS, f8, TABLE, TABLE, VECTOR, VECTOR))
-def violation(f, sizes, t, parameters, q, room, worst):
-    """Of each position the largest |C| over the sum of its row of |C_q| times the largest coordinate.
+@kernel(types.void(KIT, INTEGERS, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
+def violation(f, sizes, t, parameters, q, v, room, worst):
+    """Of each state the largest |C| and |C_q v + C_t| over the sum of a row of |C_q| times the largest entry of q or v.
 
-    room : (n_c (n + 1),).
+    room : (n_c (n + 2),).
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
-    C, G = room[:n_c], room[n_c:].reshape((n_c, n))
+    C, rate, G = room[:n_c], room[n_c : 2 * n_c], room[2 * n_c :].reshape((n_c, n))
     for k in range(q.shape[0]):
         room[:] = 0.0
         for j in range(parameters.shape[1]):
             f.p[first + j] = parameters[k, j]
         f.constraint(t, q[k], f.p, C)
         f.jacobian(t, q[k], f.p, G)
-        far, worst[k] = 0.0, 0.0
+        f.constraint_rate(t, q[k], f.p, rate)
+        far, fast, worst[k] = 0.0, 0.0, 0.0
         for j in range(n):
-            far = max(far, abs(q[k, j]))
+            far, fast = max(far, abs(q[k, j])), max(fast, abs(v[k, j]))
         for i in range(n_c):
-            row = 0.0
+            row, faster = 0.0, rate[i]
             for j in range(n):
                 row += abs(G[i, j])
-            worst[k] = max(worst[k], _off(C[i], row * far))
+                faster += G[i, j] * v[k, j]
+            worst[k] = max(worst[k], _off(C[i], row * far), _off(faster, row * fast + abs(rate[i])))

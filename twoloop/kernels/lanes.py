@@ -37,7 +37,7 @@ LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
     OFF,
     LENGTH,
     LONGEST,  # that the step may be, s
-    SHARE,  # of its length that the step may have, after it was refused
+    ASKED,  # 1: the lanes that begin a run, or in which a state is wanted
     WORST,  # defect within the step
     REFUSED,  # steps, one after another
     RUNNING,
@@ -147,7 +147,7 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
             room[FINE * LANES + k] = room[RUNNING * LANES + k] = 1.0
             room[T * LANES + k] = room[AHEAD * LANES + k] = control[T0]
             room[UNIT * LANES + k] = FIRST_UNIT * (control[T1] - control[T0])
-            room[LONGEST * LANES + k], room[SHARE * LANES + k] = np.inf, 1.0
+            room[LONGEST * LANES + k] = np.inf
             room[REFUSED * LANES + k] = room[REACHED * LANES + k] = 0.0
             room[WHICH * LANES + k] = next_run
             for j in range(n):
@@ -159,10 +159,10 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
         n_running += int(room[RUNNING * LANES + k])
     if n_fresh > 0:
         for k in range(LANES):
-            room[WORST * LANES + k] = room[FINE * LANES + k]
+            room[ASKED * LANES + k] = room[FINE * LANES + k]
         _project(code, order, control, room, n, new)
         for k in range(LANES):
-            if room[WORST * LANES + k] == 1.0:
+            if room[ASKED * LANES + k] == 1.0:
                 for j in range(2 * n):
                     room[(state + j) * LANES + k] = room[(new + j) * LANES + k]
                 if room[FINE * LANES + k] == 0.0:
@@ -179,7 +179,7 @@ def _choose_steps(room, control, status):
         room[H * LANES + k] = room[WORST * LANES + k] = 0.0
         if room[RUNNING * LANES + k] == 1.0:
             unit, t = room[UNIT * LANES + k], room[T * LANES + k]
-            h = min(room[LENGTH * LANES + k] * unit * room[SHARE * LANES + k], room[LONGEST * LANES + k])
+            h = min(room[LENGTH * LANES + k] * unit, room[LONGEST * LANES + k])
             if h >= t1 - t:
                 h = t1 - t
             room[H * LANES + k] = h
@@ -243,7 +243,6 @@ def _make_steps(code, order, control, room, n, n_rows, n_numbers, checks_redunda
             if defect > 1.0:
                 factor = min(factor, max(MOST_SHORTENED, 0.9 * defect ** (-1.0 / order)))
         h = room[H * LANES + k]
-        room[SHARE * LANES + k] = 1.0
         if factor < 1.0:
             room[REFUSED * LANES + k] += 1.0
             room[LONGEST * LANES + k] = factor * h
@@ -268,13 +267,13 @@ def _between(code, order, control, room, n, new, times, out_q, out_v):
                     room[FINE * LANES + k], n_wanted = 1.0, n_wanted + 1
                     room[X * LANES + k] = (times[wanted] - room[T * LANES + k]) / room[UNIT * LANES + k]
                     room[AHEAD * LANES + k] = times[wanted]
-            room[WORST * LANES + k] = room[FINE * LANES + k]
+            room[ASKED * LANES + k] = room[FINE * LANES + k]
         if n_wanted == 0:
             return
         code(EVALUATE, order, control, room)
         _project(code, order, control, room, n, new)
         for k in range(LANES):
-            if room[WORST * LANES + k] == 1.0:
+            if room[ASKED * LANES + k] == 1.0:
                 run, wanted = int(room[WHICH * LANES + k]), int(room[REACHED * LANES + k])
                 room[REACHED * LANES + k] += 1.0
                 for j in range(n):
