@@ -68,9 +68,9 @@ ENSEMBLES = [
     ),
     of_states("guesses as columns", lambda: states(THREE.T), r"q must have shape \(9,\) or \(n_runs, 9\)", A_ROW),
     of_states(
-        "a guess that leads nowhere",
-        lambda: states(moved(1, -LINKAGE.q0)),
-        "guess 1: ",
+        "a guess whose crank points elsewhere",
+        lambda: states(moved(1, 2.5 * np.eye(9)[2])),
+        "guess 1: q does not say on which assembly",
         "give a guess that is nearer to an assembled position",
     ),
     of_states("`keep=[9]` of nine coordinates", lambda: states(keep=[9]), "keep must hold indices", "count from 0"),

@@ -18,7 +18,7 @@ PROJECTION = [
         "a `Problem` as `system`",
         lambda: project(linkage()),
         TypeError,
-        r"system must be a ConstrainedSystem.*this is a Problem.*problem\.system",
+        r"system must be a ConstrainedSystem; given a Problem.*problem\.system",
         "give problem.system",
     ),
     *argument(

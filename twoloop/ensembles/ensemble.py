@@ -166,7 +166,7 @@ def _alone(
     try:
         return solve_dae(own, span, starts.q[run], starts.v[run], **options)
     except ValueError as error:
-        raise ValueError(f"run {run}: {error}") from error
+        raise _of_run(run, error) from error
 
 
 def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str) -> None:
@@ -176,7 +176,12 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str)
     try:
         check_start(system_of(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
     except ValueError as error:
-        raise ValueError(f"run {run}: {error}, or many starts at once by twoloop.consistent_states") from error
+        raise _of_run(run, error) from error
+
+
+def _of_run(run: int, error: ValueError) -> ValueError:
+    """The error of a single run, with its number, and the function for many runs in the place of that for one."""
+    return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 
 
 def _message(status: Any, in_lanes: Any, why: str) -> str:

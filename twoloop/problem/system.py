@@ -483,7 +483,10 @@ def check_system(system: object) -> None:
     if isinstance(system, ConstrainedSystem):
         return
     inner = getattr(system, "system", None)
-    hint = "for a ready mechanism: problem.system"
     if isinstance(inner, ConstrainedSystem):
-        hint = f"this is a {type(system).__name__}: give its system, problem.system"
-    raise TypeError(f"system must be a ConstrainedSystem ({hint}); given {system!r:.200}")
+        raise TypeError(
+            f"system must be a ConstrainedSystem; given a {type(system).__name__}: give its system, problem.system"
+        )
+    raise TypeError(
+        f"system must be a ConstrainedSystem (for a ready mechanism: problem.system); given {system!r:.200}"
+    )

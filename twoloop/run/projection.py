@@ -24,6 +24,7 @@ SINGULAR = 1e-10  # smallest singular value of scaled columns that still count a
 NEGLIGIBLE, WEAK = 1e-13, 1e-2  # singular values of rows of length 1 that count as zero: as a rule; redundant
 DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
 SAME = 0.1  # of what the projection moves: positions that are nearer to each other are one
+LOST = 1e8  # largest change of a position over its scale: farther away rounding hides where the mechanism is
 STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
 
 
@@ -136,10 +137,11 @@ def _position(
     if redundant:  # rows that depend on one another do so on the constraints, and beside them only nearly
         found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if found is None or not excess <= 1.0:
-        where = guess if found is None else found
+        where = "at q" if found is None else f"after {iterations} iterations"
+        values = system.constraint(t, guess if found is None else found)
         raise ValueError(
-            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: after {iterations} "
-            f"iterations max|C| is {_largest(system.constraint(t, where))}. Give a guess that is nearer to an "
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: "
+            f"{'the iteration diverges; ' if found is None else ''}{where} max|C| is {_largest(values)}. Give a guess that is nearer to an "
             f"assembled position{_smallest(scales, jacobian, free, kept)}"
         )
     if start.excess > 1.0 and check_assembly:
@@ -207,7 +209,7 @@ def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
     """Position (None: lost), what it is still off over what is accepted, and how many iterations it took."""
-    best, nearest, iteration = np.inf, q, 0
+    best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
             jacobian, values = system.jacobian(t, q), system.constraint(t, q)
@@ -216,15 +218,20 @@ def _gauss_newton(
         if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
             return None, np.inf, iteration
         step = _least_change(jacobian, free, -values, cut)
-        excess = Violation.of_position(system, t, q, jacobian, scales_of(system, t, q, jacobian)).excess
+        scales = scales_of(system, t, q, jacobian)
+        excess = Violation.of_position(system, t, q, jacobian, scales).excess
         if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
             return q, excess, iteration  # as far as rounding lets it
         if excess < best:
             best, nearest = excess, q
         q = q + step
-        if not np.isfinite(q).all():
+        if not (np.abs(q - guess) <= LOST * scales.columns).all():  # NaN too
             return None, np.inf, iteration
-    return (nearest if best <= 1.0 else q), best, iteration  # up to 1 is accepted: rounding may keep it above CONVERGED
+    return (
+        (nearest if best <= 1.0 else q),
+        best,
+        MAX_ITERATIONS,
+    )  # up to 1 is accepted: rounding may keep it above CONVERGED
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
