@@ -6,59 +6,67 @@ report anew. Without names: what there is.
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import pandas as pd
 
 from studies.bench import cli
 from studies.bench.cli import StudyError
 from studies.bench.store import KeptRows, Output
-from studies.work_precision import first_calls, minimal, rivals
+from studies.compare import GROUP as LENGTH
+from studies.work_precision import first_calls, minimal, rivals, scaling, study
 
-FIRST_CALLS = "first calls"
-WHOLE = {FIRST_CALLS: first_calls, minimal.GROUP: minimal}  # parts that are groups of rows
-
-
-def parts() -> list[str]:
-    """Names of what can be measured again."""
-    return [*rivals.problems(False), *WHOLE]
+AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
 
 
-def measured(name: str, kept: KeptRows) -> pd.DataFrame:
-    """The rows of one part."""
-    if name in WHOLE:
-        return WHOLE[name].collect(kept, False)
+@dataclass(frozen=True)
+class Part:
+    """Rows that are measured together: all of a group, or those of one case of it."""
+
+    group: str
+    case: str | None
+    make: Callable[[KeptRows], pd.DataFrame]
+
+
+def parts() -> dict[str, Part]:
+    """What can be measured again, by name."""
+    found = {name: Part(rivals.GROUP, name, partial(_of_rivals, name)) for name in rivals.problems(False)}
+    for case in study.known_cases(False):
+        found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
+    found["size"] = Part(scaling.GROUP, None, partial(scaling.collect, False))
+    found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
+    found[minimal.GROUP] = Part(minimal.GROUP, None, partial(minimal.collect, quick=False))
+    return found
+
+
+def _of_rivals(name: str, kept: KeptRows) -> pd.DataFrame:
     return rivals.collect([run for run in rivals.runs(False) if run.case.name == name], kept)
 
 
-def replaced(rows: pd.DataFrame, name: str, new: pd.DataFrame) -> pd.DataFrame:
+def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
     """All rows with those of one part in the place of what stood there."""
-    group = rows["group"] == WHOLE.get(name, rivals).GROUP
-    old = group if name in WHOLE else group & (rows["case"] == name)
+    old = rows["group"] == part.group
+    if part.case is not None:
+        old &= rows["case"] == part.case
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)
 
 
-def findings_of(rows: pd.DataFrame) -> list[dict[str, str | int]]:
-    """On which processors, and at which commits where these are not the report's, how many mechanisms were measured."""
-    own = rows[rows["group"] == rivals.GROUP].drop_duplicates("case").reindex(columns=["processor", "commit"])
-    counts = own.fillna("").value_counts(sort=False)
-    return [{"processor": str(p), "commit": str(c), "n": int(n)} for (p, c), n in counts.items()]
-
-
 def main(words: Sequence[str] | None = None) -> None:
     """Measure parts again, one after another."""
-    names = list(sys.argv[1:] if words is None else words)
-    unknown = [name for name in names if name not in parts()]
+    names, known = list(sys.argv[1:] if words is None else words), parts()
+    unknown = [name for name in names if name not in known]
     if unknown or not names:
-        raise StudyError(f"{f'there is no {unknown[0]!r}; ' if unknown else ''}parts are {', '.join(parts())}")
+        raise StudyError(f"{f'there is no {unknown[0]!r}; ' if unknown else ''}parts are {'; '.join(known)}")
     with Output(cli.parse("work_precision", __doc__, [])) as output:
         for name in names:
             with output.kept({"part": name}) as kept:
-                new = measured(name, kept)
+                new = known[name].make(kept)
             rows, line = output.load_rows()
             new = new.assign(processor=cli.processor(), commit=cli.commit())
-            output.save_rows(replaced(rows, name, new), line)
+            output.save_rows(replaced(rows, known[name], new), line)
             print(f"{name}: {len(new)} rows", flush=True)
 
 

@@ -28,9 +28,9 @@ from studies.bench.solvers import (
     RIVALS,
     TOLERANCES,
 )
-from studies.bench.store import Output, Row
+from studies.bench.store import KeptRows, Output, Row
 from studies.compare import GROUP, runs_of
-from studies.work_precision import again, first_calls, goals, minimal, processors, rivals, scaling
+from studies.work_precision import first_calls, goals, minimal, processors, rivals, scaling
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
@@ -96,13 +96,17 @@ def known_cases(quick: bool) -> list[Case]:
 def make(output: Output) -> pd.DataFrame:
     """Make all rows."""
     quick = output.call.quick
-    at_length = [run for case in known_cases(quick) for run in runs(case, quick)]
     with output.kept() as kept:
-        errors = () if quick else ERRORS
-        made = [adaptive.collect(at_length, kept, _row, lambda run: True, errors)]
+        made = [at_length(known_cases(quick), quick, kept)]
         made += [rivals.collect(rivals.runs(quick), kept), scaling.collect(quick, kept)]
         made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
     return pd.concat(made, ignore_index=True)
+
+
+def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
+    """The rows of cases over their whole motion."""
+    made = [run for case in known for run in runs(case, quick)]
+    return adaptive.collect(made, kept, _row, lambda run: True, () if quick else ERRORS)
 
 
 def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
@@ -121,6 +125,13 @@ def versions() -> dict[str, str]:
         with suppress(PackageNotFoundError):
             found[package] = version(package)
     return found
+
+
+def measured_on(rows: pd.DataFrame) -> list[dict[str, str | int]]:
+    """On which processors, and at which commits where these are not the report's, how many mechanisms were measured."""
+    own = rows[rows["group"] == rivals.GROUP].drop_duplicates("case").reindex(columns=["processor", "commit"])
+    counts = own.fillna("").value_counts(sort=False)
+    return [{"processor": str(p), "commit": str(c), "n": int(n)} for (p, c), n in counts.items()]
 
 
 def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
@@ -142,7 +153,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"fitted": scaling.FITTED, "rigid": scaling.RIGID}
     findings |= {"first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
-    findings["measured"] = again.findings_of(rows)
+    findings["measured"] = measured_on(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)

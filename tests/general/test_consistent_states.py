@@ -73,7 +73,7 @@ def test_a_guess_that_is_too_far_is_named():
     problem = mechanisms.four_bar()
     q, v = guesses(problem, 3)
     q[1] = 0.0
-    with pytest.raises(ValueError, match="guess 1: .*(diverges|does not say|iterations max)"):
+    with pytest.raises(ValueError, match=r"guess 1: .*(diverges|does not say|iterations max)"):
         consistent_states(problem.system, 0.0, q, v)
 
 

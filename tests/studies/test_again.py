@@ -23,21 +23,24 @@ KEPT = rows(
 
 def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     new = rows((rivals.GROUP, "four-bar", 9.0, "new")).assign(commit="abc")
-    made = again.replaced(KEPT, "four-bar", new)
+    parts = again.parts()
+    made = again.replaced(KEPT, parts["four-bar"], new)
     assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
-    assert again.findings_of(made) == [
+    assert study.measured_on(made) == [
         {"processor": "old", "commit": "", "n": 1},
         {"processor": "new", "commit": "abc", "n": 1},
     ]
-    calls = again.replaced(KEPT, again.FIRST_CALLS, rows((first_calls.GROUP, "four-bar", 8.0, "new")))
+    calls = again.replaced(KEPT, parts["first calls"], rows((first_calls.GROUP, "four-bar", 8.0, "new")))
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
+    length = again.replaced(KEPT, parts["four-bar" + again.AT_LENGTH], rows(("compare", "four-bar", 7.0, "new")))
+    assert length["call_s"].tolist() == [1.0, 2.0, 3.0, 7.0]
 
 
 def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
     (tmp_path / "work_precision.csv").write_text(f"# full work_precision; stamp\n{KEPT.to_csv(index=False)}")
     call = cli.parse("work_precision", None, ["--out", str(tmp_path)])
     monkeypatch.setattr(again.cli, "parse", lambda *_: call)
-    monkeypatch.setattr(again, "measured", lambda name, kept: rows((rivals.GROUP, name, 9.0, "")))
+    monkeypatch.setattr(again, "_of_rivals", lambda name, kept: rows((rivals.GROUP, name, 9.0, "")))
     again.main(["double pendulum"])
     with Output(call) as output:
         made, line = output.load_rows()
@@ -47,7 +50,7 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("words", [[], ["five-bar"]])
 def test_parts_are_named(words):
-    with pytest.raises(StudyError, match=r"parts are four-bar, four-bar, second, .*first calls, minimal coordinates"):
+    with pytest.raises(StudyError, match=r"parts are four-bar; four-bar, second; .*first calls; minimal coordinates"):
         again.main(words)
 
 

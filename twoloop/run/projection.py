@@ -137,12 +137,14 @@ def _position(
     if redundant:  # rows that depend on one another do so on the constraints, and beside them only nearly
         found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if found is None or not excess <= 1.0:
-        where = "at q" if found is None else f"after {iterations} iterations"
-        values = system.constraint(t, guess if found is None else found)
+        diverged = found is None
+        worst = _largest(system.constraint(t, guess if diverged else found))
+        reached = f"the iteration diverges; at q max|C| is {worst}"
+        if not diverged:
+            reached = f"after {iterations} iterations max|C| is {worst}"
         raise ValueError(
-            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: "
-            f"{'the iteration diverges; ' if found is None else ''}{where} max|C| is {_largest(values)}. Give a guess that is nearer to an "
-            f"assembled position{_smallest(scales, jacobian, free, kept)}"
+            f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {reached}. Give a guess that "
+            f"is nearer to an assembled position{_smallest(scales, jacobian, free, kept)}"
         )
     if start.excess > 1.0 and check_assembly:
         other = _another_assembly(system, t, found, guess, free, scales, cut)
