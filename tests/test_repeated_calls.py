@@ -2,22 +2,24 @@
 
 import cProfile
 import pstats
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.problems import pendulum
-from twoloop import mechanisms, solve_dae
+from twoloop import ConstraintWarning, mechanisms, solve_dae
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.straight_line import Choice, StraightLine
 from twoloop.generate.traced_values import unchecked
+from twoloop.kernels.layout import _free
 from twoloop.methods.plans_for import MOST, plans_for
 from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 
-MANY = 4000  # calls of functions; 2400 of the default
+MANY, FEW = 700, 500  # calls of functions in a run that compares callbacks again, as the second, and in others
 
 
 def run(problem, rtol=1e-6, **options):
@@ -26,13 +28,34 @@ def run(problem, rtol=1e-6, **options):
 
 @pytest.mark.parametrize("options", [{}, {"compiled": True}, {"method": "DOP853"}, {"method": "RadauIIA5"}], ids=str)
 def test_a_repeated_call_takes_few_calls_of_functions(options):
+    problem, calls = mechanisms.four_bar(), []
+    for _ in range(3):
+        profile = cProfile.Profile()
+        profile.enable()
+        run(problem, **options)
+        profile.disable()
+        calls.append(pstats.Stats(profile).total_calls)
+    assert calls[1] < MANY and calls[2] < FEW  # the first compiles callbacks, or checks derivatives
+
+
+def test_a_workspace_that_was_used_is_as_a_new_one():
+    linkage, crank = mechanisms.four_bar(), mechanisms.redundant_slider_crank()
+    with pytest.warns(ConstraintWarning):
+        alone = [run(problem) for problem in (linkage, crank)]
+        _free.clear()
+        new = [run(problem) for problem in (linkage, crank)]
+        assert _free
+        used = [run(problem) for problem in (linkage, crank)]
+    for one, other, third in zip(alone, new, used, strict=True):
+        assert np.array_equal(one.lam, other.lam) and np.array_equal(one.lam, third.lam)
+
+
+def test_runs_at_a_time_do_not_share_a_workspace():
     problem = mechanisms.four_bar()
-    run(problem, **options)
-    profile = cProfile.Profile()
-    profile.enable()
-    run(problem, **options)
-    profile.disable()
-    assert pstats.Stats(profile).total_calls < MANY
+    alone = run(problem)
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda _: run(problem), range(40)))
+    assert all(np.array_equal(alone.q, result.q) for result in results)
 
 
 @pytest.mark.parametrize("method", ["auto", "Taylor", "DOP853", "Adams", "RadauIIA5", "TRBDF2"])

@@ -25,6 +25,7 @@ from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.traced_values import Traced
+from twoloop.kernels.layout import give_back
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import PRESETS
@@ -206,6 +207,7 @@ def solve_dae(
             lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
             record = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
+        give_back(run.work)
         untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)
         if own is not None:  # Newmark's own test, of positions, has its place

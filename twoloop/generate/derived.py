@@ -28,18 +28,16 @@ def standing_for(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSy
     made = system.remembered("programs", lambda: _made(system, absent))
     if made is None:
         return system, ()
-    programs, traced = made
+    other, traced = made
     try:
         check(traced)
     except Untraceable:
         return system, ()
-    other = copy.copy(system)
-    other.functions = system.functions._replace(**programs)
     return other, (traced,)
 
 
-def _made(system: ConstrainedSystem, absent: Sequence[str]) -> tuple[dict[str, Any], Traced] | None:
-    """The programs, as vectors of integers and of numbers; None: the constraints cannot be traced, or are too long."""
+def _made(system: ConstrainedSystem, absent: Sequence[str]) -> tuple[ConstrainedSystem, Traced] | None:
+    """The system with programs, as vectors; None: the constraints cannot be traced, or are too long."""
     equations = Equations(system)
     try:
         results = _results(equations, absent)
@@ -52,7 +50,9 @@ def _made(system: ConstrainedSystem, absent: Sequence[str]) -> tuple[dict[str, A
             return None
         vectors = _packed(program, list(forms))
         programs |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
-    return programs, Traced(system, equations.graph)
+    other = copy.copy(system)
+    other.functions = system.functions._replace(**programs)
+    return other, Traced(system, equations.graph)
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Form]]:

@@ -172,9 +172,8 @@ class Sample:
 
     def up_to(self, end: float) -> Array:
         """All of them, the last first."""
-        states = np.concatenate(self.states)
-        states = states[states[:, 0] <= end]
-        return states[::-1]
+        states = np.concatenate(self.states)[::-1]
+        return states if states[0, 0] <= end else states[states[:, 0] <= end]
 
 
 Check = Callable[[Traced], None]

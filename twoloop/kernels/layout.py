@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,9 +14,11 @@ from twoloop.kernels.algebra.lapack import N_ROUTINES
 from twoloop.kernels.data.common import N_COUNTERS, N_NOTES, WORK, Work
 from twoloop.kernels.evaluation.kinks import PARTS
 
+MOST_FREE, LARGEST_FREE = 32, 100_000  # workspaces that wait for their next run, and numbers of each of them
 WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin
 
 
+Sizes = tuple[int, int, int, int, int, bool, bool, int]
 Places = list[tuple[str, int, int, tuple[int, ...]]]  # of arrays in a piece of memory: name, begin, end, shape
 
 
@@ -45,16 +48,54 @@ def make_work(
     augmented: bool = False,
     n_nodes: int = 0,
 ) -> Work:
-    """Allocate the workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a."""
+    """The workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a.
+
+    It may be one that a run of these sizes gave back: to make the arrays takes longer than to clear them.
+    """
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
-    layout = _layout(n_q, n_c, n_a, r, r_v, reduced, augmented, n_nodes)
+    sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes)
+    free = _free.get(sizes)
+    if free:
+        with suppress(IndexError):  # another thread took it
+            return _cleared(free.pop())
+    layout = _layout(*sizes)
     numbers, integers = np.zeros(layout.n_numbers), np.zeros(layout.n_integers, dtype=np.int64)
     arrays: dict[str, Any] = {name: numbers[a:b].reshape(shape) for name, a, b, shape in layout.numbers}
     arrays |= {name: integers[a:b].reshape(shape) for name, a, b, shape in layout.integers}
     arrays["G_of_S"][:] = np.nan
     table = layout.table + layout.of_numbers * numbers.ctypes.data + layout.of_integers * integers.ctypes.data
     return Work(**arrays, table=table, address=table.ctypes.data)
+
+
+def give_back(work: Work) -> None:
+    """Let the next run of the same sizes have this workspace, of which nothing is used any more."""
+    if work.notes.base.size <= LARGEST_FREE and sum(map(len, _free.values())) < MOST_FREE:
+        _free.setdefault(_sizes(work), []).append(work)
+
+
+_free: dict[Sizes, list[Work]] = {}  # those that were given back
+
+
+def _sizes(work: Work) -> Sizes:
+    n_q, n_c = work.Q.size, work.C.size
+    return (
+        n_q,
+        n_c,
+        work.Rate.size - n_c,
+        work.rows.size,
+        work.rows_v.size,
+        work.A.size > 0,
+        work.right.size > 0,
+        work.nodes.size,
+    )
+
+
+def _cleared(work: Work) -> Work:
+    work.notes.base[:] = 0.0
+    work.counters.base[:] = 0
+    work.G_of_S[:] = np.nan
+    return work
 
 
 @cache

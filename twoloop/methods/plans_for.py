@@ -1,6 +1,7 @@
 """The plans by which a method runs a system; those of presets are made once for a system and a tolerance."""
 
 from dataclasses import replace
+from typing import Any
 
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check
@@ -58,5 +59,7 @@ def _made(
         raise ValueError(
             f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{constant}"
         )
-    traced = (*plan.traced, code.equations.traced)
-    return replace(plan, inner=code.inner, numbers=code.numbers.values, traced=traced), interiors
+    own: dict[str, Any] = {"inner": code.inner, "numbers": code.numbers.values}
+    if plan.substitute is not None:
+        plan = replace(plan, substitute=replace(plan.substitute, **own))
+    return replace(plan, **own, traced=(*plan.traced, code.equations.traced)), interiors

@@ -54,6 +54,7 @@ CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go o
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
+_spare: dict[tuple[int, int, int], tuple[Array, Array, Array]] = {}  # buffers, by their sizes, for the next run
 LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
 
@@ -204,7 +205,7 @@ class Run:
     def _first_step(self, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
-        q, v, a = (float(np.abs(state[k * n : (k + 1) * n]).max()) for k in range(3))
+        q, v, a = np.abs(state[: 3 * n]).reshape(3, n).max(axis=1).tolist()
         q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
         scales = [span]
         if v > 0.0:
@@ -243,9 +244,10 @@ class Run:
         cpu = 0.0
         sample = Sample(self.t0, self.state[: 2 * system.n_q])
         code = INTERRUPTED if interrupts.asked else a.PAUSED
-        out_t, out_state, out_steps = self._buffers()
+        out_t, out_state, out_steps = buffers = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
         raised: Exception | None = None
+        sparse = True  # whether what the buffers hold was copied
         while code == a.PAUSED:
             across, leaps = plan is not self.plan, self.clock[a.LEAPS] == 1.0
             self.control[a.MAX_ATTEMPTS] = min(self.chunk, max(0, next_look - self._attempts()))
@@ -275,7 +277,7 @@ class Run:
             t, rows, steps = out_t[:n_rows], out_state[:n_rows], out_steps[:n_steps]
             sample.add(t, rows)
             sample.add(self.clock[a.T : a.T + 1], self.state[None, :])
-            sparse = 2 * n_rows < len(out_t)  # then copies take less room than the buffers
+            sparse = 2 * n_rows < len(out_t)  # then copies take less room
             if sparse:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             step_parts.append(steps)
@@ -298,7 +300,7 @@ class Run:
             if spent < CHUNK_TIME:
                 self.chunk = min(2 * self.chunk, largest_chunk)
             if not sparse or len(out_t) < min(self.chunk, BUFFER_ROWS):
-                out_t, out_state, out_steps = self._buffers()
+                out_t, out_state, out_steps = buffers = self._buffers()
             if code == a.PAUSED and time.monotonic() > deadline:
                 code = OUT_OF_TIME
             if code == a.PAUSED and (interrupts.asked or recorder.interrupted):
@@ -316,6 +318,8 @@ class Run:
                 plan, control, code = self._beyond(plan, control, code, n_steps)
                 kit = self.kit if plan is self.plan else kit
             report(self.clock[a.T])
+        if sparse:
+            _spare[out_t.size, out_state.size, len(out_steps)] = buffers
         if wanted.between_steps:
             began = time.process_time()
             recorder.finish()
@@ -348,7 +352,8 @@ class Run:
             code = INTERRUPTED
         if interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
             status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
-        errors, failures, partitions = np.diff(steps[:, a.ERRORS : a.JACOBIANS], axis=0).astype(np.int64).T
+        counts = steps[:, a.ERRORS : a.JACOBIANS].T.astype(np.int64)
+        errors, failures, partitions = counts[:, 1:] - counts[:, :-1]
         t_events, q_events, v_events = recorder.events()
         return Record(
             t=t,
@@ -383,6 +388,9 @@ class Run:
     def _buffers(self) -> tuple[Array, Array, Array]:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
         n_rows, n_steps = min(self.chunk, BUFFER_ROWS), min(self.chunk, BUFFER_STEPS)
+        spare = _spare.pop((n_rows, n_rows * len(self.state), n_steps), None)
+        if spare is not None:
+            return spare
         return np.empty(n_rows), np.empty((n_rows, len(self.state))), np.empty((n_steps, self.a.N_STEP_COLUMNS))
 
     def _recorder(self, wanted: Wanted) -> Recorder:
@@ -408,8 +416,8 @@ class Run:
     def _give_way(self) -> None:
         """Go on with the plan that takes over where values of this one are not finite."""
         assert self.plan.substitute is not None
-        self.plan = replace(self.plan.substitute, inner=self.plan.inner, numbers=self.plan.numbers)
-        self.kit = kit_with(self.system, self.functions._replace(flags=self.functions.flags.copy()), self.plan)
+        self.plan = self.plan.substitute
+        self.kit = kit_with(self.system, self.functions.flags, self.plan)
         self.functions = self.kit.functions
         self.memory = self.plan.memory.copy()
         self.substituted = True
@@ -477,21 +485,21 @@ class Run:
 
     def _attempts(self) -> int:
         """How many steps were tried so far."""
-        places = [common.N_ACCEPTED, common.N_REJECTED_ERROR, common.N_REJECTED_CONVERGENCE]
-        return int(self.work.counters[places].sum())
+        c = self.work.counters
+        return int(c[common.N_ACCEPTED] + c[common.N_REJECTED_ERROR] + c[common.N_REJECTED_CONVERGENCE])
 
     def _statistics(self, cpu: float) -> Statistics:
-        c = self.work.counters
+        c = self.work.counters.tolist()
         return Statistics(
-            n_accepted=int(c[common.N_ACCEPTED]),
-            n_rejected_error=int(c[common.N_REJECTED_ERROR]),
-            n_rejected_convergence=int(c[common.N_REJECTED_CONVERGENCE]),
-            n_outer=int(c[common.N_OUTER]),
-            n_inner=int(c[common.N_INNER]),
-            n_evaluations=int(c[common.N_EVALUATIONS]),
-            n_partitions=int(c[common.N_PARTITIONS]),
-            n_factorizations=int(c[common.N_FACTORIZATIONS]),
-            n_jacobians=int(c[common.N_JACOBIANS]),
+            n_accepted=c[common.N_ACCEPTED],
+            n_rejected_error=c[common.N_REJECTED_ERROR],
+            n_rejected_convergence=c[common.N_REJECTED_CONVERGENCE],
+            n_outer=c[common.N_OUTER],
+            n_inner=c[common.N_INNER],
+            n_evaluations=c[common.N_EVALUATIONS],
+            n_partitions=c[common.N_PARTITIONS],
+            n_factorizations=c[common.N_FACTORIZATIONS],
+            n_jacobians=c[common.N_JACOBIANS],
             cpu_time=cpu,
         )
 

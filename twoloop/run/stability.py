@@ -48,7 +48,8 @@ class Looks:
     def pass_by(self, steps: Array) -> None:
         """Note the lengths of accepted steps."""
         self.n_steps += steps.size
-        self.last = np.append(self.last, steps[-LAST_STEPS:])[-LAST_STEPS:]
+        last = steps[-LAST_STEPS:]
+        self.last = last if last.size == LAST_STEPS else np.append(self.last, last)[-LAST_STEPS:]
 
     def take(self, t: float, state: Array, n_q: int) -> None:
         """Keep this state, that after the last steps; of many only every second, fourth, ..."""

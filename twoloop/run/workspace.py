@@ -28,9 +28,10 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     from twoloop.kernels.evaluation.calls import inner_loop
 
     given = ("flags", system.functions.flags.tobytes())
-    flags = system.remembered_at(given, t0, (q0,), lambda: _flags(system, t0, q0)).copy()
-    functions = system.functions._replace(flags=flags)
-    return common.Kit(functions, inner_loop) if plan is None else kit_with(system, functions, plan)
+    flags = system.remembered_at(given, t0, (q0,), lambda: _flags(system, t0, q0))
+    if plan is None:
+        return common.Kit(system.functions._replace(flags=flags.copy()), inner_loop)
+    return kit_with(system, flags, plan)
 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -51,23 +52,25 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return flags
 
 
-def kit_with(system: ConstrainedSystem, functions: Any, plan: Plan) -> common.Kit:
-    """The same callbacks and flags, with what another plan calls; kept with the system for the next run."""
+def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:
+    """The callbacks with these flags, and what a plan calls; kept with the system for the next run."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    flags = functions.flags
-    flags[common.STRAIGHT] = plan.inner is not None
     called = (plan.inner or inner_loop, plan.step, plan.first, plan.second)
     read = (plan.numbers, plan.own_numbers)
-    kept: dict[Any, common.Kit] = system.remembered("kits", dict)
-    key = (flags.tobytes(), *called, plan.own, plan.instead, *map(id, read))  # which a kit that is kept holds
+    kept: dict[Any, tuple[common.Kit, Any]] = system.remembered("kits", dict)
+    # what it names by numbers is held by what is kept
+    key = (id(system.functions), flags.tobytes(), *called, plan.own, plan.instead, *map(id, read))
     if key in kept:
-        return kept[key]
+        return kept[key][0]
+    flags = flags.copy()
+    flags[common.STRAIGHT] = plan.inner is not None
+    functions = system.functions._replace(flags=flags)
     made = common.Kit(functions, *called, inner_loop, plan.own, plan.instead, *read)
     if flags[common.FORM] != common.AUGMENTED:  # which a run may change
         if len(kept) == MOST_KITS:
             del kept[next(iter(kept))]
-        kept[key] = made
+        kept[key] = made, system.functions
     return made
 
 
