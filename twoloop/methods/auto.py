@@ -153,10 +153,12 @@ class Auto:
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = implicit.plan(n_q, rtol, atol, False)
         dearer = self._dearer(n_q) if self.compiled else 1.0
-        explicit = self._explicit(n_q, rtol, atol, second, dearer)
         if self.series is None or self.series.program is None:
-            return explicit
+            return self._explicit(self.few, n_q, rtol, atol, second, dearer)
         pays = self._series_pays(n_q, tolerance)
+        # where the series lasts, what takes over if its values are not finite is not worth a compilation
+        few = replace(self.few, code=None) if pays and isinstance(self.few, DOP853) else self.few
+        explicit = self._explicit(few, n_q, rtol, atol, second, dearer)
         # at looser tolerances as well where steps are long: others may not be longer than a hundredth of the run
         if not pays and not self._series_pays(n_q, LONG_STEPS):
             return explicit
@@ -164,12 +166,12 @@ class Auto:
         chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
         return replace(chosen, substitute=explicit, provisional=not pays)
 
-    def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
+    def _explicit(self, few: Method, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
         """The plan without a series."""
         many = n_q >= VERY_MANY
         if n_q >= MANY and not self.compiled:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
-        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
-        if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
+        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (few, LIMIT_FEW, LOOKS_FEW)
+        if explicit is few and n_q >= MANY:  # whose evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1
         return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks, dearer)
