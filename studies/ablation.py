@@ -17,7 +17,7 @@ from studies.bench.cases import beam, four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver
 from studies.bench.metrics import violations
-from studies.bench.study import Series, Study, key
+from studies.bench.study import Study, rows_of
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
@@ -259,7 +259,7 @@ def _costs(controlled: pd.DataFrame, case: str, variant: str, targets: Sequence[
     return {name: costs_at(along, targets, what).tolist() for name, what in COSTS.items()}
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Cost over error by three measures on both mechanisms; violation and energy over time."""
     names = list(dict.fromkeys(rows["case"]))
     made, axes = plt.subplots(len(names), 3, figsize=(10.5, 3.0 * len(names)), sharex="row", layout="constrained")
@@ -278,9 +278,9 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     fixed = rows[(rows["group"] == "fixed") & (rows["tableau"] == SUN.name)]
     for variant in VARIANTS:
         row = _at_drawn(fixed, variant)
-        if row is not None and key(row, "violation") in series:
+        if row is not None and "violation" in row["series"]:
             for panel, name in ((left, "violation"), (right, "energy")):
-                t, size = series[key(row, name)]
+                t, size = row["series"][name]
                 panel.plot(t, np.maximum.accumulate(size), **_look(variant) | {"marker": ""})
             drift.suptitle(f"{row['case']}, steps of {row['h']:g} s", fontsize=10)
     left.set(yscale="log", xlabel="t (s)", ylabel="largest |C| so far (m)", ylim=(1e-17, None))
@@ -293,7 +293,7 @@ def _look(variant: str) -> dict[str, Any]:
     return {"color": COLORS[variant], "marker": MARKERS[variant], "label": variant, "markersize": 3.5}
 
 
-STUDY = Study("ablation", __doc__, runs, measure, findings_of, figures_of)
+STUDY = Study("ablation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
 
 if __name__ == "__main__":

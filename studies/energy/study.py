@@ -13,9 +13,8 @@ from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
-from studies.bench.study import Series, Study, key
+from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting, unfinished
-from studies.energy import runs as energy_runs
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,
@@ -30,6 +29,8 @@ from studies.energy.runs import (
     TRAPEZOIDAL,
     VARIANTS,
     Variant,
+    measure,
+    runs,
 )
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
@@ -160,9 +161,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Both figures of the report."""
-    return {"energy_cost": cost_figure(judged(rows)), "energy_long": time_figure(judged(rows), series)}
+    rows = judged(rows)
+    return {"energy_cost": cost_figure(rows), "energy_long": time_figure(rows)}
 
 
 def cost_figure(rows: pd.DataFrame) -> Figure:
@@ -180,7 +182,7 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
+def time_figure(rows: pd.DataFrame) -> Figure:
     """Mean energy error over time with fixed steps, on both geometries."""
     dashes = {BASIC: "-", MOMENTA: ":", EVEN: "--"}
     chosen = [(SUN, BASIC), (SUN, MOMENTA), (GAUSS, BASIC), (GAUSS, EVEN), (RADAU, BASIC), (NEWMARK, BASIC)]
@@ -189,10 +191,10 @@ def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
         fixed = rows[(rows["group"] == "fixed") & (rows["case"] == motion)]
         for solver, variant in chosen:
             for _, row in of(fixed, solver, variant).iterrows():
-                if key(row, "t") in series:
+                if curves := row["series"]:
                     look = figures.look(row) | {"linestyle": dashes[variant], "marker": ""}
                     look["label"] = f"{row['name']}, h = {row['h']:g} s"
-                    axes.plot(series[key(row, "t")], np.abs(series[key(row, "mean")]), **look)
+                    axes.plot(curves["t"], np.abs(curves["mean"]), **look)
         axes.set(xscale="log", yscale="log", xlabel="time (s)")
         axes.set_title(f"{motion}: {rows[rows['case'] == motion]['problem'].iloc[0]}", fontsize=9)
     panels[0].set_ylabel("|mean energy error of a window| (J)")
@@ -200,7 +202,7 @@ def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
     return figure
 
 
-STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of)
+STUDY = Study("energy", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
 
 if __name__ == "__main__":
