@@ -28,6 +28,24 @@ def run(name: str, about: str | None, words: Sequence[str] | None, work: Callabl
     cli.main(inside, words)
 
 
+def run_rows(
+    name: str,
+    about: str | None,
+    words: Sequence[str] | None,
+    make: Make,
+    report: Callable[[Output, pd.DataFrame, str], Any],
+    curves: bool = False,
+) -> None:
+    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else."""
+
+    def work(output: Output) -> None:
+        if not output.call.redraw:
+            output.save_rows(make(output), cli.stamp(output.call.command))
+        report(output, *output.load_rows(curves))  # the same from new rows and from saved ones
+
+    run(name, about, words, work)
+
+
 def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
     """What makes the rows of runs(quick), with the columns of measure(run, result) and its curves, "series"."""
 
@@ -77,12 +95,7 @@ class Study:
 
     def main(self, words: Sequence[str] | None = None) -> None:
         """Make the rows, or with --redraw read those that were saved, and write the report."""
-        run(self.name, self.about, words, self._work)
-
-    def _work(self, output: Output) -> None:
-        if not output.call.redraw:
-            output.save_rows(self.make(output), cli.stamp(output.call.command))
-        self.report(output, *output.load_rows(self.curves))  # the same from new rows and from saved ones
+        run_rows(self.name, self.about, words, self.make, self.report, self.curves)
 
     def report(self, output: Output, rows: pd.DataFrame, line: str) -> None:
         """Write findings, figures and report; `line`: the stamp of the rows."""

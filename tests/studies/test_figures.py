@@ -12,7 +12,6 @@ from studies import motion, step_size, violation
 from studies.bench import figures
 from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, IRK_LINE, NEWMARK, gear
 from studies.energy import study as energy
-from studies.honesty import picture as honesty_picture
 from studies.honesty import study as honesty
 from studies.motion import GRIDS
 from studies.table3 import study as table3
@@ -174,7 +173,7 @@ def test_the_bars_of_honesty_are_the_shares_of_the_outcomes():
     made = pd.DataFrame([{"solver": name, "outcome": what} for name, each in outcomes.items() for what in each])
     totals = honesty.totals(made)
     assert [(line["solver"], line["n"]) for line in totals] == [("auto (two-loop)", 4), ("LSODA, index 1", 3)]
-    (axes,) = honesty_picture.picture(totals, honesty.PARTS).axes
+    (axes,) = honesty.picture(totals).axes
     shares = [[bar.get_width() for bar in bars] for bars in axes.containers]
     assert np.allclose(shares, [[75.0, 0.0], [25.0, 100.0 / 3.0], [0.0, 200.0 / 3.0]])
     assert np.allclose(np.sum(shares, axis=0), 100.0)
