@@ -11,6 +11,7 @@ takes `OUTCLASSED` times as long as another of its side is not repeated. A part 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -89,9 +90,7 @@ def collect(
     todo = list(todo)
 
     def first(run: Run) -> None:
-        if run.key(0) not in kept:
-            kept.add(run.key(0), make(run, 0, built))
-        row, runs = kept[run.key(0)], reached.setdefault(_side(run), [])
+        row, runs = kept.made(run.key(0), lambda: make(run, 0, built)), reached.setdefault(_side(run), [])
         good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
         who = progress.setdefault((run.case.name, run.solver.name), _Progress())
         who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
@@ -110,8 +109,8 @@ def collect(
     again = _repeated(todo, kept, always_repeated)
     for repeat in range(1, max((run.repeats for run in todo), default=0)):
         for run in again:
-            if repeat < run.repeats and run.key(repeat) not in kept:
-                kept.add(run.key(repeat), make(run, repeat, built))
+            if repeat < run.repeats:
+                kept.made(run.key(repeat), partial(make, run, repeat, built))
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 

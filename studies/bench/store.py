@@ -198,18 +198,20 @@ class Output:
         return f"{'quick' if self.call.quick else 'full'} {self.call.study}"
 
 
-def read_rows(path: Path) -> tuple[pd.DataFrame, str]:
+def read_rows(path: Path, *columns: str) -> tuple[pd.DataFrame, str]:
     """The rows of a file that `Output.save_rows` wrote, and its first line.
 
     Raises
     ------
     StudyError
-        If the file is damaged.
+        If the file is damaged, or lacks one of these columns.
     """
     try:
         first, rest = path.read_text().split("\n", 1)
-        return pd.read_csv(StringIO(rest), low_memory=False), first
-    except (ValueError, UnicodeDecodeError) as error:
+        rows = pd.read_csv(StringIO(rest), low_memory=False)
+        _ = rows[list(columns)]
+        return rows, first
+    except (ValueError, KeyError) as error:
         again = f"make it again by python -m studies.{path.stem}"
         raise StudyError(f"{path} is damaged ({error}); {again}") from None
 
