@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from references.paper.ablation import VARIANTS, solve_variant
 from studies.bench import figures
@@ -17,11 +16,10 @@ from studies.bench.cases import beam, four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver
 from studies.bench.metrics import violations
+from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
-
-Array = NDArray[np.floating]
 
 PAPER, FROZEN, PROJECTED, STABILISED, UNPROJECTED = VARIANTS
 RIVALS = (PROJECTED, STABILISED, UNPROJECTED)

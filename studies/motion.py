@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from studies.bench import figures
 from studies.bench.cases import four_bar
@@ -30,11 +29,10 @@ from studies.bench.solvers import (
     OWN_EXPLICIT,
     gear,
 )
+from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting
 from twoloop import Result
-
-Array = NDArray[np.float64]
 
 VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
 PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it

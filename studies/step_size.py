@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from references.sundials.ida import solve_ida
 from studies.bench import figures
@@ -17,11 +16,10 @@ from studies.bench.cases.four_bar import Y3
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, Solver
 from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting
 from twoloop import Result
-
-Array = NDArray[np.floating]
 
 LONG = 0.02  # s; the paper: Runge-Kutta steps are longer than this most of the time
 ERR_OUT, TOL = 1e-9, 1e-5  # of the paper's procedures; Atol = Rtol of all others, as of the paper

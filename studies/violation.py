@@ -6,7 +6,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from studies.bench import figures, tables
 from studies.bench.cases import four_bar
@@ -29,10 +28,9 @@ from studies.bench.solvers import (
     gear,
     paper_irk_at,
 )
+from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
 from twoloop import Result
-
-Array = NDArray[np.floating]
 
 LOOSE, TIGHT = 1e-3, 1e-9  # err_in and err_out of Table 3
 LEVELS = {"q": "max |C| (m)", "v": "max |C_q v + C_t| (m/s)", "a": "max |C_q a − Q_d| (m/s²)"}

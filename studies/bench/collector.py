@@ -16,17 +16,14 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from references.driver import user_call
 from studies.bench import metrics
 from studies.bench.reference_motion import ReferenceMotion, make_reference
-from studies.bench.store import KeptRows, Row
+from studies.bench.store import Array, KeptRows, Row
 from twoloop import Result, Statistics
 from twoloop.mechanisms import Problem
-
-Array = NDArray[np.float64]
 
 INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...

@@ -7,16 +7,15 @@ import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench.store import Array
 from twoloop import ConstrainedSystem
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar
 
 equations = sys.modules[four_bar.__module__]  # the module, whose name its function has taken in the package
 
-Array = NDArray[np.float64]
 
 GRASHOF, OTHER, NEAR = "a bar can turn round", "no bar can", "near a change point"
 KINDS = (GRASHOF, OTHER, NEAR)

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from studies.bench.store import Array
 
 T_END = 3.0  # s of all runs with these forces
 N_TABLE = 64

@@ -10,17 +10,15 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import sharp_callbacks as callbacks
 from studies.bench.random_linkages import equations as linkage
 from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import Sharp, drive, force_along
+from studies.bench.store import Array
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import four_bar, spatial, spatial_slider_crank
-
-Array = NDArray[np.float64]
 
 TINY = 1e-30  # imaginary step: derivatives without differences
 

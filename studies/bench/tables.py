@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
-
-Array = NDArray[np.float64]
+from studies.bench.store import Array
 
 SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
 DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated

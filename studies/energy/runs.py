@@ -7,7 +7,6 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.casadi.integrators import solve_cvodes
 from references.diffrax.dopri8 import solve_diffrax
@@ -28,13 +27,13 @@ from studies.bench.solvers import (
     OWN_BDF,
     OWN_EXPLICIT,
 )
+from studies.bench.store import Array
 from studies.energy.drift import drift, windows
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.methods.plan import Method
 from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
 
-Array = NDArray[np.float64]
 Variant = tuple[str, str]  # variables and partition
 
 ONE, SWITCHING = "one partition", "switching"

@@ -204,6 +204,3 @@ def time_figure(rows: pd.DataFrame) -> Figure:
 
 STUDY = Study("energy", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()

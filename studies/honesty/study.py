@@ -323,6 +323,3 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 STUDY = Study("honesty", __doc__, make, findings_of, figures_of, tables_of)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from studies.bench.cli import StudyError
 from studies.bench.random_linkages import end_of
@@ -17,12 +16,11 @@ from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families
 from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import CHECK, RTOL, march, motion, off
+from studies.bench.store import Array
 from studies.planted_errors.faults import python_copy
 from twoloop import ConstrainedSystem
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
-
-Array = NDArray[np.float64]
 
 NEVER = 1e30  # s
 # what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,

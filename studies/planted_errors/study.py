@@ -190,7 +190,3 @@ def _file(check: str) -> str:
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
     study.run_rows("planted_errors", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()

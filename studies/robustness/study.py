@@ -223,6 +223,3 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 STUDY = Study("robustness", __doc__, make, findings_of)
-
-if __name__ == "__main__":
-    main()

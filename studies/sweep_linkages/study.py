@@ -156,9 +156,3 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 STUDY = Study("sweep_linkages", __doc__, make, findings_of, figures_of)
 main = STUDY.main
-
-if __name__ == "__main__":
-    # the functions are to be those of the module, not of the script: other processes look for them there
-    from studies.sweep_linkages.study import main as main_of_module
-
-    main_of_module()

@@ -104,6 +104,3 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 STUDY = Study("symbolic_size", __doc__, make, findings_of)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()

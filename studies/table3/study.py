@@ -284,6 +284,3 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 STUDY = Study("table3", __doc__, make, findings_of, figures_of, tables_of, medians=True)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()

@@ -344,6 +344,3 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 STUDY = Study("validation", __doc__, make, findings_of, figures_of, tables_of)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()
