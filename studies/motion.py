@@ -31,7 +31,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
-from studies.bench.tables import setting
+from studies.bench.tables import setting, where
 from twoloop import Result
 
 VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
@@ -89,8 +89,8 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 def find(rows: pd.DataFrame, solver: str, step: float | None = None) -> pd.Series | None:
     """The row of a solver of the line-up, or with a fixed step of the stand-in."""
-    found = rows[(rows["group"] == ("line-up" if step is None else "GSTIFF stand-in")) & (rows["solver"] == solver)]
-    found = found if step is None else found[found["h"] == step]
+    fixed = {"group": "line-up"} if step is None else {"group": "GSTIFF stand-in", "h": step}
+    found = where(rows, solver=solver, **fixed)
     return None if found.empty else found.iloc[0]
 
 

@@ -49,6 +49,13 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
     return found.assign(repeats=np.diff(firsts, append=len(rows)), times=pd.Series(kept, dtype=object))
 
 
+def where(rows: pd.DataFrame, **equal: Any) -> pd.DataFrame:
+    """The rows in which each column named has that value, or one of a tuple of values."""
+    for column, value in equal.items():
+        rows = rows[rows[column].isin(value if isinstance(value, tuple) else (value,))]
+    return rows
+
+
 @cache
 def _rounds(n: int) -> NDArray[np.int64]:
     """Rounds of n repetitions, drawn again (RESAMPLES, n): the same for all runs, as rounds are interleaved."""

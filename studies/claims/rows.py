@@ -74,8 +74,7 @@ class Rows:
             raise NotRun(f"there is no {study}.csv")
         found = self.tables[study]
         found = found[found["solver"].astype(str).str.contains(named, regex=False)]
-        for column, value in equal.items():
-            found = found[found[column].isin(value if isinstance(value, tuple) else (value,))]
+        found = tables.where(found, **equal)
         if found.empty:
             raise NotRun(f"{study}.csv has no row of {named} with {', '.join(f'{c} = {v}' for c, v in equal.items())}")
         if least and not found["t_end"].max() >= least:

@@ -26,6 +26,7 @@ from studies.bench.solvers import (
     IRK,
     OWN_BDF,
     OWN_EXPLICIT,
+    at_instants,
 )
 from studies.bench.store import Array
 from studies.energy.drift import drift, windows
@@ -137,8 +138,7 @@ def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int
 
 
 def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> Result:
-    p, options = case.problem, {"time_limit": case.time_limit, "most_steps": MOST_STEPS}
-    return solve(p.system, (0.0, case.t_end), p.q0, p.v0, tol, tol, t_eval=np.append(0.0, case.instants), **options)
+    return at_instants(solve, case, rtol=tol, atol=tol, most_steps=MOST_STEPS)
 
 
 def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:

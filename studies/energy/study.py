@@ -14,7 +14,7 @@ from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Study, rows_of
-from studies.bench.tables import setting, unfinished
+from studies.bench.tables import setting, unfinished, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,
@@ -52,13 +52,12 @@ def name_of(row: pd.Series) -> str:
 
 def of(rows: pd.DataFrame, solver: str, variant: Variant = BASIC) -> pd.DataFrame:
     """The runs of a method on certain variables, with a certain choice of the partition."""
-    same = (rows["variables"] == variant[0]) & (rows["partition"] == variant[1])
-    return rows[(rows["solver"] == solver) & same]
+    return where(rows, solver=solver, variables=variant[0], partition=variant[1])
 
 
 def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC, group: str = "fixed") -> pd.Series:
     """The long run of a method with fixed steps (group "fixed") or step-size control ("controlled")."""
-    chosen = of(rows[(rows["case"] == motion) & (rows["group"] == group)], solver, variant)
+    chosen = of(where(rows, case=motion, group=group), solver, variant)
     if chosen.empty:
         raise StudyError(f"the rows have no run of {solver} on {motion}; make them again by python -m studies.energy")
     return chosen.iloc[0]
@@ -132,7 +131,7 @@ def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report and the first screen say."""
     rows = judged(rows)
-    fixed = rows[(rows["group"] == "fixed") & (rows["case"] == SWITCHING)]
+    fixed = where(rows, group="fixed", case=SWITCHING)
     even = fixed["partition"] == "symmetric"
     kinds = {"lasting": ~even, "even": even & (fixed["solver"] != SUN), "uneven": even & (fixed["solver"] == SUN)}
     calm = {name: fixed[which]["verdict"] == NO_DRIFT for name, which in kinds.items()}
@@ -188,9 +187,8 @@ def time_figure(rows: pd.DataFrame) -> Figure:
     chosen = [(SUN, BASIC), (SUN, MOMENTA), (GAUSS, BASIC), (GAUSS, EVEN), (RADAU, BASIC), (NEWMARK, BASIC)]
     figure, panels = plt.subplots(1, 2, figsize=(10.5, 3.8), sharey=True, layout="constrained")
     for axes, motion in zip(panels, (ONE, SWITCHING), strict=True):
-        fixed = rows[(rows["group"] == "fixed") & (rows["case"] == motion)]
         for solver, variant in chosen:
-            for _, row in of(fixed, solver, variant).iterrows():
+            for _, row in of(where(rows, group="fixed", case=motion), solver, variant).iterrows():
                 if curves := row["series"]:
                     look = figures.look(row) | {"linestyle": dashes[variant], "marker": ""}
                     look["label"] = f"{row['name']}, h = {row['h']:g} s"

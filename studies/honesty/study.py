@@ -22,7 +22,7 @@ from studies.bench.render import table
 from studies.bench.sharp_forces import T_END
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
-from studies.honesty.solvers import DEFAULT, DEFAULT_COMPILED, LIMITED, OURS, Call, solvers, why_not
+from studies.honesty.solvers import CVODE_C, DEFAULT, DEFAULT_COMPILED, HEYOKA, LIMITED, OURS, Call, solvers, why_not
 from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
@@ -40,7 +40,7 @@ REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, t
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
-BUILT = ("heyoka", "cvode_c")  # calls of solvers that are built for each system, which takes longer than they run
+BUILT = (HEYOKA, CVODE_C)  # solvers that are built for each system, which takes longer than they run
 
 PARTS = {  # of the bars of the figure
     "right": ((RIGHT,), figures.BLUE),
@@ -158,7 +158,7 @@ def make(output: Output) -> pd.DataFrame:
 
 def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
     """Compile in this process what the children call, on a harmless motion."""
-    shared = call.func.__name__ if isinstance(call, partial) and not name.endswith(OURS) else name
+    shared = name.removesuffix(LIMITED)
     sane, tolerance = trap.sane or trap.system, 1e-4
     made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *sane.functions[:-2])
     if shared in BUILT:

@@ -9,6 +9,7 @@ import pytest
 from studies.bench import tables
 from studies.bench.render import number, render
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
+from studies.bench.store import KeptRows
 from studies.work_precision import goals, rivals, scaling
 from studies.work_precision import study as work_precision
 from twoloop import solve_dae
@@ -109,7 +110,7 @@ def test_the_reference_of_the_second_geometry_is_held_by_a_second_way():
 
 
 class Kept(dict):
-    add = dict.__setitem__
+    add, made = dict.__setitem__, KeptRows.made
 
 
 def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
