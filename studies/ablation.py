@@ -54,10 +54,8 @@ LOOKS = dict(zip(VARIANTS, zip(COLORS, "ovsD^", strict=True), strict=True))
 
 
 def _solve(variant: str, tableau: Tableau, setting: str, case: Case, value: float, repeat: int) -> Result:
-    problem, limit = case.problem, case.time_limit
-    options = {"step": value, "tol": None} if setting == "h" else {"step": None, "tol": value}
-    span = (0.0, case.t_end)
-    return solve_variant(problem.system, span, problem.q0, problem.v0, variant, tableau, time_limit=limit, **options)[0]
+    options: dict[str, Any] = {"step" if setting == "h" else "tol": value, "time_limit": case.time_limit}
+    return solve_variant(*case.start, variant, tableau, **options)[0]
 
 
 def solver(variant: str, tableau: Tableau, setting: str) -> Solver:

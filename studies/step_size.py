@@ -31,8 +31,7 @@ MARKS = {"error": ("x", "error too large, shortened"), "convergence": ("v", "not
 
 
 def _ida(case: Case, tolerance: float, repeat: int) -> Result:
-    p = case.problem
-    return solve_ida(p.system, (0.0, case.t_end), p.q0, p.v0, "stabilised", tolerance, tolerance)
+    return solve_ida(*case.start, "stabilised", tolerance, tolerance)
 
 
 def runs(quick: bool) -> list[Run]:

@@ -45,11 +45,9 @@ def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
         {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
         for name in names
     ]
+    shown = [solver for solver in LISTED if any(solver in cost for cost in costs)]
     nothing = ["", *["–"] * len(TARGETS)]
-    lines = []
-    for solver in LISTED:
-        cells = [cell for cost in costs for cell in cost.get(solver, nothing)[1:]]
-        lines += [[solver, *cells]] if any(solver in cost for cost in costs) else []
+    lines = [[solver, *(cell for cost in costs for cell in cost.get(solver, nothing)[1:])] for solver in shown]
     errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
     return table(["solver", *errors], lines)
 

@@ -88,13 +88,9 @@ COMPARED = (
 )
 
 
-def _start(case: Case) -> tuple[Any, Any, Any, Any]:
-    return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
-
-
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: bool = False) -> Result:
     limit = case.time_limit
-    return solve_dae(*_start(case), method, tolerance, tolerance, time_limit=limit, compiled=compiled)
+    return solve_dae(*case.start, method, tolerance, tolerance, time_limit=limit, compiled=compiled)
 
 
 def _chosen(tolerance: float, result: Result) -> str:
@@ -129,13 +125,13 @@ def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repea
 
 def _canonical(case: Case, step: float, repeat: int) -> Result:
     method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    return solve_dae(*_start(case), method=method, step_size=step, time_limit=case.time_limit)
+    return solve_dae(*case.start, method=method, step_size=step, time_limit=case.time_limit)
 
 
 def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Result:
     """A run of a solver that tells its states at the common instants; `NotApplicable` where it needs expressions."""
     try:
-        return solve(*_start(case), t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
+        return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
     except NotSymbolic as why:
         raise NotApplicable(str(why)) from None
 
@@ -158,7 +154,7 @@ def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int
 
 
 def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, time_limit=case.time_limit)
+    return solve_fully_implicit(*case.start, method, tolerance, tolerance, time_limit=case.time_limit)
 
 
 def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
@@ -177,13 +173,13 @@ def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
 
 def _collocation(case: Case, step: float, repeat: int) -> Result:
     try:
-        return solve_collocation(*_start(case), round(case.t_end / step), time_limit=case.time_limit)
+        return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
     except NotSymbolic as why:
         raise NotApplicable(str(why)) from None
 
 
 def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_index1(*_start(case), rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
+    return solve_index1(*case.start, rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
@@ -202,7 +198,7 @@ def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, 
 def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Result:
     n_steps = round(case.t_end / step)
     kept = np.append(np.arange(0, n_steps, max(1, n_steps // STORED)) * step, case.t_end)
-    return solve_gear(*_start(case), step, order, start=start, t_eval=kept, time_limit=case.time_limit)
+    return solve_gear(*case.start, step, order, start=start, t_eval=kept, time_limit=case.time_limit)
 
 
 def baumgarte(method: str, alpha: float) -> str:

@@ -11,6 +11,7 @@ import os
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from importlib.metadata import version
 from io import BytesIO, StringIO
 from itertools import count
@@ -31,16 +32,8 @@ FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes
 NUMERICS = ("numpy", "scipy", "numba")
 # studies whose times are compared, so that no two run at once
 TIMED = (
-    "work_precision",
-    "compare",
-    "table3",
-    "beam",
-    "energy",
-    "violation",
-    "symbolic_size",
-    "sweep_linkages",
-    "ensembles",
-    "ablation",
+    *("work_precision", "compare", "table3", "beam", "energy", "violation", "symbolic_size", "sweep_linkages"),
+    *("ensembles", "ablation"),
 )
 WHOLE_CALL = "whole call"  # what their times are of, in their findings
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
@@ -65,43 +58,30 @@ class Output:
     def __init__(self, call: Call):
         self.call = call
         self.path = call.out.resolve()
-        self._lock: int | None = None
-        self._machine: int | None = None
+        self._locks = ExitStack()
 
     def __enter__(self) -> Self:
-        lock = self.path / ".lock"
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | NO_LINK, 0o644)
-            tempfile.TemporaryFile(dir=self.path).close()
-        except OSError as error:
-            self._unlock()
-            raise StudyError(f"cannot write to {self.path}: {error.strerror}; choose another folder by --out") from None
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._unlock()
-            raise StudyError(
-                f"another run is writing to {self.path}; wait for it, or choose another folder by --out"
-            ) from None
-        if self.call.study in TIMED and not (self.call.quick or self.call.redraw):
+        with ExitStack() as held:
             try:
-                self._machine = alone()
-            except StudyError:
-                self._unlock()
-                raise
+                self.path.mkdir(parents=True, exist_ok=True)
+                lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | NO_LINK, 0o644)
+                held.callback(os.close, lock)  # which releases the lock, as the end of the process does
+                tempfile.TemporaryFile(dir=self.path).close()
+            except OSError as error:
+                why = f"cannot write to {self.path}: {error.strerror}"
+                raise StudyError(f"{why}; choose another folder by --out") from None
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                why = f"another run is writing to {self.path}"
+                raise StudyError(f"{why}; wait for it, or choose another folder by --out") from None
+            if self.call.study in TIMED and not (self.call.quick or self.call.redraw):
+                held.callback(os.close, alone())
+            self._locks = held.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._unlock()
-
-    def _unlock(self) -> None:
-        if self._machine is not None:
-            os.close(self._machine)
-            self._machine = None
-        if self._lock is not None:
-            os.close(self._lock)  # which releases the lock, as the end of the process does
-            self._lock = None
+        self._locks.close()
 
     def file(self, name: str) -> Path:
         """Path of a file of the report to read, which must not be a link out of the folder."""

@@ -256,7 +256,7 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
         line |= {what: float(_cost(told[what].to_numpy(float), place)) for what in COSTS}
         lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
-    return pd.DataFrame(lines).sort_values("call_s", ignore_index=True) if lines else pd.DataFrame()
+    return pd.DataFrame(lines, columns=["solver", *RANKED]).sort_values("call_s", ignore_index=True)
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
@@ -271,8 +271,6 @@ def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
 
 def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
     """The cheapest of ours and of others in a ranking."""
-    if ranked.empty:
-        return {"ours": None, "others": None}
     own = ranked["family"] == "two-loop"
     return {"ours": best(ranked[own]), "others": best(ranked[~own])}
 

@@ -117,8 +117,7 @@ def instants(case: Case, h: float) -> Array | None:
 
 
 def _solve(method: str | Method, case: Case, **options: Any) -> Result:
-    problem = case.problem
-    return solve_dae(problem.system, (0.0, case.t_end), problem.q0, problem.v0, method=method, **options)
+    return solve_dae(*case.start, method=method, **options)
 
 
 def _fixed(method: Method, case: Case, h: float, repeat: int) -> Result:
@@ -132,9 +131,8 @@ def _controlled(method: str | Method, case: Case, tol: float, repeat: int, compi
 
 
 def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int) -> Result:
-    p, span = case.problem, (0.0, case.t_end)
     options: dict[str, Any] = {"stabilisation": stabilisation, "t_eval": np.append(0.0, case.instants)}
-    return solve_index1(p.system, span, p.q0, p.v0, method, tol, tol, **options)
+    return solve_index1(*case.start, method, tol, tol, **options)
 
 
 def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> Result:

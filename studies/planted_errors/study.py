@@ -161,10 +161,8 @@ def make(output: Output) -> pd.DataFrame:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     missed = rows[rows["caught_by"] == NONE]
-    places = {
-        str(place): {"n": len(own), "caught": int((own["caught_by"] != NONE).sum())}
-        for place, own in rows.groupby("place", sort=False)
-    }
+    caught = (rows["caught_by"] != NONE).groupby(rows["place"], sort=False)
+    places = {str(place): {"n": len(own), "caught": int(own.sum())} for place, own in caught}
     return {"n": len(rows), "missed": missed["fault"].tolist(), "places": places, "tolerance": TOLERANCE}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
+from studies.bench.sharp_motion import RIGHT, SAID, SILENT
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
 from studies.robustness import sharp_runs
@@ -23,7 +24,6 @@ QUICK_METHODS = ("DOP853", "Gauss12", "BDF")
 TOLERANCE = 1e-8  # rtol and atol of all runs
 LOOSENESS = 1e3  # an answer is right within so many tolerances, times the sensitivity of the end to the start
 TIME_LIMIT = 10.0  # s
-RIGHT, SAID, SILENT = "right", "said so", "wrong and silent"
 T_END = 5.0  # s; of a size s it is times sqrt(s)
 SEED = 2016
 N_LINKAGES, N_QUICK = 100, 2  # of each kind
@@ -160,17 +160,12 @@ def counts_of(own: pd.DataFrame) -> dict[str, Any]:
 
 def limits_of(own: pd.DataFrame) -> dict[str, Any]:
     """Smallest and largest value from which and to which all of a method's runs are right, about 1."""
-    good = (own["outcome"] == RIGHT).groupby(own["value"]).all()
-    low = high = None
-    for value in sorted((x for x in good.index if x <= 1.0), reverse=True):
-        if not good[value]:
-            break
-        low = float(value)
-    for value in sorted(x for x in good.index if x >= 1.0):
-        if not good[value]:
-            break
-        high = float(value)
-    return {"low": low, "high": high, "said": sorted({str(x) for x in own[own["outcome"] == SAID]["status"]})}
+    good = (own["outcome"] == RIGHT).groupby(own["value"]).all()  # in the order of the values
+    found: dict[str, Any] = {}
+    for end, outwards in (("low", good[good.index <= 1.0][::-1]), ("high", good[good.index >= 1.0])):
+        reached = outwards.index[outwards.cummin()]
+        found[end] = float(reached[-1]) if len(reached) else None
+    return found | {"said": sorted({str(x) for x in own[own["outcome"] == SAID]["status"]})}
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:

@@ -91,8 +91,7 @@ def partition_cost(rows: pd.DataFrame) -> float:
 
 def _paper_irk(test: Reading, case: Case, err_out: float, repeat: int) -> Result:
     method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, err_out, outer_test=test)
-    span, start = (0.0, case.t_end), (case.problem.q0, case.problem.v0)
-    return solve_dae(case.problem.system, span, *start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
+    return solve_dae(*case.start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
 
 
 def reading_runs(case: Case) -> list[Run]:

@@ -58,8 +58,7 @@ STEP = 0.01  # s, of the runs that tell what a partition costs
 
 
 def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
-    problem, method = case.problem, RungeKutta(gauss(1), partition=partition)  # type: ignore[arg-type]
-    return solve_dae(problem.system, (0.0, case.t_end), problem.q0, problem.v0, method=method, step_size=step)
+    return solve_dae(*case.start, method=RungeKutta(gauss(1), partition=partition), step_size=step)  # type: ignore[arg-type]
 
 
 def runs(first: Case, second: Case, quick: bool) -> list[Run]:

@@ -15,7 +15,6 @@ import site
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -147,16 +146,6 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
             line["never"] += pays is None and solver != DEFAULT
         found.append(line)
     return found
-
-
-def lines(found: list[dict[str, Any]]) -> Iterator[list[Any]]:
-    """Of the table."""
-    for line in found:
-        pays = sorted(line["pays"])
-        from_run = "–" if not pays else "–".join(dict.fromkeys(f"{n:.0f}" for n in (pays[0], pays[-1])))
-        never = f"never on {line['never']}" if line["never"] else ""
-        said = ", ".join(text for text in ("" if not pays else from_run, never) if text)
-        yield [f"`{line['solver']}`", line["first_call_s"], 1e3 * line["call_s"], said or "–"]
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from references.scipy.index1 import solve_index1
-from studies.bench.render import table
 from studies.bench.store import KeptRows, Row
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, n_four_bar
@@ -163,11 +162,3 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
         line["step_exponent"] = exponent(sizes, middle["step_us"])
         found.append(line | {"evaluation_us": float(middle["evaluation_us"].iloc[-1])})
     return found
-
-
-def pivot(found: list[dict[str, Any]]) -> str:
-    """A table: by mechanism and method the exponent of a step."""
-    methods, families = (list(dict.fromkeys(line[key] for line in found)) for key in ("method", "family"))
-    cells = {(line["family"], line["method"]): line["step_exponent"] if line["sizes"] else "failed" for line in found}
-    lines = [[family, *(cells.get((family, method), "–") for method in methods)] for family in families]
-    return table(["mechanism", *methods], lines)
