@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from references.paper.ablation import VARIANTS, solve_variant
 from studies.bench import figures
@@ -17,11 +16,11 @@ from studies.bench.cases import beam, four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver
 from studies.bench.metrics import violations
-from studies.bench.study import Series, Study, key
+from studies.bench.store import Array
+from studies.bench.study import Study, rows_of
+from studies.bench.tables import where
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
-
-Array = NDArray[np.floating]
 
 PAPER, FROZEN, PROJECTED, STABILISED, UNPROJECTED = VARIANTS
 RIVALS = (PROJECTED, STABILISED, UNPROJECTED)
@@ -50,17 +49,13 @@ KEPT = 1e-12  # m; what is violated no more is kept
 GROWS = 2.0  # times the violation of the first tenth of a run in its last
 SAME_TOLERANCE = HALVES[8]  # 1e-5, the paper's, at which step lengths are compared
 
-COLORS = dict(
-    zip(VARIANTS, (figures.RED, figures.GREY, figures.BLUE, figures.GREEN, figures.ORANGE), strict=True),
-)
-MARKERS = dict(zip(VARIANTS, "ovsD^", strict=True))
+COLORS = (figures.RED, figures.GREY, figures.BLUE, figures.GREEN, figures.ORANGE)
+LOOKS = dict(zip(VARIANTS, zip(COLORS, "ovsD^", strict=True), strict=True))
 
 
 def _solve(variant: str, tableau: Tableau, setting: str, case: Case, value: float, repeat: int) -> Result:
-    problem, limit = case.problem, case.time_limit
-    options = {"step": value, "tol": None} if setting == "h" else {"step": None, "tol": value}
-    span = (0.0, case.t_end)
-    return solve_variant(problem.system, span, problem.q0, problem.v0, variant, tableau, time_limit=limit, **options)[0]
+    options: dict[str, Any] = {"step" if setting == "h" else "tol": value, "time_limit": case.time_limit}
+    return solve_variant(*case.start, variant, tableau, **options)[0]
 
 
 def solver(variant: str, tableau: Tableau, setting: str) -> Solver:
@@ -130,9 +125,8 @@ def costs_at(along: pd.DataFrame, targets: Sequence[float], what: str) -> Array:
 def ratios(rows: pd.DataFrame, rival: str, what: str) -> list[float]:
     """Costs of a rival over those of positions in every stage, for all cases, tableaux and errors that both have."""
     found: list[float] = []
-    controlled = rows[rows["group"] == "controlled"]
-    for (case, _), both in controlled.groupby(["case", "tableau"], sort=False):
-        one, other = (costs_at(both[both["solver"] == name], TARGETS[case], what) for name in (rival, PAPER))
+    for (case, _), both in where(rows, group="controlled").groupby(["case", "tableau"], sort=False):
+        one, other = (costs_at(where(both, solver=name), TARGETS[case], what) for name in (rival, PAPER))
         found += (one / other).tolist()
     return [ratio for ratio in found if np.isfinite(ratio)]
 
@@ -140,9 +134,9 @@ def ratios(rows: pd.DataFrame, rival: str, what: str) -> list[float]:
 def frozen_ratios(rows: pd.DataFrame, what: str = "n_evaluations") -> list[float]:
     """Least costs of the best runs with dependents frozen over those of the paper's runs that are as good or better."""
     found = []
-    controlled = rows[(rows["group"] == "controlled") & rows["error_q"].notna()]
+    controlled = where(rows, group="controlled").dropna(subset="error_q")
     for _, both in controlled.groupby(["case", "tableau"], sort=False):
-        one, other = (both[both["solver"] == name] for name in (FROZEN, PAPER))
+        one, other = where(both, solver=FROZEN), where(both, solver=PAPER)
         if len(one) and (other["error_q"] <= one["error_q"].min()).any():
             finest = one.loc[one["error_q"].astype(float).idxmin()]
             found.append(float(finest[what] / other[other["error_q"] <= finest["error_q"]][what].min()))
@@ -151,8 +145,8 @@ def frozen_ratios(rows: pd.DataFrame, what: str = "n_evaluations") -> list[float
 
 def order(rows: pd.DataFrame, variant: str, tableau: str) -> float:
     """Slope of the position error over the steps of `ORDER_STEPS`."""
-    along = rows[(rows["group"] == "order") & (rows["solver"] == variant) & (rows["tableau"] == tableau)]
-    long, short = (along[along["h"] == h]["error_q"].astype(float).mean() for h in ORDER_STEPS)
+    along = where(rows, group="order", solver=variant, tableau=tableau)
+    long, short = (where(along, h=h)["error_q"].astype(float).mean() for h in ORDER_STEPS)
     return float(np.log(long / short) / np.log(ORDER_STEPS[0] / ORDER_STEPS[1]))
 
 
@@ -172,115 +166,100 @@ def verdict(span: list[float] | None) -> str:
     return "dearer" if span[2] <= 1.0 else "mixed"
 
 
-def _longest(rows: pd.DataFrame, case: str, variant: str) -> float | None:
-    """The longest fixed step of a run that reaches its end and is in phase there."""
-    fixed = rows[(rows["group"] == "fixed") & (rows["case"] == case) & (rows["tableau"] == SUN.name)]
-    good = fixed[(fixed["solver"] == variant) & (fixed["status"] == "REACHED_END") & ~fixed["astray"].astype(bool)]["h"]
-    return None if good.empty else float(good.max())
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says, from the medians."""
     if not {*VARIANTS} <= set(rows["solver"]) or "tableau" not in rows:
         raise StudyError("the rows lack variants; make them again by python -m studies.ablation")
-    controlled, fixed = (rows[rows["group"] == group] for group in ("controlled", "fixed"))
-    names = list(dict.fromkeys(rows["case"]))
+    controlled = where(rows, group="controlled")
+    cases = {name: of_case(name, own) for name, own in rows.groupby("case", sort=False)}
     against = {}
     for rival in RIVALS:
         spans = {name: _span(ratios(rows, rival, what)) for name, what in COSTS.items()}
         against[rival] = {"spans": spans, "verdicts": {name: verdict(span) for name, span in spans.items()}}
-    kept = {name: float(controlled[controlled["solver"] == name]["violation_q"].max()) for name in VARIANTS}
+    kept = {name: float(where(controlled, solver=name)["violation_q"].max()) for name in VARIANTS}
     tableaux = list(dict.fromkeys(rows["tableau"]))
     orders = {variant: {tableau: order(rows, variant, tableau) for tableau in tableaux} for variant in VARIANTS}
-    told = {name: [target for target in TOLD[name]] for name in names}
-    at_tolerance = controlled[np.isclose(controlled["tol"].astype(float), SAME_TOLERANCE)]
+    frozen = where(controlled, solver=FROZEN).groupby("case", sort=False)["error_q"].min()
+    drawn = {variant: _at_drawn(rows, variant) for variant in VARIANTS}
+    drift, nothing = drawn[UNPROJECTED], {"violation_q": np.nan, "energy": np.nan}
+    costs = [costs[FROZEN]["evaluations"] for costs in (each["costs"] for each in cases.values())]
     return {
-        "cases": [{"name": name, "t_end": float(rows[rows["case"] == name]["t_end"].iloc[0])} for name in names],
+        "cases": [{"name": name, "t_end": float(where(rows, case=name)["t_end"].iloc[0])} for name in cases],
         "tableaux": tableaux,
         "against": against,
         "n_compared": len(ratios(rows, PROJECTED, "n_evaluations")),
-        "frozen": {"at_least": _span(frozen_ratios(rows)), "best": _best_frozen(controlled)},
+        "frozen": {"at_least": _span(frozen_ratios(rows)), "best": frozen.to_dict()},
         "orders": orders,
         "frozen_order_one": all(value < ONE for value in orders[FROZEN].values()),
         "kept": kept,
         "kept_as_well": kept[PROJECTED] <= max(KEPT, kept[PAPER]),
-        "drift": _drift(fixed),
+        # in the first and in the last tenth of the run that the figure shows
+        "drift": None if drift is None else [float(drift["violation_early"]), float(drift["violation_late"])],
         "grows": GROWS,
-        "longest": {name: {variant: _longest(rows, name, variant) for variant in VARIANTS} for name in names},
-        "median_h": {name: {v: _median_step(at_tolerance, name, v) for v in VARIANTS} for name in names},
+        **{what: {name: each[what] for name, each in cases.items()} for what in ("longest", "median_h", "costs")},
         "tolerance": float(SAME_TOLERANCE),
-        "costs": {name: {v: _costs(controlled, name, v, told[name]) for v in VARIANTS} for name in names},
-        "told": told,
-        "drawn": {variant: _at_drawn_step(fixed, variant) for variant in VARIANTS},
-        "drawn_step": _drawn(fixed),
-        "frozen_reaches_none": not any(
-            np.isfinite(_costs(controlled, name, FROZEN, told[name])["evaluations"]).any() for name in names
-        ),
+        "told": {name: list(TOLD[name]) for name in cases},
+        "drawn": {name: nothing if row is None else row[[*nothing]].abs().to_dict() for name, row in drawn.items()},
+        "drawn_step": _drawn(where(rows, group="fixed")),
+        "frozen_reaches_none": not np.isfinite(np.concatenate(costs)).any(),
+    }
+
+
+def of_case(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """Of each variant with the paper's tableau on one mechanism, by what is told of it.
+
+    The longest fixed step of a run that reaches its end and is in phase there, the median step at the tolerance at
+    which these are compared, and costs at the errors of the table.
+    """
+    rows = where(rows, tableau=SUN.name)
+    good = where(rows, group="fixed", status="REACHED_END")
+    longest = good[~good["astray"].astype(bool)].groupby("solver")["h"].max()
+    controlled = where(rows, group="controlled")
+    at_tolerance = controlled[np.isclose(controlled["tol"].astype(float), SAME_TOLERANCE)]
+    median_h = at_tolerance.groupby("solver")["h_median"].first()
+
+    def costs(variant: str) -> dict[str, list[float]]:
+        along = where(controlled, solver=variant)
+        return {cost: costs_at(along, TOLD[name], what).tolist() for cost, what in COSTS.items()}
+
+    return {
+        "longest": longest.astype(float).reindex(VARIANTS).replace(np.nan, None).to_dict(),
+        "median_h": median_h.astype(float).reindex(VARIANTS).replace(np.nan, None).to_dict(),
+        "costs": {variant: costs(variant) for variant in VARIANTS},
     }
 
 
 def _drawn(fixed: pd.DataFrame) -> float:
-    steps = set(fixed["h"])
-    return DRAWN_STEP if DRAWN_STEP in steps and fixed["t_end"].max() >= T_END else DRAWN_STEP_QUICK
+    return DRAWN_STEP if DRAWN_STEP in set(fixed["h"]) and fixed["t_end"].max() >= T_END else DRAWN_STEP_QUICK
 
 
-def _at_drawn(fixed: pd.DataFrame, variant: str) -> pd.Series | None:
-    chosen = fixed[(fixed["case"] == LINKAGE) & (fixed["tableau"] == SUN.name) & (fixed["solver"] == variant)]
-    chosen = chosen[chosen["h"] == _drawn(fixed)]
+def _at_drawn(rows: pd.DataFrame, variant: str) -> pd.Series | None:
+    """The run of a variant that the figure over time shows."""
+    fixed = where(rows, group="fixed")
+    chosen = where(fixed, case=LINKAGE, tableau=SUN.name, solver=variant, h=_drawn(fixed))
     return None if chosen.empty else chosen.iloc[0]
 
 
-def _drift(fixed: pd.DataFrame) -> list[float] | None:
-    """Largest violation without projection in the first and in the last tenth of the run that the figure shows."""
-    row = _at_drawn(fixed, UNPROJECTED)
-    return None if row is None else [float(row["violation_early"]), float(row["violation_late"])]
-
-
-def _at_drawn_step(fixed: pd.DataFrame, variant: str) -> dict[str, float]:
-    """Largest violation and energy error of the run that the figure shows."""
-    row = _at_drawn(fixed, variant)
-    return {name: float("nan") if row is None else abs(float(row[name])) for name in ("violation_q", "energy")}
-
-
-def _median_step(rows: pd.DataFrame, case: str, variant: str) -> float | None:
-    chosen = rows[(rows["case"] == case) & (rows["tableau"] == SUN.name) & (rows["solver"] == variant)]
-    return None if chosen.empty or pd.isna(chosen["h_median"].iloc[0]) else float(chosen["h_median"].iloc[0])
-
-
-def _best_frozen(controlled: pd.DataFrame) -> dict[str, float]:
-    chosen = controlled[controlled["solver"] == FROZEN].groupby("case", sort=False)["error_q"].min()
-    return {str(name): float(value) for name, value in chosen.items()}
-
-
-def _costs(controlled: pd.DataFrame, case: str, variant: str, targets: Sequence[float]) -> dict[str, list[float]]:
-    """Costs with the paper's tableau at the errors of the table."""
-    along = controlled[(controlled["case"] == case) & (controlled["tableau"] == SUN.name)]
-    along = along[along["solver"] == variant]
-    return {name: costs_at(along, targets, what).tolist() for name, what in COSTS.items()}
-
-
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Cost over error by three measures on both mechanisms; violation and energy over time."""
     names = list(dict.fromkeys(rows["case"]))
     made, axes = plt.subplots(len(names), 3, figsize=(10.5, 3.0 * len(names)), sharex="row", layout="constrained")
-    controlled = rows[(rows["group"] == "controlled") & (rows["tableau"] == SUN.name)]
+    controlled = where(rows, group="controlled", tableau=SUN.name)
     for name, line in zip(names, np.atleast_2d(axes), strict=True):
         for (text, what), panel in zip(COSTS.items(), line, strict=True):
             for variant in VARIANTS:
-                along = controlled[(controlled["case"] == name) & (controlled["solver"] == variant)]
-                along = figures.with_gaps(along)
+                along = figures.with_gaps(where(controlled, case=name, solver=variant))
                 panel.plot(along["error_q"].astype(float), along[what].astype(float), **_look(variant))
             label = "CPU time (s)" if what == TIME else text
             panel.set(xscale="log", yscale="log", ylabel=label, xlabel="largest position error (m, rad)")
         line[0].set_title(name, loc="left")
     figures.legend(made, np.ravel(axes))
     drift, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.2), layout="constrained")
-    fixed = rows[(rows["group"] == "fixed") & (rows["tableau"] == SUN.name)]
     for variant in VARIANTS:
-        row = _at_drawn(fixed, variant)
-        if row is not None and key(row, "violation") in series:
+        row = _at_drawn(rows, variant)
+        if row is not None and "violation" in row["series"]:
             for panel, name in ((left, "violation"), (right, "energy")):
-                t, size = series[key(row, name)]
+                t, size = row["series"][name]
                 panel.plot(t, np.maximum.accumulate(size), **_look(variant) | {"marker": ""})
             drift.suptitle(f"{row['case']}, steps of {row['h']:g} s", fontsize=10)
     left.set(yscale="log", xlabel="t (s)", ylabel="largest |C| so far (m)", ylim=(1e-17, None))
@@ -290,10 +269,11 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
 
 
 def _look(variant: str) -> dict[str, Any]:
-    return {"color": COLORS[variant], "marker": MARKERS[variant], "label": variant, "markersize": 3.5}
+    color, marker = LOOKS[variant]
+    return {"color": color, "marker": marker, "label": variant, "markersize": 3.5}
 
 
-STUDY = Study("ablation", __doc__, runs, measure, findings_of, figures_of)
+STUDY = Study("ablation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
 
 if __name__ == "__main__":

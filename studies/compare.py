@@ -100,23 +100,23 @@ def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Se
     kept |= {"violation_v": "max abs C_q v + C_t", "energy": "energy error (J)"}
     quality = [[run[key] for key in kept] for _, run in tables.ranking(rows, middle).iterrows()]
     ready = {"work": table(header, tables.work_precision(rows, errors)), "kept": table([*kept.values()], quality)}
-    ready["failed"] = table(["solver", "setting", "status", "message"], tables.failures(rows))
+    ready["failed"] = _failed(rows)
     more = {"stamp": line, "quick": output.call.quick, "middle": middle, "note": case.note, "drawn": bool(lines)}
     output.write("compare.md", render("compare", findings, ready, **more))
 
 
+def _failed(rows: pd.DataFrame) -> str:
+    return table(["solver", "setting", "status", "message"], tables.failures(rows))
+
+
 def _work(words: Sequence[str] | None) -> None:
     parser = cli.parser("compare", __doc__)
-    parser.add_argument(
-        "where",
-        metavar="MECHANISM",
-        help="FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism",
-    )
+    what = "FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism"
+    parser.add_argument("where", metavar="MECHANISM", help=what)
     parser.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     parser.add_argument("--solvers", nargs="+", metavar="NAME", help=f"of {', '.join(CATALOGUE)}")
-    parser.add_argument(
-        "--reference-limit", type=float, default=REFERENCE_LIMIT, metavar="S", help="s, for each run of the reference"
-    )
+    limit: dict[str, Any] = {"default": REFERENCE_LIMIT, "metavar": "S", "help": "s, for each run of the reference"}
+    parser.add_argument("--reference-limit", type=float, **limit)
     parser.add_argument("--errors", nargs="+", type=float, default=list(ERRORS), help="errors to compare the cost at")
     given = parser.parse_args(words)
     unknown = [name for name in given.solvers or () if name not in CATALOGUE]
@@ -138,24 +138,18 @@ def _work(words: Sequence[str] | None) -> None:
         if call.redraw:
             rows, line = output.load_rows()
         else:
-            runs, line = runs_of(case, given.solvers or COMPARED, call.quick), cli.stamp(call.command)
+            runs, line, failed = runs_of(case, given.solvers or COMPARED, call.quick), cli.stamp(call.command), ""
             try:
                 with output.kept({"where": given.where, "t_end": t_end}) as kept:
-                    rows = collect(runs, kept)
-            except StudyError as error:  # without a reference
-                output.write(
-                    "compare.md",
-                    render("compare_failed", {"name": case.name, "why": str(error)}, {"failed": ""}, stamp=line),
-                )
+                    rows = collect(runs, kept)  # raises without a reference
+                output.save_rows(rows, line)
+                if not (rows["status"] == "REACHED_END").any():
+                    failed = _failed(rows)
+                    raise StudyError(f"no solver reached the end; the first said: {rows['message'].iloc[0]}")
+            except StudyError as error:
+                found = {"name": case.name, "why": str(error)}
+                output.write("compare.md", render("compare_failed", found, {"failed": failed}, stamp=line))
                 raise
-            output.save_rows(rows, line)
-            if not (rows["status"] == "REACHED_END").any():
-                why = f"no solver reached the end; the first said: {rows['message'].iloc[0]}"
-                failed = {"failed": table(["solver", "setting", "status", "message"], tables.failures(rows))}
-                output.write(
-                    "compare.md", render("compare_failed", {"name": case.name, "why": why}, failed, stamp=line)
-                )
-                raise StudyError(why)
         report(output, case, rows, line, errors)
     print(f"wrote compare.md, .csv, .json, .png and .svg to {output.path}")
 

@@ -4,7 +4,6 @@ import html
 import json
 import re
 from collections.abc import Iterable, Sequence
-from io import StringIO
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import pandas as pd
 from studies.bench import figures, study, tables
 from studies.bench.cli import StudyError
 from studies.bench.render import TEMPLATES
-from studies.bench.store import Output, plain
+from studies.bench.store import Output, plain, read_rows
 
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")
@@ -52,20 +51,11 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         path = folder / f"{name}.csv"
         if not path.is_file():
             continue
-        try:
-            first, rest = path.read_text().split("\n", 1)
-            rows = pd.read_csv(StringIO(rest), low_memory=False)
-            rows = tables.medians(rows) if "repeat" in rows else rows
-            rows = rows[rows["t_end"].notna()]  # not those of a first call, which are times alone
-            # a study may run one mechanism for several lengths of time, whose costs cannot be compared
-            parts.append(
-                rows.assign(
-                    mechanism=[f"{case}, {end:g} s" for case, end in zip(rows["case"], rows["t_end"], strict=True)],
-                    study=name,
-                )
-            )
-        except (ValueError, KeyError) as error:
-            raise StudyError(f"{path} is damaged ({error}); make it again by python -m studies.{name}") from None
+        rows, first = read_rows(path, "case", "solver", "t_end")
+        rows = tables.medians(rows) if "repeat" in rows else rows
+        rows = rows[rows["t_end"].notna()]  # not those of a first call, which are times alone
+        # a study may run one mechanism for several lengths of time, whose costs cannot be compared
+        parts.append(rows.assign(mechanism=rows["case"] + rows["t_end"].map(", {:g} s".format), study=name))
         stamps[name] = first.removeprefix("# ")
     if not parts:
         raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
@@ -80,7 +70,7 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
     families = rows.groupby("solver", sort=False)["family"].first()
     seen = looks(families.index)
     solvers = [{"name": name, "ours": family == "two-loop", **seen[name]} for name, family in families.items()]
-    numbers = {solver["name"]: k for k, solver in enumerate(solvers)}
+    numbers = {name: k for k, name in enumerate(families.index)}
     mechanisms = [
         {"name": f"{name} ({of})", "floor": float(runs["floor"].max())}
         for (of, name), runs in rows.groupby(["study", "mechanism"], sort=False)

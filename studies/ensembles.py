@@ -10,20 +10,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
 from references.paper.four_bar_minimal import MinimalFourBar
-from studies.bench import figures, study, tables
+from studies.bench import figures, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS
-from studies.bench.render import number, power, render, table
-from studies.bench.store import Output
+from studies.bench.store import Array, Output
+from studies.bench.study import Study
 from studies.sweep_linkages.study import drawn, linkage
 from twoloop import consistent_states, ensemble, mechanisms, solve_dae
 from twoloop.mechanisms import Problem
 
-Array = NDArray[np.float64]
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
 
 GROUP, GEOMETRY = "many", "random linkages"
@@ -31,7 +29,7 @@ TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
-OWN = (ENSEMBLE, SINGLE)
+OWN, WAYS = (ENSEMBLE, SINGLE), (ENSEMBLE, SINGLE, HEYOKA, DIFFRAX)
 LINKAGES = "random four-bar linkages"
 STARTS = {  # mechanisms whose runs differ by their velocities at the start, and how long they run
     "andrews": 0.03,
@@ -141,10 +139,8 @@ def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[st
         try:
             solves[name] = made[name]()
         except (ImportError, ValueError) as why:
-            yield head | {
-                "way": name,
-                "message": f"{'not installed' if isinstance(why, ImportError) else 'not run'}: {why}",
-            }
+            said = "not installed" if isinstance(why, ImportError) else "not run"
+            yield head | {"way": name, "message": f"{said}: {why}"}
     for tol in QUICK_TOLERANCES if quick else TOLERANCES:
         first = {name: _timed(solve, tol)[0] for name, solve in solves.items()}
         for repeat, (name, solve) in product(range(1 if quick else REPEATS), solves.items()):
@@ -226,13 +222,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found
 
 
-def figure_of(rows: pd.DataFrame) -> Figure:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """CPU time of a run over the largest error, a panel a mechanism."""
     made = rows[(rows["group"] == GROUP) & rows["tol"].notna() & (rows["n_failed"] == 0)]
     cases = list(dict.fromkeys(made["case"]))
     width = 3.4 * len(cases) + 1.2
     figure, panels = plt.subplots(1, len(cases), figsize=(width, 3.9), layout="constrained", squeeze=False)
-    colors = dict(zip((ENSEMBLE, SINGLE, HEYOKA, DIFFRAX), (figures.BLUE, figures.RED, "black", "gray"), strict=True))
+    colors = dict(zip(WAYS, (figures.BLUE, figures.RED, "black", "gray"), strict=True))
     for axes, case in zip(panels[0], cases, strict=True):
         for way, own in made[made["case"] == case].groupby("way", sort=False):
             line = own.groupby("tol")[["error_worst", "run_s"]].median()
@@ -242,35 +238,12 @@ def figure_of(rows: pd.DataFrame) -> Figure:
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of a run (µs)")
     shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize=9, frameon=False)
-    return figure
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize=9)
+    return {"ensembles": figure}
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings, figure and report."""
-    found = findings_of(rows)
-    output.save_findings(found)
-    figures.save(figure_of(rows), output, "ensembles")
-    lines: list[list[str]] = []
-    for each in found["cases"]:
-        for way in (ENSEMBLE, SINGLE, HEYOKA, DIFFRAX):
-            cells = [number(1e6 * at["run_s"][way]) if way in at["run_s"] else "–" for at in each["at"]]
-            lines += [[each["case"], way, *cells]] if any(way in at["run_s"] for at in each["at"]) else []
-    ready = {"ways": table(["runs of", "way", *(power(error) for error in ERRORS)], lines)}
-    columns = ["runs", "wall-clock time (s)", "CPU time (s)", "failed", "made singly"]
-    fields = ("n_runs", "wall", "cpu", "n_failed", "n_singly")
-    geometry = [
-        [number(each[name]) if name in ("wall", "cpu") else f"{each[name]:,.0f}" for name in fields]
-        for each in found["geometry"]
-    ]
-    ready["geometry"] = table(columns, geometry)
-    output.write("ensembles.md", render("ensembles", found, ready, stamp=line, quick=output.call.quick))
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study."""
-    study.run_rows("ensembles", __doc__, words, make, report)
-
+STUDY = Study("ensembles", __doc__, make, findings_of, figures_of)
+main = STUDY.main
 
 if __name__ == "__main__":
     main()

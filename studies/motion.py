@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from studies.bench import figures
 from studies.bench.cases import four_bar
@@ -30,11 +29,10 @@ from studies.bench.solvers import (
     OWN_EXPLICIT,
     gear,
 )
-from studies.bench.study import Series, Study, key
-from studies.bench.tables import setting
+from studies.bench.store import Array
+from studies.bench.study import Study, rows_of
+from studies.bench.tables import setting, where
 from twoloop import Result
-
-Array = NDArray[np.float64]
 
 VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
 PASSES = 1e-3  # m above 0 from which y3 passes the line, and below it to which it reaches it
@@ -91,8 +89,8 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 def find(rows: pd.DataFrame, solver: str, step: float | None = None) -> pd.Series | None:
     """The row of a solver of the line-up, or with a fixed step of the stand-in."""
-    found = rows[(rows["group"] == ("line-up" if step is None else "GSTIFF stand-in")) & (rows["solver"] == solver)]
-    found = found if step is None else found[found["h"] == step]
+    fixed = {"group": "line-up"} if step is None else {"group": "GSTIFF stand-in", "h": step}
+    found = where(rows, solver=solver, **fixed)
     return None if found.empty else found.iloc[0]
 
 
@@ -159,37 +157,37 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _draw(panel: Axes, rows: Iterable[pd.Series | None], series: Series, curve: str, t: Array, **more: Any) -> None:
-    for k, row in enumerate(row for row in rows if row is not None and key(row, curve) in series):
-        panel.plot(t, series[key(row, curve)], **({"markevery": (3 * k % 10, 10)} | figures.look(row) | more))
+def _draw(panel: Axes, rows: Iterable[pd.Series | None], curve: str, t: Array, **more: Any) -> None:
+    for k, row in enumerate(row for row in rows if row is not None and curve in row["series"]):
+        panel.plot(t, row["series"][curve], **({"markevery": (3 * k % 10, 10)} | figures.look(row) | more))
 
 
-def _motion(panel: Axes, rows: pd.DataFrame, series: Series, curve: str, step: float) -> None:
+def _motion(panel: Axes, rows: pd.DataFrame, curve: str, step: float) -> None:
     """The true motion, both two-loop procedures, and of the stand-in the curves that are visibly off."""
     t = GRIDS[curve] + (rows["t_end"].iloc[0] if curve == "last" else 0.0)
     truth = four_bar.cases(False)[0].reference.states(t)[0][Y3]
     panel.plot(t, truth, color="black", lw=6.0, alpha=0.2, label="true motion")
     for row, width, first in ((find(rows, IRK), 3.0, 10), (find(rows, NEWMARK), 1.2, 30)):  # one lies upon the other
-        _draw(panel, [row], series, curve, t, linewidth=width, markevery=(first, 40))
+        _draw(panel, [row], curve, t, linewidth=width, markevery=(first, 40))
     entries = [find(rows, gear(order), step) for order in (1, 2, 3, 5)]
     error = "error_y3" if curve == "last" else "error_y3_short"
     off = [row for row in entries if row is not None and not row[error] <= VISIBLE]
-    _draw(panel, off, series, curve, t, marker="")
+    _draw(panel, off, curve, t, marker="")
     panel.set(xlabel="t (s)")
     panel.set_title(f"GSTIFF stand-in with h = {step:g} s", fontsize=9)
 
 
-def motion_figure(rows: pd.DataFrame, series: Series, curve: str, steps: tuple[float, ...]) -> Figure:
+def motion_figure(rows: pd.DataFrame, curve: str, steps: tuple[float, ...]) -> Figure:
     """Height of bar 3's centre over time, a panel a step of the stand-in."""
     figure, panels = plt.subplots(1, len(steps), figsize=(9.2, 3.2), sharey=True, squeeze=False, layout="constrained")
     for panel, step in zip(panels[0], steps, strict=True):
-        _motion(panel, rows, series, curve, step)
+        _motion(panel, rows, curve, step)
     panels[0, 0].set_ylabel("y3 (m)")
     figures.legend(figure, panels[0])
     return figure
 
 
-def error_figure(rows: pd.DataFrame, series: Series) -> Figure:
+def error_figure(rows: pd.DataFrame) -> Figure:
     """Largest error of y3 so far over time."""
     figure, panels = plt.subplots(1, 2, figsize=(9.2, 4.4), sharex=True, sharey=True, layout="constrained")
     sides = {
@@ -197,7 +195,7 @@ def error_figure(rows: pd.DataFrame, series: Series) -> Figure:
         f"GSTIFF stand-in, h = {MIDDLE:g} s": [find(rows, gear(order), MIDDLE) for order in GEAR_ORDERS],
     }
     for panel, (title, entries) in zip(panels, sides.items(), strict=True):
-        _draw(panel, entries, series, "log", rows["t_end"].iloc[0] * GRIDS["log"])
+        _draw(panel, entries, "log", rows["t_end"].iloc[0] * GRIDS["log"])
         panel.axhline(VISIBLE, color="black", lw=0.8, ls=":")
         panel.set(xscale="log", yscale="log", xlabel="t (s)")
         panel.set_title(title, fontsize=9)
@@ -207,16 +205,16 @@ def error_figure(rows: pd.DataFrame, series: Series) -> Figure:
     return figure
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Over 2 s, at the end of the run, and the error over time."""
-    made = {"motion_short": motion_figure(rows, series, "short", (COARSE, MIDDLE))}
-    return made | {
-        "motion_long": motion_figure(rows, series, "last", (MIDDLE,)),
-        "motion_error": error_figure(rows, series),
+    return {
+        "motion_short": motion_figure(rows, "short", (COARSE, MIDDLE)),
+        "motion_long": motion_figure(rows, "last", (MIDDLE,)),
+        "motion_error": error_figure(rows),
     }
 
 
-STUDY = Study("motion", __doc__, runs, measure, findings_of, figures_of)
+STUDY = Study("motion", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from references.sundials.ida import solve_ida
 from studies.bench import figures
@@ -17,11 +16,10 @@ from studies.bench.cases.four_bar import Y3
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, Solver
 from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
-from studies.bench.study import Series, Study, key
+from studies.bench.store import Array
+from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting
 from twoloop import Result
-
-Array = NDArray[np.floating]
 
 LONG = 0.02  # s; the paper: Runge-Kutta steps are longer than this most of the time
 ERR_OUT, TOL = 1e-9, 1e-5  # of the paper's procedures; Atol = Rtol of all others, as of the paper
@@ -33,8 +31,7 @@ MARKS = {"error": ("x", "error too large, shortened"), "convergence": ("v", "not
 
 
 def _ida(case: Case, tolerance: float, repeat: int) -> Result:
-    p = case.problem
-    return solve_ida(p.system, (0.0, case.t_end), p.q0, p.v0, "stabilised", tolerance, tolerance)
+    return solve_ida(*case.start, "stabilised", tolerance, tolerance)
 
 
 def runs(quick: bool) -> list[Run]:
@@ -116,7 +113,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Steps of the paper's procedures: the whole run, two periods, and the motion below."""
     figure, axes = plt.subplots(3, 1, figsize=(9.2, 7.2), layout="constrained", height_ratios=(3, 4, 1.4))
     whole, zoom, motion = axes
@@ -124,10 +121,10 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     for panel, name in ((whole, "whole"), (zoom, "zoom")):
         for _, row in paper.iterrows():
             look = figures.look(row) | {"marker": "", "linewidth": 0.9}
-            panel.plot(*series[key(row, name)], drawstyle="steps-post", **look)
+            panel.plot(*row["series"][name], drawstyle="steps-post", **look)
         panel.axhline(LONG, color=figures.RED, lw=1.0, ls=":", label=f"{LONG:g} s, of the paper")
         panel.set(ylabel="step size (s)", yscale="log")
-    _mark(zoom, {name: series[key(paper.loc[IRK], name)] for name in (*MARKS, "switch")})
+    _mark(zoom, paper.loc[IRK, "series"])
     zoom.set_title(f"the first {PERIODS:g} periods, with rejected attempts of {IRK}", fontsize=9)
     whole.set(title="", xlabel="t (s)")
     grid = np.linspace(0.0, PERIODS * four_bar.period(), 400)
@@ -137,7 +134,7 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     return {"step_size": figure}
 
 
-def _mark(panel: Axes, places: Series) -> None:
+def _mark(panel: Axes, places: dict[str, Array]) -> None:
     """Mark steps before which attempts were rejected; lines where the coordinates changed."""
     for (name, (marker, what)), color in zip(MARKS.items(), (figures.RED, figures.BLUE), strict=True):
         if places[name].size:
@@ -146,7 +143,7 @@ def _mark(panel: Axes, places: Series) -> None:
         panel.axvline(moment, color="black", alpha=0.25, lw=1.0, label="new independent coordinates")
 
 
-STUDY = Study("step_size", __doc__, runs, measure, findings_of, figures_of)
+STUDY = Study("step_size", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
 
 if __name__ == "__main__":

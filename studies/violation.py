@@ -6,7 +6,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from studies.bench import figures, tables
 from studies.bench.cases import four_bar
@@ -29,10 +28,9 @@ from studies.bench.solvers import (
     gear,
     paper_irk_at,
 )
-from studies.bench.study import Series, Study, key
+from studies.bench.store import Array
+from studies.bench.study import Study, rows_of
 from twoloop import Result
-
-Array = NDArray[np.floating]
 
 LOOSE, TIGHT = 1e-3, 1e-9  # err_in and err_out of Table 3
 LEVELS = {"q": "max |C| (m)", "v": "max |C_q v + C_t| (m/s)", "a": "max |C_q a − Q_d| (m/s²)"}
@@ -188,13 +186,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Largest violation in each part of the run, and cost over error."""
     line_up, along = (rows[rows["group"] == group] for group in ("line-up", "tolerances"))
     t = (np.arange(CURVE) + 0.5) * line_up["t_end"].iloc[0] / CURVE
     over_time, axes = plt.subplots(1, 2, figsize=(9.2, 3.8), sharex=True, sharey=True, layout="constrained")
     for panel, level in zip(axes, "qv", strict=True):
-        drawn = [(row, series[key(row, level)]) for _, row in line_up.iterrows() if key(row, level) in series]
+        drawn = [(row, row["series"][level]) for _, row in line_up.iterrows() if level in row["series"]]
         ours = [sizes for row, sizes in drawn if row["family"] == "two-loop"]
         low, high = np.nanmin(ours, axis=0), np.nanmax(ours, axis=0)
         panel.fill_between(t, low, high, color=figures.GREY, alpha=0.5, lw=0, label="all two-loop procedures")
@@ -209,7 +207,7 @@ def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
     return {"violation": over_time, "violation_cost": figures.work_precision(along, DRAWN, title)}
 
 
-STUDY = Study("violation", __doc__, runs, measure, findings_of, figures_of)
+STUDY = Study("violation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
 
 if __name__ == "__main__":

@@ -1,5 +1,3 @@
-"""`python -m studies.beam`."""
-
-from studies.beam.study import main
+from studies.beam import main
 
 main()

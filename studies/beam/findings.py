@@ -35,9 +35,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _of(rows: pd.DataFrame, group: str, **equal: Any) -> pd.DataFrame:
-    found = rows[rows["group"] == group]
-    for column, value in equal.items():
-        found = found[found[column] == value]
+    found = tables.where(rows, group=group, **equal)
     if found.empty:
         raise StudyError(f"the rows lack those of group {group!r}; make them again by python -m studies.beam")
     return found
@@ -70,7 +68,7 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
 def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     """Who is cheapest at one error on one beam: of all, of ours, of others; and the paper's."""
     ranked = tables.ranking(runs, error)
-    seconds = dict(zip(ranked["solver"], ranked["call_s"], strict=True)) if len(ranked) else {}
+    seconds = dict(zip(ranked["solver"], ranked["call_s"], strict=True))
     found: dict[str, Any] = {"error": error, "best": tables.best(ranked)}
     found |= tables.of_both(ranked)
     found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
@@ -110,14 +108,8 @@ def _limits(rows: pd.DataFrame) -> dict[str, Any]:
         limit = part["measured"].to_numpy(float)
         paper = _of(rows, "run", case=case, solver=PAPER, tol=PAPER_TOL).iloc[0]
         low, middle, high = (float(x) for x in np.percentile(limit[1:], (25, 50, 75)))
-        line: dict[str, Any] = {
-            "case": case,
-            "start": float(limit[0]),
-            "low": low,
-            "median": middle,
-            "high": high,
-            "n": len(limit) - 1,
-        }
+        line: dict[str, Any] = {"case": case, "start": float(limit[0]), "low": low, "median": middle, "high": high}
+        line["n"] = len(limit) - 1
         line["accepted"] = float(paper["h_median"] * part["straight"].iloc[0])
         line["explains"] = bool(max(line["accepted"], tests.median()) <= middle)
         found["along"].append(line)

@@ -78,8 +78,7 @@ def along_rows(known: dict[str, Case], quick: bool) -> Iterator[Row]:
     """
     for case in known.values():
         problem, method = case.problem, paper_irk()
-        span, start = (0.0, case.t_end), (problem.q0, problem.v0)
-        run = solve_dae(problem.system, span, *start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
+        run = solve_dae(*case.start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
         straight = float(frequencies(problem)[-1])
         for k in np.linspace(0, run.t.size - 2, STATES_QUICK if quick else STATES).astype(int):
             t, q, v = float(run.t[k]), run.q[:, k].copy(), run.v[:, k].copy()

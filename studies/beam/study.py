@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 import studies.beam as package
 from studies.beam.findings import findings_of
@@ -12,10 +13,10 @@ from studies.beam.limits import along_rows, limit_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
 from studies.beam.sensitivity import CHANGES, sensitivity_rows
 from studies.bench import figures, tables
-from studies.bench import study as common
-from studies.bench.render import number, render, table
+from studies.bench.render import number, table
 from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
 from studies.bench.store import Output
+from studies.bench.study import Study
 
 ERROR = "largest error of the tip's height over the run (m)"
 LISTED = (  # the CSV has all
@@ -44,36 +45,33 @@ def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
         {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
         for name in names
     ]
+    shown = [solver for solver in LISTED if any(solver in cost for cost in costs)]
     nothing = ["", *["–"] * len(TARGETS)]
-    lines = []
-    for solver in LISTED:
-        cells = [cell for cost in costs for cell in cost.get(solver, nothing)[1:]]
-        lines += [[solver, *cells]] if any(solver in cost for cost in costs) else []
+    lines = [[solver, *(cell for cost in costs for cell in cost.get(solver, nothing)[1:])] for solver in shown]
     errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
     return table(["solver", *errors], lines)
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
-    """Write findings, figures and report; the findings."""
-    rows = tables.medians(rows)
-    findings = findings_of(rows)
-    output.save_findings(findings)
-    names = [case["name"] for case in findings["cases"]]
-    ready = {"cost": cost_table(by_tip(rows), names)}
-    for case in findings["cases"]:
-        runs_ = by_tip(rows)
-        runs_ = runs_[runs_["case"] == case["name"]]
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Cost over error, a figure a beam."""
+    made, runs_ = {}, by_tip(rows)
+    for case in found["cases"]:
+        own = runs_[runs_["case"] == case["name"]]
         title = f"{case['name']} beam, {number(case['t_end'])} s"
-        plot = figures.work_precision(runs_, drawn(runs_), title, ERROR)
+        plot = figures.work_precision(own, drawn(own), title, ERROR)
         for axes, target in itertools.product(plot.axes, TARGETS):
             axes.axvline(target, color="0.6", linestyle=":", linewidth=1.0, zorder=0)
-        figures.save(plot, output, case["figure"].removesuffix(".png"))
-    changes = [[change, *(1e3 * case["changes"][change] for case in findings["cases"])] for change in CHANGES]
-    ready["changes"] = table(["change", *(f"{name} (mm)" for name in names)], changes)
-    output.write("beam.md", render("beam", findings, ready, stamp=line, quick=output.call.quick))
-    return findings
+        made[case["figure"].removesuffix(".png")] = plot
+    return made
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    common.run_rows("beam", package.__doc__, words, make, report)
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """What each solver takes, and how far changed beams are away."""
+    names = [case["name"] for case in found["cases"]]
+    changes = [[change, *(1e3 * case["changes"][change] for case in found["cases"])] for change in CHANGES]
+    ready = {"changes": table(["change", *(f"{name} (mm)" for name in names)], changes)}
+    return ready | {"cost": cost_table(by_tip(rows), names)}
+
+
+STUDY = Study("beam", package.__doc__, make, findings_of, figures_of, tables_of, medians=True)
+main = STUDY.main

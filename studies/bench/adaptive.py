@@ -9,8 +9,10 @@ takes `OUTCLASSED` times as long as another of its side is not repeated. A part 
 """
 
 import itertools
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -84,47 +86,40 @@ def collect(
         In the order of the runs, the repetitions of a run one below the other.
     """
     built: Built = set()
-    progress: dict[tuple[str, str], _Progress] = {}
-    reached: dict[Side, list[tuple[float, float]]] = {}  # error and time of the runs on a mechanism
+    progress: dict[tuple[str, str], _Progress] = defaultdict(_Progress)
+    reached: dict[Side, list[tuple[float, float]]] = defaultdict(list)  # error and time of the runs on a mechanism
     todo = list(todo)
 
     def first(run: Run) -> None:
-        if run.key(0) not in kept:
-            kept.add(run.key(0), make(run, 0, built))
-        row, runs = kept[run.key(0)], reached.setdefault(_side(run), [])
+        row, runs = kept.made(run.key(0), lambda: make(run, 0, built)), reached[_side(run)]
         good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
-        who = progress.setdefault((run.case.name, run.solver.name), _Progress())
+        who = progress[run.case.name, run.solver.name]
         who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
         if row["error_q"] is not None and row["call_s"]:
             runs.append((row["error_q"], row["call_s"]))
 
     for run in todo:
-        who = progress.get((run.case.name, run.solver.name))
-        if who is None or not who.ended:
+        if not progress[run.case.name, run.solver.name].ended:
             first(run)
     for _ in range(ROUNDS if errors else 0):
-        more = [run for own in _by_solver(todo) for run in between(own, kept, reached, errors)]
+        by_solver: dict[tuple[str, str], list[Run]] = defaultdict(list)
+        for run in todo:
+            by_solver[run.case.name, run.solver.name].append(run)
+        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors)]
         for run in more:
             first(run)
         todo += more
     again = _repeated(todo, kept, always_repeated)
     for repeat in range(1, max((run.repeats for run in todo), default=0)):
         for run in again:
-            if repeat < run.repeats and run.key(repeat) not in kept:
-                kept.add(run.key(repeat), make(run, repeat, built))
+            if repeat < run.repeats:
+                kept.made(run.key(repeat), partial(make, run, repeat, built))
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 
 
 def _side(run: Run) -> Side:
     return run.case.name, run.solver.family == "two-loop"
-
-
-def _by_solver(todo: Sequence[Run]) -> list[list[Run]]:
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in todo:
-        groups.setdefault((run.case.name, run.solver.name), []).append(run)
-    return list(groups.values())
 
 
 def between(
@@ -188,10 +183,10 @@ def _repeated(todo: Sequence[Run], kept: KeptRows, always: Callable[[Run], bool]
 
     These are no more than `OUTCLASSED` times the least of those of their side, ours or others', for no larger an error.
     """
-    sides: dict[Side, list[tuple[float, float, Run]]] = {}
+    sides: dict[Side, list[tuple[float, float, Run]]] = defaultdict(list)
     for run in todo:
         if run.key(0) in kept and (row := kept[run.key(0)])["error_q"] is not None:
-            sides.setdefault(_side(run), []).append((row["error_q"], row["call_s"] or 0.0, run))
+            sides[_side(run)].append((row["error_q"], row["call_s"] or 0.0, run))
     found = set()
     for ended in sides.values():
         least = np.inf

@@ -16,17 +16,14 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from references.driver import user_call
 from studies.bench import metrics
 from studies.bench.reference_motion import ReferenceMotion, make_reference
-from studies.bench.store import KeptRows, Row
-from twoloop import Result, Statistics
+from studies.bench.store import Array, KeptRows, Row
+from twoloop import ConstrainedSystem, Result, Statistics
 from twoloop.mechanisms import Problem
-
-Array = NDArray[np.float64]
 
 INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
@@ -115,6 +112,11 @@ class Case:
         if conserved is None:
             conserved = metrics.keeps_energy(self.problem, self.reference, self.instants)
         return metrics.Scale(self.problem, self.reference, self.instants, conserved)
+
+    @property
+    def start(self) -> tuple[ConstrainedSystem, tuple[float, float], Array, Array]:
+        """System, time span, q0 and v0, as all solvers take them."""
+        return self.problem.system, (0.0, self.t_end), self.problem.q0, self.problem.v0
 
     def steps(self) -> tuple[float, ...]:
         """Fixed steps, s."""
@@ -283,9 +285,8 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
     row["floor"] = case.reference.floor
     if result is None:
         return row | metrics.COLUMNS
-    invariants = dict(case.invariants)
     try:
-        given = case.problem, result, case.reference, case.instants, case.scale, case.watched, invariants
+        given = case.problem, result, case.reference, case.instants, case.scale, case.watched, dict(case.invariants)
         row |= metrics.measure(*given)
         return row if measure is None else row | measure(run, result)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:  # the rest of the night goes on

@@ -3,16 +3,13 @@
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from studies.bench import metrics
 from studies.bench.collector import NOTHING_RUN, Case, Run, called_from, timed
 from studies.bench.reference_motion import ReferenceMotion
-from studies.bench.store import Row
+from studies.bench.store import Array, Row
 from twoloop import ConstrainedSystem, Result
 from twoloop.mechanisms import Problem, Reference
-
-Array = NDArray[np.float64]
 
 JUDGED = "judged by the problem's own condition"  # group of runs
 TIME_LIMIT = 1.5  # s of CPU of a run

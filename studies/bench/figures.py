@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
 from studies.bench.store import Output
-from studies.bench.tables import DECADE, SETTINGS, astray, time_for, used
+from studies.bench.tables import DECADE, astray, setting_of, time_for, used
 
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
@@ -230,10 +230,8 @@ def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
     As in `tables`, nothing is told between runs of errors more than a decade apart or of different methods, nor across
     a run that failed. Runs whose errors cannot be told are left out.
     """
-    settings = runs[[name for name in SETTINGS if name in runs]].astype(float)
-    setting = settings.bfill(axis=1).iloc[:, 0] if settings.shape[1] else pd.Series(np.nan, runs.index)
     runs = runs.assign(error_q=runs["error_q"].astype(float).where(_told(runs)))
-    runs = runs.iloc[np.lexsort((-runs["error_q"], -setting))].reset_index(drop=True)
+    runs = runs.iloc[np.lexsort((-runs["error_q"], -setting_of(runs)))].reset_index(drop=True)
     size = np.log(runs["error_q"])
     methods = pd.Series([used(run) for _, run in runs.iterrows()])
     apart = (size.diff().abs() > np.log(DECADE)) | (methods != methods.shift(fill_value=methods.get(0)))

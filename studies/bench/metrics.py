@@ -16,15 +16,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from references.equations.accelerations import compiled_gamma
 from studies.bench.reference_motion import ReferenceMotion
+from studies.bench.store import Array
 from twoloop import ConstrainedSystem, Result
 from twoloop.mechanisms import Problem
-
-Array = NDArray[np.float64]
 
 CHECKED = 500  # stored instants, evenly chosen, at which violations are taken
 MULTIPLIERS = 100  # stored instants at which multipliers are compared

@@ -5,18 +5,18 @@ That motion is `references.paper.four_bar_minimal`, SciPy's DOP853 at 1e-13: it 
 
 import sys
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench.store import Array
 from twoloop import ConstrainedSystem
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar
 
 equations = sys.modules[four_bar.__module__]  # the module, whose name its function has taken in the package
 
-Array = NDArray[np.float64]
 
 GRASHOF, OTHER, NEAR = "a bar can turn round", "no bar can", "near a change point"
 KINDS = (GRASHOF, OTHER, NEAR)
@@ -102,19 +102,10 @@ def scaled(size: float, densities: tuple[float, float, float]) -> Problem:
     """The default linkage with all lengths times `size`, and bars of these masses per length (kg/m)."""
     problem = four_bar()
     p = np.array([problem.parameters[name] for name in ("L1", "L2", "L3", "L")]) * size
-    system = ConstrainedSystem(
-        n_q=9,
-        n_c=8,
-        mass=mass,
-        force=force,
-        constraint=equations.constraint,
-        jacobian=equations.jacobian,
-        gamma=equations.gamma,
-        kinematics=equations.kinematics,
-        parameters=[*p.tolist(), *densities],
-        constant_mass=True,
-        name=f"four-bar of size {size:g}, densities {', '.join(f'{d:g}' for d in densities)}",
-    )
+    rows = {name: getattr(equations, name) for name in ("constraint", "jacobian", "gamma", "kinematics")}
+    about: dict[str, Any] = {"parameters": [*p.tolist(), *densities], "constant_mass": True}
+    name = f"four-bar of size {size:g}, densities {', '.join(f'{d:g}' for d in densities)}"
+    system = ConstrainedSystem(n_q=9, n_c=8, mass=mass, force=force, name=name, **rows, **about)
     q0 = problem.q0.copy()
     q0[PLACES] *= size
     return replace(problem, name=system.name, system=system, q0=q0, reference=None)

@@ -4,14 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.scipy.index1 import solve_index1
 from studies.bench.cli import StudyError
+from studies.bench.store import Array
 from twoloop import Result, solve_dae
 from twoloop.mechanisms import Problem
-
-Array = NDArray[np.float64]
 
 TIGHT = 1e-13  # tolerance of both runs of the smooth pair
 STIFF = 1e-11  # of the pair for stiff problems, which IDA does not follow below

@@ -1,5 +1,7 @@
 """Callbacks of the mechanisms under the forces of `sharp_forces`, whose parameters come after their own."""
 
+from typing import Any
+
 from studies.bench.sharp_forces import drive, force_along
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import spatial
@@ -148,3 +150,11 @@ def four_bar_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
 def slider_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
     spatial_force(t, q, v, p, Q)
     Q[14] += force_along(t, q[14], v[14], p)
+
+
+CHAIN: dict[str, Any] = {"mass": chain_mass, "force": chain_force, "constraint": chain_constraint}
+CHAIN |= {"jacobian": chain_jacobian, "constraint_rate": chain_rate, "gamma": chain_gamma}
+CRANK: dict[str, Any] = {"mass": crank_mass, "force": crank_force, "constraint": crank_constraint}
+CRANK |= {"jacobian": crank_jacobian, "gamma": crank_gamma}
+ROW: dict[str, Any] = {"mass": row_mass, "force": row_force, "constraint": row_constraint}
+ROW |= {"jacobian": row_jacobian, "constraint_rate": row_rate, "gamma": row_gamma}

@@ -7,12 +7,13 @@ parameters of the mechanism, so that one set of compiled callbacks serves all.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from studies.bench.store import Array
 
 T_END = 3.0  # s of all runs with these forces
 N_TABLE = 64
@@ -154,143 +155,95 @@ def made(family: str, kind: int, numbers: tuple[float, ...], drives: bool = Fals
     return Sharp(family, p, **more)  # type: ignore[arg-type]
 
 
-def about(time: float, width: float, times: float = 7.0) -> tuple[tuple[float, float], ...]:
-    """The window of what happens within so many widths about a time."""
-    return ((time - times * width, time + times * width),)
-
-
 Draw = Callable[[np.random.Generator], Sharp]
-WHOLE = ((0.0, T_END),)
+Number = Callable[[np.random.Generator], float]
+Where = Callable[[float, float], dict[str, Any]]  # of b and c: breaks and windows
 GUSTS = (3e-3, 1e-2, 3e-2, 0.1, 0.3)  # s
 FRICTIONS = (0.1, 0.01, 0.001)  # of the unit of v
 
 
+def between(low: float, high: float) -> Number:
+    """An even number."""
+    return lambda g: float(g.uniform(low, high))
+
+
+def log(low: float, high: float, factor: float = 1.0) -> Number:
+    """A number whose logarithm is even, times a factor."""
+    return lambda g: factor * float(np.exp(g.uniform(np.log(low), np.log(high))))
+
+
+def family(kind: int, where: Where = lambda b, c: {}, drives: bool = False, **numbers: Number) -> Callable[..., Sharp]:
+    """draw(name, generator) of a force (or a drive), whose numbers, from a to d, are drawn in this order."""
+
+    def draw(name: str, g: np.random.Generator) -> Sharp:
+        drawn = dict.fromkeys("abc" if drives else "abcd", 0.0) | {each: number(g) for each, number in numbers.items()}
+        return made(name, kind, tuple(drawn.values()), drives, **where(drawn["b"], drawn["c"]))
+
+    return draw
+
+
+def about(reach: float = 7.0, later: float = 0.0) -> Where:
+    """Of what happens within so many widths b about a time c, and about a later one."""
+    return lambda b, c: {"windows": tuple((at - reach * b, at + reach * b) for at in dict.fromkeys((c, c + later)))}
+
+
+def at_zeros(b: float, c: float) -> dict[str, Any]:
+    """Breaks at the zeros of sin(b t)."""
+    return {"breaks": tuple(np.arange(1, int(T_END * b / np.pi) + 1) * np.pi / b)}
+
+
+def noise(name: str, g: np.random.Generator) -> Sharp:
+    """Random values, and lines between them."""
+    b = 0.05
+    force = made(name, 8, (log(3.0, 20.0)(g), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
+    force.parameters[TABLE:] = g.standard_normal(N_TABLE)
+    return force
+
+
 def families() -> dict[str, Draw]:
     """Name to draw(generator), which returns a force of that family with random numbers."""
+    when, size = between(0.3, 2.3), log(5.0, 50.0)
 
-    def log(g: np.random.Generator, low: float, high: float) -> float:
-        return float(np.exp(g.uniform(np.log(low), np.log(high))))
+    def gust(width: float) -> Callable[..., Sharp]:
+        return family(3, about(), c=when, b=log(0.7, 1.4, width), a=log(5.0, 50.0, (0.03 / width) ** 0.5))
 
-    def when(g: np.random.Generator) -> float:
-        return float(g.uniform(0.3, 2.3))
+    def jumps(b: float, c: float) -> dict[str, Any]:
+        return {"breaks": (c,)}
 
-    def gust(name: str, width: float) -> Draw:
-        def draw(g: np.random.Generator) -> Sharp:
-            c, b = when(g), width * log(g, 0.7, 1.4)
-            return made(name, 3, (log(g, 5.0, 50.0) * (0.03 / width) ** 0.5, b, c), windows=about(c, b))
+    def whole(b: float, c: float) -> dict[str, Any]:
+        return {"windows": ((0.0, T_END),)}
 
-        return draw
+    def in_x(b: float, c: float) -> dict[str, Any]:
+        return {"follows_x": True}
 
-    def tanh(name: str, width: float) -> Draw:
-        return lambda g: made(name, 2, (log(g, 0.5, 5.0), width * log(g, 0.7, 1.4)))
-
-    def zeros(rate: float) -> tuple[float, ...]:
-        return tuple(np.arange(1, int(T_END * rate / np.pi) + 1) * np.pi / rate)
-
-    def timed(name: str, kind: int, low: float, high: float, reach: float = 7.0, more: float = 0.0) -> Draw:
-        def draw(g: np.random.Generator) -> Sharp:
-            c, b = when(g), log(g, low, high)
-            return made(name, kind, (log(g, 5.0, 50.0), b, c, more), windows=about(c, b, reach))
-
-        return draw
-
-    def square(g: np.random.Generator) -> Sharp:
-        b = log(g, 2.0, 30.0)
-        return made("square wave", 7, (log(g, 2.0, 20.0), b), breaks=zeros(b))
-
-    def rectified(g: np.random.Generator) -> Sharp:
-        b = log(g, 2.0, 30.0)
-        return made("rectified sine", 25, (log(g, 2.0, 20.0), b), breaks=zeros(b))
-
-    def noise(g: np.random.Generator) -> Sharp:
-        b = 0.05
-        force = made("noise by interpolation", 8, (log(g, 3.0, 20.0), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
-        force.parameters[TABLE:] = g.standard_normal(N_TABLE)
-        return force
-
-    def at(name: str, kind: int, low: float, high: float) -> Draw:
-        def draw(g: np.random.Generator) -> Sharp:
-            c = when(g)
-            return made(name, kind, (log(g, low, high), 0.0, c), breaks=(c,))
-
-        return draw
-
-    def pulse(g: np.random.Generator) -> Sharp:
-        b, c = log(g, 0.02, 0.5), when(g)
-        return made("square pulse", 13, (log(g, 5.0, 50.0), b, c), breaks=(c, c + b))
-
-    def brake(g: np.random.Generator) -> Sharp:
-        b, c = log(g, 0.003, 0.1), when(g)
-        windows = (*about(c, b, 9.0), *about(c + 0.6, b, 9.0))
-        return made("brake", 10, (log(g, 1.0, 10.0), b, c, 0.02), windows=windows)
-
-    def stribeck(g: np.random.Generator) -> Sharp:
-        numbers = (log(g, 0.5, 3.0), log(g, 0.002, 0.05), log(g, 0.02, 0.3), log(g, 0.5, 3.0))
-        return made("Stribeck friction", 19, numbers)
-
-    def follows(name: str, kind: int, *numbers: Callable[[np.random.Generator], float]) -> Draw:
-        return lambda g: made(name, kind, tuple(number(g) for number in numbers), follows_x=True)
-
-    def between(low: float, high: float) -> Callable[[np.random.Generator], float]:
-        return lambda g: float(g.uniform(low, high))
-
-    def decades(low: float, high: float) -> Callable[[np.random.Generator], float]:
-        return lambda g: log(g, low, high)
-
-    def whole(name: str, kind: int, *numbers: Callable[[np.random.Generator], float]) -> Draw:
-        return lambda g: made(name, kind, tuple(number(g) for number in numbers), windows=WHOLE)
-
-    def decay(g: np.random.Generator) -> Sharp:
-        b = log(g, 3e-4, 0.03)
-        return made("fast decay", 15, (log(g, 10.0, 500.0), b), windows=((0.0, 30.0 * b),))
-
-    def root(g: np.random.Generator) -> Sharp:
-        return made("square root of t", 17, (log(g, 3.0, 30.0),), windows=((0.0, 1e-4), (1e-4, 1e-2)))
-
-    def packet(g: np.random.Generator) -> Sharp:
-        c, b = when(g), log(g, 0.01, 0.1)
-        return made("wave packet", 22, (log(g, 10.0, 100.0), b, c, log(g, 30.0, 300.0)), windows=about(c, b))
-
-    def driven(name: str, kind: int, low: float, high: float) -> Draw:
-        def draw(g: np.random.Generator) -> Sharp:
-            a, b, c = float(g.uniform(0.05, 0.5)), log(g, low, high), when(g)
-            where: dict[str, object] = {"breaks": (c,)} if kind == 1 else {"windows": about(c, b, 12.0)}
-            return made(name, kind, (a, b, c), True, **where)
-
-        return draw
-
-    found: dict[str, Draw] = {"drag": lambda g: made("drag", 1, (log(g, 0.05, 1.0),))}
-    for width in FRICTIONS:
-        name = f"tanh friction, width {width:g}"
-        found[name] = tanh(name, width)
-    for width in GUSTS:
-        name = f"gust of {1e3 * width:g} ms"
-        found[name] = gust(name, width)
-    found["softplus stop"] = follows(
-        "softplus stop", 4, decades(200.0, 5000.0), decades(0.002, 0.05), between(-0.3, 0.4)
-    )
-    found["chirp"] = whole("chirp", 5, decades(3.0, 30.0), decades(3.0, 60.0))
-    found["switching drive"] = whole("switching drive", 6, decades(2.0, 20.0), decades(5.0, 40.0), decades(10.0, 200.0))
-    found |= {"square wave": square, "noise by interpolation": noise, "brake": brake, "Stribeck friction": stribeck}
-    found["stop of power 3/2"] = follows(
-        "stop of power 3/2", 9, decades(500.0, 2e4), decades(1.0, 2.0), between(-0.2, 0.4)
-    )
-    found["jump of the force"] = at("jump of the force", 11, 3.0, 30.0)
-    found["kinked force"] = at("kinked force", 12, 3.0, 30.0)
-    found |= {"square pulse": pulse, "fast decay": decay, "square root of t": root, "wave packet": packet}
-    found["Lorentz pulse"] = timed("Lorentz pulse", 14, 0.005, 0.1, 20.0)
-    found["tanh step"] = timed("tanh step", 16, 5e-4, 0.1, 12.0)
-    found["high power of x"] = follows(
-        "high power of x", 18, decades(10.0, 100.0), lambda g: 2.0 * g.integers(5, 33) + 1.0
-    )
-    found["magnet"] = follows("magnet", 20, decades(10.0, 100.0), decades(0.03, 0.2), between(-0.4, 0.5))
-    found["backlash"] = follows("backlash", 24, decades(50.0, 2000.0), decades(0.03, 0.3))
-    found["resonance in v"] = lambda g: made(
-        "resonance in v", 21, (log(g, 3.0, 60.0), log(g, 0.1, 0.5), float(g.uniform(-1.5, 1.5)))
-    )
-    found["spikes"] = whole("spikes", 23, decades(5.0, 60.0), decades(3.0, 10.0), decades(20.0, 200.0))
-    found["rectified sine"] = rectified
-    found["drive with a kink"] = driven("drive with a kink", 1, 1.0, 2.0)
-    found["drive with a gust"] = driven("drive with a gust", 2, 0.01, 0.3)
-    found["drive with a step"] = driven("drive with a step", 3, 0.01, 0.2)
-    return found
+    found = {
+        "drag": family(1, a=log(0.05, 1.0)),
+        **{f"tanh friction, width {b:g}": family(2, a=log(0.5, 5.0), b=log(0.7, 1.4, b)) for b in FRICTIONS},
+        **{f"gust of {1e3 * b:g} ms": gust(b) for b in GUSTS},
+        "softplus stop": family(4, in_x, a=log(200.0, 5000.0), b=log(0.002, 0.05), c=between(-0.3, 0.4)),
+        "chirp": family(5, whole, a=log(3.0, 30.0), b=log(3.0, 60.0)),
+        "switching drive": family(6, whole, a=log(2.0, 20.0), b=log(5.0, 40.0), c=log(10.0, 200.0)),
+        "square wave": family(7, at_zeros, b=log(2.0, 30.0), a=log(2.0, 20.0)),
+        "noise by interpolation": noise,
+        "brake": family(10, about(9.0, 0.6), b=log(0.003, 0.1), c=when, a=log(1.0, 10.0), d=lambda g: 0.02),
+        "Stribeck friction": family(19, a=log(0.5, 3.0), b=log(0.002, 0.05), c=log(0.02, 0.3), d=log(0.5, 3.0)),
+        "stop of power 3/2": family(9, in_x, a=log(500.0, 2e4), b=log(1.0, 2.0), c=between(-0.2, 0.4)),
+        "jump of the force": family(11, jumps, c=when, a=log(3.0, 30.0)),
+        "kinked force": family(12, jumps, c=when, a=log(3.0, 30.0)),
+        "square pulse": family(13, lambda b, c: {"breaks": (c, c + b)}, b=log(0.02, 0.5), c=when, a=size),
+        "fast decay": family(15, lambda b, c: {"windows": ((0.0, 30.0 * b),)}, b=log(3e-4, 0.03), a=log(10.0, 500.0)),
+        "square root of t": family(17, lambda b, c: {"windows": ((0.0, 1e-4), (1e-4, 1e-2))}, a=log(3.0, 30.0)),
+        "wave packet": family(22, about(), c=when, b=log(0.01, 0.1), a=log(10.0, 100.0), d=log(30.0, 300.0)),
+        "Lorentz pulse": family(14, about(20.0), c=when, b=log(0.005, 0.1), a=size),
+        "tanh step": family(16, about(12.0), c=when, b=log(5e-4, 0.1), a=size),
+        "high power of x": family(18, in_x, a=log(10.0, 100.0), b=lambda g: 2.0 * g.integers(5, 33) + 1.0),
+        "magnet": family(20, in_x, a=log(10.0, 100.0), b=log(0.03, 0.2), c=between(-0.4, 0.5)),
+        "backlash": family(24, in_x, a=log(50.0, 2000.0), b=log(0.03, 0.3)),
+        "resonance in v": family(21, a=log(3.0, 60.0), b=log(0.1, 0.5), c=between(-1.5, 1.5)),
+        "spikes": family(23, whole, a=log(5.0, 60.0), b=log(3.0, 10.0), c=log(20.0, 200.0)),
+        "rectified sine": family(25, at_zeros, b=log(2.0, 30.0), a=log(2.0, 20.0)),
+        "drive with a kink": family(1, jumps, True, a=between(0.05, 0.5), b=log(1.0, 2.0), c=when),
+        "drive with a gust": family(2, about(12.0), True, a=between(0.05, 0.5), b=log(0.01, 0.3), c=when),
+        "drive with a step": family(3, about(12.0), True, a=between(0.05, 0.5), b=log(0.01, 0.2), c=when),
+    }
+    return {name: partial(draw, name) for name, draw in found.items()}

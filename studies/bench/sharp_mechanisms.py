@@ -10,17 +10,15 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import sharp_callbacks as callbacks
 from studies.bench.random_linkages import equations as linkage
 from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import Sharp, drive, force_along
+from studies.bench.store import Array
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import four_bar, spatial, spatial_slider_crank
-
-Array = NDArray[np.float64]
 
 TINY = 1e-30  # imaginary step: derivatives without differences
 
@@ -112,19 +110,8 @@ def chain(sharp: Sharp, lengths: Array, masses: Array, angles: Array, rates: Arr
     v0 = np.empty(2 * n)
     v0[::2] = np.cumsum(lengths * np.cos(angles) * rates) + drive(0.0, p)[1]
     v0[1::2] = np.cumsum(lengths * np.sin(angles) * rates)
-    system = ConstrainedSystem(
-        n_q=2 * n,
-        n_c=n,
-        mass=callbacks.chain_mass,
-        force=callbacks.chain_force,
-        constraint=callbacks.chain_constraint,
-        jacobian=callbacks.chain_jacobian,
-        constraint_rate=callbacks.chain_rate,
-        gamma=callbacks.chain_gamma,
-        parameters=p,
-        constant_mass=True,
-        name=f"chain of {n}",
-    )
+    about: dict[str, Any] = {"parameters": p, "constant_mass": True, "name": f"chain of {n}"}
+    system = ConstrainedSystem(n_q=2 * n, n_c=n, **callbacks.CHAIN, **about)
     name = "pendulum" if n == 1 else system.name
     start = np.concatenate([angles, rates])
     return Mechanism(
@@ -147,30 +134,10 @@ def row(sharp: Sharp, stiffness: Array, masses: Array, apart: float, rate0: floa
         return np.array([y[1], -stiffness[0] * x[0] + stiffness[1] * x[1] - push])
 
     f, moves, _ = drive(0.0, p)
-    system = ConstrainedSystem(
-        n_q=2,
-        n_c=1,
-        mass=callbacks.row_mass,
-        force=callbacks.row_force,
-        constraint=callbacks.row_constraint,
-        jacobian=callbacks.row_jacobian,
-        constraint_rate=callbacks.row_rate,
-        gamma=callbacks.row_gamma,
-        parameters=p,
-        constant_mass=True,
-        name="driven row",
-    )
+    system = ConstrainedSystem(n_q=2, n_c=1, **callbacks.ROW, parameters=p, constant_mass=True, name="driven row")
     y0 = np.array([apart, rate0])
-    return Mechanism(
-        system.name,
-        system,
-        places(apart, f),
-        places(rate0, moves),
-        sharp,
-        y0,
-        rate,
-        lambda t, y: places(y[0], drive(t, p)[0]),
-    )
+    start = places(apart, f), places(rate0, moves)
+    return Mechanism(system.name, system, *start, sharp, y0, rate, lambda t, y: places(y[0], drive(t, p)[0]))
 
 
 def turning(
@@ -211,18 +178,8 @@ def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: f
     def positions(t: float, y: Array) -> Array:
         return np.array([crank * np.cos(y[0]), crank * np.sin(y[0]), energies(y[0])[2]])
 
-    system = ConstrainedSystem(
-        n_q=3,
-        n_c=2,
-        mass=callbacks.crank_mass,
-        force=callbacks.crank_force,
-        constraint=callbacks.crank_constraint,
-        jacobian=callbacks.crank_jacobian,
-        gamma=callbacks.crank_gamma,
-        parameters=p,
-        constant_mass=True,
-        name="slider-crank",
-    )
+    about: dict[str, Any] = {"parameters": p, "constant_mass": True, "name": "slider-crank"}
+    system = ConstrainedSystem(n_q=3, n_c=2, **callbacks.CRANK, **about)
     slope = energies(complex(angle, TINY))[2].imag / TINY
     v0 = speed * np.array([-crank * np.sin(angle), crank * np.cos(angle), slope])
     return turning(
@@ -232,14 +189,8 @@ def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: f
 
 def under_force(system: ConstrainedSystem, force: Any, own: Array, **more: Any) -> ConstrainedSystem:
     """A ready system with another force, whose parameters come after its own."""
-    return ConstrainedSystem(
-        n_q=system.n_q,
-        n_c=system.n_c,
-        force=force,
-        parameters=np.append(system.parameters, own),
-        name=system.name,
-        **more,
-    )
+    about: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "name": system.name}
+    return ConstrainedSystem(force=force, parameters=np.append(system.parameters, own), **about, **more)
 
 
 def bars(sharp: Sharp) -> Mechanism:
@@ -275,10 +226,8 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
     def places(s: Any) -> tuple[Any, ...]:
         """The crank's end, x of the slider, the rod's axes, and their derivatives."""
         zero = 0.0 * s
-        B, B_s = (
-            np.array([zero, y_A - r * np.sin(s), z_A + r * np.cos(s)]),
-            np.array([zero, -np.cos(s), -np.sin(s)]) * r,
-        )
+        B = np.array([zero, y_A - r * np.sin(s), z_A + r * np.cos(s)])
+        B_s = np.array([zero, -np.cos(s), -np.sin(s)]) * r
         across = np.sqrt(B @ B)
         across_s = (B @ B_s) / across
         x = np.sqrt(rod * rod - across * across)

@@ -9,15 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from studies.bench.sharp_forces import DRIVE_A, T_END, families
 from studies.bench.sharp_mechanisms import Mechanism, drawn
-from studies.bench.store import Row
+from studies.bench.store import Array, Row
 from twoloop import solve_dae
-
-Array = NDArray[np.float64]
 
 TIMES = np.linspace(0.0, T_END, 13)  # s, at which positions are compared
 RTOL, CHECK, DISTURBED = 1e-13, 1e-12, 1e-9  # of the motion, of the one to compare it with, and of disturbed ones

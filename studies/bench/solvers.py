@@ -1,8 +1,8 @@
 """The catalogue: every solver that the studies compare, one entry each, usable on any case.
 
 An adapter that needs a model of its own (Exudyn) or compiled functions (IDA from C) raises `NotApplicable` for a case
-that it cannot run, which becomes a row. Foreign packages are imported when they are used, so that one that is not
-installed is a row too.
+that it cannot run, which becomes a row. Foreign packages are imported when they are used, here or in `references/`, so
+that one that is not installed is a row too.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -12,7 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from references.casadi.integrators import solve_collocation, solve_cvodes, solve_idas
+from references.diffrax.dopri8 import solve_diffrax
+from references.equations.expressions import NotSymbolic
+from references.heyoka.taylor import solve_heyoka
+from references.minimal.equations import NoMinimalCoordinates
+from references.minimal.solvers import solve_cvode_minimal, solve_heyoka_minimal
+from references.paper.gear import solve_gear
+from references.scipy.fully_implicit import solve_fully_implicit
 from references.scipy.index1 import solve_index1
+from references.sundials.cvode import solve_cvode
+from references.sundials.cvode_c import solve_cvode_c
+from references.sundials.ida_c import solve_ida_c
 from studies.bench.collector import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.auto import LOOSE, TIGHTEST
@@ -36,12 +47,7 @@ ADAMS, TAYLOR = "Adams", "Taylor"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
 DEFAULT = "auto"  # of solve_dae
 # with code made for the mechanism, and the method of each
-COMPILED = {
-    "auto, compiled": DEFAULT,
-    "Taylor, compiled": TAYLOR,
-    "Adams, compiled": ADAMS,
-    "DOP853, compiled": "DOP853",
-}
+COMPILED = {f"{method}, compiled": method for method in (DEFAULT, TAYLOR, ADAMS, "DOP853")}
 RADAU = ("RadauIIA5", "RadauIIA9", "RadauIIA13")
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", *RADAU, "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
 PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
@@ -82,13 +88,9 @@ COMPARED = (
 )
 
 
-def _start(case: Case) -> tuple[Any, Any, Any, Any]:
-    return case.problem.system, (0.0, case.t_end), case.problem.q0, case.problem.v0
-
-
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: bool = False) -> Result:
     limit = case.time_limit
-    return solve_dae(*_start(case), method, tolerance, tolerance, time_limit=limit, compiled=compiled)
+    return solve_dae(*case.start, method, tolerance, tolerance, time_limit=limit, compiled=compiled)
 
 
 def _chosen(tolerance: float, result: Result) -> str:
@@ -123,61 +125,43 @@ def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repea
 
 def _canonical(case: Case, step: float, repeat: int) -> Result:
     method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    return solve_dae(*_start(case), method=method, step_size=step, time_limit=case.time_limit)
+    return solve_dae(*case.start, method=method, step_size=step, time_limit=case.time_limit)
+
+
+def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Result:
+    """A run of a solver that tells its states at the common instants; `NotApplicable` where it needs expressions."""
+    try:
+        return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
+    except NotSymbolic as why:
+        raise NotApplicable(str(why)) from None
+
+
+def _along(solve: Callable[..., Result], case: Case, tolerance: float, repeat: int) -> Result:
+    return at_instants(solve, case, rtol=tolerance, atol=tolerance)
 
 
 def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
     from references.sundials.ida import solve_ida
 
     # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
-    rtol, times = tolerance * (1.0 + NUDGE * repeat), np.append(0.0, case.instants)
-    return solve_ida(*_start(case), form, rtol, tolerance, t_eval=times, time_limit=case.time_limit)
+    return at_instants(solve_ida, case, form=form, rtol=tolerance * (1.0 + NUDGE * repeat), atol=tolerance)
 
 
 def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
-    from references.sundials.ida_c import solve_ida_c
-
     if case.problem.system.called_in_python:
         raise NotApplicable("IDA from C needs compiled functions; this mechanism is plain Python (see IDA, stabilised)")
-    rtol, times = tolerance * (1.0 + NUDGE * repeat), np.append(0.0, case.instants)
-    return solve_ida_c(*_start(case), rtol, tolerance, t_eval=times, time_limit=case.time_limit, **options)
+    return at_instants(solve_ida_c, case, rtol=tolerance * (1.0 + NUDGE * repeat), atol=tolerance, **options)
 
 
 def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
-    from references.scipy.fully_implicit import solve_fully_implicit
-
-    return solve_fully_implicit(*_start(case), method, tolerance, tolerance, time_limit=case.time_limit)
-
-
-def _by_expressions(run: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Run a solver that takes expressions; `NotApplicable` where there are none."""
-    from references.equations.expressions import NotSymbolic
-
-    try:
-        return run(*arguments, **options)
-    except NotSymbolic as why:
-        raise NotApplicable(str(why)) from None
+    return solve_fully_implicit(*case.start, method, tolerance, tolerance, time_limit=case.time_limit)
 
 
 def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
-    from references.heyoka.taylor import solve_heyoka
-
-    times = np.append(0.0, case.instants)
-    return _by_expressions(solve_heyoka, *_start(case), tolerance, t_eval=times, time_limit=case.time_limit)
-
-
-def _cvode_c(method: str, projected: bool, case: Case, tolerance: float, repeat: int) -> Result:
-    from references.sundials.cvode_c import solve_cvode_c
-
-    setting = (method, tolerance, tolerance)
-    options = {"projected": projected, "t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
-    return _by_expressions(solve_cvode_c, *_start(case), *setting, **options)
+    return at_instants(solve_heyoka, case, tol=tolerance)
 
 
 def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
-    from references.minimal.equations import NoMinimalCoordinates
-    from references.minimal.solvers import solve_cvode_minimal, solve_heyoka_minimal
-
     more: dict[str, Any] = {"t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
     try:
         if kind == "heyoka":
@@ -187,38 +171,15 @@ def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
         raise NotApplicable(str(why)) from None
 
 
-def _cvode(case: Case, tolerance: float, repeat: int) -> Result:
-    from references.sundials.cvode import solve_cvode
-
-    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
-    return solve_cvode(*_start(case), "Adams", *tolerances, t_eval=times, time_limit=case.time_limit)
-
-
-def _diffrax(case: Case, tolerance: float, repeat: int) -> Result:
-    from references.diffrax.dopri8 import solve_diffrax
-
-    times, tolerances = np.append(0.0, case.instants), (tolerance, tolerance)
-    return _by_expressions(solve_diffrax, *_start(case), *tolerances, t_eval=times, time_limit=case.time_limit)
-
-
-def _casadi(method: str | None, case: Case, tolerance: float, repeat: int) -> Result:
-    """IDAS, or CVODES by a method."""
-    from references.casadi.integrators import solve_cvodes, solve_idas
-
-    solve = solve_idas if method is None else partial(solve_cvodes, method=method)
-    options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": case.time_limit}
-    return _by_expressions(solve, *_start(case), t_eval=np.append(0.0, case.instants), **options)
-
-
 def _collocation(case: Case, step: float, repeat: int) -> Result:
-    from references.casadi.integrators import solve_collocation
-
-    n_steps = round(case.t_end / step)
-    return _by_expressions(solve_collocation, *_start(case), n_steps, time_limit=case.time_limit)
+    try:
+        return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
+    except NotSymbolic as why:
+        raise NotApplicable(str(why)) from None
 
 
 def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_index1(*_start(case), rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
+    return solve_index1(*case.start, rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
@@ -228,19 +189,16 @@ def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, 
     store_every = max(1, n_steps // STORED)
     n_steps = store_every * round(n_steps / store_every)  # of which it asks for a multiple
     if not has_model(case.problem):
-        raise NotApplicable(
-            f"Exudyn needs a model of its own for every mechanism; there is none of {case.problem.name!r}"
-        )
+        why = f"Exudyn needs a model of its own for every mechanism; there is none of {case.problem.name!r}"
+        raise NotApplicable(why)
     more = {"store_every": store_every, "time_limit": case.time_limit, **options}
     return solve_exudyn(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
 
 
 def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Result:
-    from references.paper.gear import solve_gear
-
     n_steps = round(case.t_end / step)
     kept = np.append(np.arange(0, n_steps, max(1, n_steps // STORED)) * step, case.t_end)
-    return solve_gear(*_start(case), step, order, start=start, t_eval=kept, time_limit=case.time_limit)
+    return solve_gear(*case.start, step, order, start=start, t_eval=kept, time_limit=case.time_limit)
 
 
 def baumgarte(method: str, alpha: float) -> str:
@@ -294,12 +252,8 @@ def _all() -> Iterator[Solver]:
     for form in IDA_FORMS:
         keeps, run = form == "stabilised", partial(_ida, form)
         yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
-    of_ida: dict[str, dict[str, Any]] = {
-        IDA_C: {},
-        IDA_C_STATES: {"error_test": "states"},
-        IDA_C_ORDER_2: {"max_order": 2, "error_test": "positions"},
-    }
-    for name, options in of_ida.items():
+    of_order_2 = {"max_order": 2, "error_test": "positions"}
+    for name, options in ((IDA_C, {}), (IDA_C_STATES, {"error_test": "states"}), (IDA_C_ORDER_2, of_order_2)):
         yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
     yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True, traces=True)
     for name, kind in zip(MINIMAL, ("heyoka", "CVODE"), strict=True):
@@ -307,13 +261,14 @@ def _all() -> Iterator[Solver]:
         yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
     for name, method in ((CVODE_C, "Adams"), ("CVODE from C, BDF", "BDF"), (CVODE_C_PROJECTED, "BDF")):
         keeps = name == CVODE_C_PROJECTED
-        run = partial(_cvode_c, method, keeps)
+        run = partial(_along, partial(solve_cvode_c, method=method, projected=keeps))
         yield _solver(name, "SUNDIALS", "compiled", "tol", run, keeps=keeps, traces=True)
-    yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", _cvode, keeps=False)
-    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", _diffrax, keeps=False, traces=True)
+    yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", partial(_along, solve_cvode), keeps=False)
+    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", partial(_along, solve_diffrax), keeps=False, traces=True)
     more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
-    for name, integrator in ((IDAS, None), (CVODES, "BDF"), ("CVODES, CasADi, Adams", "Adams")):
-        yield _solver(name, "CasADi", "compiled", "tol", partial(_casadi, integrator), **more)
+    by_adams = partial(solve_cvodes, method="Adams")
+    for name, solve in ((IDAS, solve_idas), (CVODES, solve_cvodes), ("CVODES, CasADi, Adams", by_adams)):
+        yield _solver(name, "CasADi", "compiled", "tol", partial(_along, solve), **more)
     yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, **more)
     for name in ("Radau", "Radau9", "BDF"):
         yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)

@@ -9,7 +9,9 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from importlib.metadata import version
 from io import BytesIO, StringIO
 from itertools import count
@@ -24,21 +26,14 @@ from numpy.typing import NDArray
 from studies.bench.cli import ROOT, Call, StudyError, processor
 
 Row = dict[str, Any]
+Array = NDArray[np.float64]
 
 FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes kept rows worthless
 NUMERICS = ("numpy", "scipy", "numba")
 # studies whose times are compared, so that no two run at once
 TIMED = (
-    "work_precision",
-    "compare",
-    "table3",
-    "beam",
-    "energy",
-    "violation",
-    "symbolic_size",
-    "sweep_linkages",
-    "ensembles",
-    "ablation",
+    *("work_precision", "compare", "table3", "beam", "energy", "violation", "symbolic_size", "sweep_linkages"),
+    *("ensembles", "ablation"),
 )
 WHOLE_CALL = "whole call"  # what their times are of, in their findings
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
@@ -63,43 +58,30 @@ class Output:
     def __init__(self, call: Call):
         self.call = call
         self.path = call.out.resolve()
-        self._lock: int | None = None
-        self._machine: int | None = None
+        self._locks = ExitStack()
 
     def __enter__(self) -> Self:
-        lock = self.path / ".lock"
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | NO_LINK, 0o644)
-            tempfile.TemporaryFile(dir=self.path).close()
-        except OSError as error:
-            self._unlock()
-            raise StudyError(f"cannot write to {self.path}: {error.strerror}; choose another folder by --out") from None
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._unlock()
-            raise StudyError(
-                f"another run is writing to {self.path}; wait for it, or choose another folder by --out"
-            ) from None
-        if self.call.study in TIMED and not (self.call.quick or self.call.redraw):
+        with ExitStack() as held:
             try:
-                self._machine = alone()
-            except StudyError:
-                self._unlock()
-                raise
+                self.path.mkdir(parents=True, exist_ok=True)
+                lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | NO_LINK, 0o644)
+                held.callback(os.close, lock)  # which releases the lock, as the end of the process does
+                tempfile.TemporaryFile(dir=self.path).close()
+            except OSError as error:
+                why = f"cannot write to {self.path}: {error.strerror}"
+                raise StudyError(f"{why}; choose another folder by --out") from None
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                why = f"another run is writing to {self.path}"
+                raise StudyError(f"{why}; wait for it, or choose another folder by --out") from None
+            if self.call.study in TIMED and not (self.call.quick or self.call.redraw):
+                held.callback(os.close, alone())
+            self._locks = held.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._unlock()
-
-    def _unlock(self) -> None:
-        if self._machine is not None:
-            os.close(self._machine)
-            self._machine = None
-        if self._lock is not None:
-            os.close(self._lock)  # which releases the lock, as the end of the process does
-            self._lock = None
+        self._locks.close()
 
     def file(self, name: str) -> Path:
         """Path of a file of the report to read, which must not be a link out of the folder."""
@@ -126,11 +108,24 @@ class Output:
         return path
 
     def save_rows(self, rows: pd.DataFrame, line: str) -> None:
-        """Write NAME.csv; its first line says study, quick or full, and the stamp `line`."""
+        """Write NAME.csv; its first line says study, quick or full, and the stamp `line`.
+
+        The column "series", of curves by name, goes to NAME_series.npz.
+        """
+        if "series" in rows:
+            curves = {
+                f"{key(row)} {name}": np.asarray(curve, np.float32)
+                for _, row in rows[rows["series"].notna()].iterrows()  # none of a run without a result
+                for name, curve in row["series"].items()
+            }
+            stream = BytesIO()
+            np.savez_compressed(stream, allow_pickle=False, **curves)  # type: ignore[arg-type]
+            self.write(f"{self.call.study}_series.npz", stream.getvalue())
+            rows = rows.drop(columns="series")
         self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False)}")
 
-    def load_rows(self) -> tuple[pd.DataFrame, str]:
-        """Read what `save_rows` wrote, and its stamp.
+    def load_rows(self, curves: bool = False) -> tuple[pd.DataFrame, str]:
+        """Read what `save_rows` wrote, the curves, too, where these are asked for, and the stamp.
 
         Raises
         ------
@@ -141,14 +136,24 @@ class Output:
         rerun = f"make it again by python -m studies.{self.call.study}"
         if not path.is_file():
             raise StudyError(f"there is no {path} to redraw from; {rerun}")
-        try:
-            first, rest = path.read_text().split("\n", 1)
-            rows = pd.read_csv(StringIO(rest), low_memory=False)
-        except (ValueError, UnicodeDecodeError) as error:
-            raise StudyError(f"{path} is damaged ({error}); {rerun}") from None
+        rows, first = read_rows(path)
         if not first.startswith(f"# {self._kind()}; "):
             raise StudyError(f"{path} holds other rows than {self._kind()} ones: {first[:60]!r}; {rerun}")
+        if curves:
+            known = self._load_series()
+            rows["series"] = [known.get(key(row), {}) for _, row in rows.iterrows()]
         return rows, first.removeprefix(f"# {self._kind()}; ")
+
+    def _load_series(self) -> dict[str, dict[str, Array]]:
+        path, found = self.file(f"{self.call.study}_series.npz"), defaultdict[str, dict[str, Array]](dict)
+        try:
+            with np.load(path) as stored:
+                for name in stored.files:
+                    of, curve = name.rsplit(" ", 1)
+                    found[of][curve] = stored[name]
+        except (OSError, ValueError) as error:
+            raise StudyError(f"{path} cannot be read: {error}") from None
+        return found
 
     def save_findings(self, findings: Mapping[str, Any]) -> None:
         """Write NAME.json; what is not finite becomes null."""
@@ -164,22 +169,6 @@ class Output:
         except (OSError, ValueError, TypeError) as error:
             raise StudyError(f"{path} cannot be read: {error}") from None
 
-    def save_series(self, series: Mapping[str, NDArray[Any]]) -> None:
-        """Write named arrays, of which figures are drawn, to NAME_series.npz."""
-        stream = BytesIO()
-        arrays = {name: np.asarray(x, np.float32) for name, x in series.items()}
-        np.savez_compressed(stream, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-        self.write(f"{self.call.study}_series.npz", stream.getvalue())
-
-    def load_series(self) -> dict[str, NDArray[Any]]:
-        """Read what `save_series` wrote."""
-        path = self.file(f"{self.call.study}_series.npz")
-        try:
-            with np.load(path) as stored:
-                return {name: stored[name] for name in stored.files}
-        except (OSError, ValueError) as error:
-            raise StudyError(f"{path} cannot be read: {error}") from None
-
     def kept(self, settings: Mapping[str, Any] | None = None) -> "KeptRows":
         """The rows of an unfinished run of this study; `settings`: what they depend on beside sources and keys."""
         depends = {"study": self.call.study, "quick": self.call.quick, **(settings or {})}
@@ -187,6 +176,31 @@ class Output:
 
     def _kind(self) -> str:
         return f"{'quick' if self.call.quick else 'full'} {self.call.study}"
+
+
+def read_rows(path: Path, *columns: str) -> tuple[pd.DataFrame, str]:
+    """The rows of a file that `Output.save_rows` wrote, and its first line.
+
+    Raises
+    ------
+    StudyError
+        If the file is damaged, or lacks one of these columns.
+    """
+    try:
+        first, rest = path.read_text().split("\n", 1)
+        rows = pd.read_csv(StringIO(rest), low_memory=False)
+        _ = rows[list(columns)]
+        return rows, first
+    except (ValueError, KeyError) as error:
+        again = f"make it again by python -m studies.{path.stem}"
+        raise StudyError(f"{path} is damaged ({error}); {again}") from None
+
+
+def key(row: pd.Series) -> str:
+    """What tells the curves of this row from those of all others of the study."""
+    words = [row.get(name) for name in ("group", "case", "solver", "variables", "partition")]
+    values = [f"{name}={row[name]:g}" for name in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(name))]
+    return " ".join([*(word for word in words if isinstance(word, str)), *values])
 
 
 def alone() -> int:
@@ -288,6 +302,12 @@ class KeptRows:
 
     def __getitem__(self, key: str) -> Row:
         return self._rows[key]
+
+    def made(self, key: str, make: Callable[[], Row]) -> Row:
+        """The row of this key: the one that is kept, or that make() returns, which is then kept."""
+        if key not in self:
+            self.add(key, make())
+        return self[key]
 
     def add(self, key: str, row: Row) -> None:
         """Keep a row, with the processor that made it: it is on disk when this returns."""

@@ -1,22 +1,19 @@
-"""A study, from its command line to the index: rows and series, then findings, tables, figures and the report."""
+"""A study, from its command line to the index: rows, then findings, figures, tables and the report."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from studies.bench import cli, figures, tables
-from studies.bench.collector import Run, collect
+from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
 from studies.bench.render import render, table
 from studies.bench.store import Output
-from twoloop import Result
 
-Series = dict[str, NDArray[Any]]  # curves of runs, each under the name that `key` gives it
+Make = Callable[[Output], pd.DataFrame]
 
 
 def run(name: str, about: str | None, words: Sequence[str] | None, work: Callable[[Output], None]) -> None:
@@ -35,27 +32,32 @@ def run_rows(
     name: str,
     about: str | None,
     words: Sequence[str] | None,
-    make: Callable[[Output], pd.DataFrame],
+    make: Make,
     report: Callable[[Output, pd.DataFrame, str], Any],
+    curves: bool = False,
 ) -> None:
-    """Run a study without series: `make(output)` returns the rows, `report(output, rows, stamp)` writes its files."""
+    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else."""
 
     def work(output: Output) -> None:
-        if output.call.redraw:
-            rows, line = output.load_rows()
-        else:
-            rows, line = make(output), cli.stamp(output.call.command)
-            output.save_rows(rows, line)
-        report(output, rows, line)
+        if not output.call.redraw:
+            output.save_rows(make(output), cli.stamp(output.call.command))
+        report(output, *output.load_rows(curves))  # the same from new rows and from saved ones
 
     run(name, about, words, work)
 
 
-def key(row: pd.Series, curve: str) -> str:
-    """Name of a curve of this row in the series."""
-    words = [row.get(name) for name in ("group", "case", "solver", "variables", "partition")]
-    values = [f"{name}={row[name]:g}" for name in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(name))]
-    return " ".join([*(word for word in words if isinstance(word, str)), *values, curve])
+def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
+    """What makes the rows of runs(quick), with the columns of measure(run, result) and its curves, "series"."""
+
+    def make(output: Output) -> pd.DataFrame:
+        with output.kept() as kept:
+            return collect(runs(output.call.quick), kept, measure)
+
+    return make
+
+
+def _nothing(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Any]:
+    return {}
 
 
 @dataclass(frozen=True)
@@ -68,50 +70,44 @@ class Study:
         Of its files and its template.
     about : str or None
         What --help says.
-    runs : callable
-        runs(quick) -> the runs.
-    measure : callable
-        measure(run, result) -> further columns; in the entry "series" curves by name, for figures.
+    make : callable
+        make(output) -> the rows.
     findings : callable
-        findings(rows) -> what the report and the first screen say. `rows`, here and below: medians.
+        findings(rows) -> what the report and the first screen say, `f` in the template.
     figures : callable
-        figures(rows, series) -> figures by the name of their file.
+        figures(rows, found) -> figures by the name of their file.
+    tables : callable
+        tables(rows, found) -> ready markdown, `tables` in the template, which has `rows`, too.
+    medians : bool
+        Whether these are given medians (`tables.medians`), and the template `tables.failed`: the rows are of `collect`.
+    curves : bool
+        Whether the figures are drawn of curves, in the column "series": by name, those of each row.
     """
 
     name: str
     about: str | None
-    runs: Callable[[bool], Iterable[Run]]
-    measure: Callable[[Run, Result], dict[str, Any]]
+    make: Make
     findings: Callable[[pd.DataFrame], dict[str, Any]]
-    figures: Callable[[pd.DataFrame, Series], dict[str, Figure]]
+    figures: Callable[[pd.DataFrame, dict[str, Any]], dict[str, Figure]] = _nothing
+    tables: Callable[[pd.DataFrame, dict[str, Any]], dict[str, str]] = _nothing
+    medians: bool = False
+    curves: bool = False
 
     def main(self, words: Sequence[str] | None = None) -> None:
         """Make the rows, or with --redraw read those that were saved, and write the report."""
-        run(self.name, self.about, words, self._work)
+        run_rows(self.name, self.about, words, self.make, self.report, self.curves)
 
-    def _work(self, output: Output) -> None:
-        if output.call.redraw:
-            (rows, line), series = output.load_rows(), output.load_series()
-        else:
-            with output.kept() as kept:
-                rows = collect(self.runs(output.call.quick), kept, self.measure)
-            line, series = cli.stamp(output.call.command), {}
-            for _, row in rows.iterrows():
-                curves = row.get("series")  # none of a run without a result
-                for name, curve in curves.items() if isinstance(curves, dict) else ():
-                    series[key(row, name)] = np.array(curve, dtype=float)
-            rows = rows.drop(columns="series", errors="ignore")
-            output.save_rows(rows, line)
-            output.save_series(series)
-        self.report(output, rows, series, line)
-
-    def report(self, output: Output, rows: pd.DataFrame, series: Series, line: str) -> None:
-        """Write findings, figures and report."""
-        rows = tables.medians(rows).infer_objects()
+    def report(self, output: Output, rows: pd.DataFrame, line: str) -> None:
+        """Write findings, figures and report; `line`: the stamp of the rows."""
+        ready = {}
+        if self.medians:
+            rows = tables.medians(rows).infer_objects()
+            failed = [cells[:3] for cells in tables.failures(rows)]  # the messages stand in the rows
+            ready["failed"] = table(["solver", "setting", "status"], failed) if failed else ""
         found = self.findings(rows)
         output.save_findings(found)
-        for name, figure in self.figures(rows, series).items():
+        for name, figure in self.figures(rows, found).items():
             figures.save(figure, output, name)
-        failed = [cells[:3] for cells in tables.failures(rows)]  # the messages stand in the rows
-        ready = {"failed": table(["solver", "setting", "status"], failed) if failed else ""}
-        output.write(f"{self.name}.md", render(self.name, found, ready, stamp=line, quick=output.call.quick))
+        ready |= self.tables(rows, found)
+        text = render(self.name, found, ready, stamp=line, quick=output.call.quick, rows=rows)
+        output.write(f"{self.name}.md", text)

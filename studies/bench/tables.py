@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
-
-Array = NDArray[np.float64]
+from studies.bench.store import Array
 
 SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
 DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
@@ -48,6 +47,13 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
     found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
     return found.assign(repeats=np.diff(firsts, append=len(rows)), times=pd.Series(kept, dtype=object))
+
+
+def where(rows: pd.DataFrame, **equal: Any) -> pd.DataFrame:
+    """The rows in which each column named has that value, or one of a tuple of values."""
+    for column, value in equal.items():
+        rows = rows[rows[column].isin(value if isinstance(value, tuple) else (value,))]
+    return rows
 
 
 @cache
@@ -250,7 +256,7 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
         line |= {what: float(_cost(told[what].to_numpy(float), place)) for what in COSTS}
         lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
-    return pd.DataFrame(lines).sort_values("call_s", ignore_index=True) if lines else pd.DataFrame()
+    return pd.DataFrame(lines, columns=["solver", *RANKED]).sort_values("call_s", ignore_index=True)
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
@@ -265,8 +271,6 @@ def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
 
 def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
     """The cheapest of ours and of others in a ranking."""
-    if ranked.empty:
-        return {"ours": None, "others": None}
     own = ranked["family"] == "two-loop"
     return {"ours": best(ranked[own]), "others": best(ranked[~own])}
 

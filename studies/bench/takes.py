@@ -1,6 +1,6 @@
 """The table "your mechanism, take": what is the cheapest for a class of problem or a kind of mechanism, by its call."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -51,9 +51,9 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
             open_kinds.append(words)
             others |= {each["case"]: each["at"] for each in own}
     left = {case: at for case, at in others.items() if case not in told}
-    by_solver: dict[str, list[str]] = {}
+    by_solver: dict[str, list[str]] = defaultdict(list)
     for case, at in left.items():
-        by_solver.setdefault(_cheapest(at), []).append(case)
+        by_solver[_cheapest(at)].append(case)
     open_ones = by_solver.pop("", [])
     if open_kinds:
         ranked = sorted(by_solver.items(), key=lambda item: -len(item[1]))

@@ -6,19 +6,17 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.paper.paper_step import Step, advance, independents, true_states
 from studies.beam.runs import without_tangent
 from studies.bench import end_states
 from studies.bench.solvers import IMPLICIT
+from studies.bench.store import Array
 from studies.validation import study as validation
 from twoloop import ConstrainedSystem, ConstraintWarning, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar, knife_edge, moderately_stiff_beam, rolling_disc, very_flexible_beam
 from twoloop.methods.tableaux import sun_radau_iib
-
-Array = NDArray[np.float64]
 
 TOL = 1e-5  # Atol = Rtol of the paper
 LOOPS = 1e-9  # err_in = err_out of the paper

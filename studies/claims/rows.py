@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pandas as pd
 
 from studies.bench import tables
 from studies.bench.cases.beam import SOFT, STIFF
-from studies.bench.cli import StudyError
+from studies.bench.store import read_rows
 from twoloop.mechanisms import four_bar
 
 STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam", "ablation")
@@ -37,12 +36,7 @@ def read(folder: Path) -> dict[str, pd.DataFrame]:
     for name in STUDIES:
         path = folder / f"{name}.csv"
         if path.is_file():
-            try:
-                found[name] = _one_a_run(
-                    name, pd.read_csv(StringIO(path.read_text().split("\n", 1)[1]), low_memory=False)
-                )
-            except (ValueError, IndexError) as error:
-                raise StudyError(f"{path} is damaged ({error}); make it again by python -m studies.{name}") from None
+            found[name] = _one_a_run(name, read_rows(path)[0])
     return found
 
 
@@ -80,8 +74,7 @@ class Rows:
             raise NotRun(f"there is no {study}.csv")
         found = self.tables[study]
         found = found[found["solver"].astype(str).str.contains(named, regex=False)]
-        for column, value in equal.items():
-            found = found[found[column].isin(value if isinstance(value, tuple) else (value,))]
+        found = tables.where(found, **equal)
         if found.empty:
             raise NotRun(f"{study}.csv has no row of {named} with {', '.join(f'{c} = {v}' for c, v in equal.items())}")
         if least and not found["t_end"].max() >= least:

@@ -1,5 +1,3 @@
-"""`python -m studies.energy`."""
-
-from studies.energy.study import main
+from studies.energy import main
 
 main()

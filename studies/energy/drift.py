@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from studies.bench.store import Array
 
 EPS = float(np.finfo(float).eps)
 RESOLVED = 3.0  # standard errors from which a slope counts as one

@@ -7,7 +7,6 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.casadi.integrators import solve_cvodes
 from references.diffrax.dopri8 import solve_diffrax
@@ -27,14 +26,15 @@ from studies.bench.solvers import (
     IRK,
     OWN_BDF,
     OWN_EXPLICIT,
+    at_instants,
 )
+from studies.bench.store import Array
 from studies.energy.drift import drift, windows
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.methods.plan import Method
 from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
 
-Array = NDArray[np.float64]
 Variant = tuple[str, str]  # variables and partition
 
 ONE, SWITCHING = "one partition", "switching"
@@ -117,8 +117,7 @@ def instants(case: Case, h: float) -> Array | None:
 
 
 def _solve(method: str | Method, case: Case, **options: Any) -> Result:
-    problem = case.problem
-    return solve_dae(problem.system, (0.0, case.t_end), problem.q0, problem.v0, method=method, **options)
+    return solve_dae(*case.start, method=method, **options)
 
 
 def _fixed(method: Method, case: Case, h: float, repeat: int) -> Result:
@@ -132,14 +131,12 @@ def _controlled(method: str | Method, case: Case, tol: float, repeat: int, compi
 
 
 def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int) -> Result:
-    p, span = case.problem, (0.0, case.t_end)
     options: dict[str, Any] = {"stabilisation": stabilisation, "t_eval": np.append(0.0, case.instants)}
-    return solve_index1(p.system, span, p.q0, p.v0, method, tol, tol, **options)
+    return solve_index1(*case.start, method, tol, tol, **options)
 
 
 def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> Result:
-    p, options = case.problem, {"time_limit": case.time_limit, "most_steps": MOST_STEPS}
-    return solve(p.system, (0.0, case.t_end), p.q0, p.v0, tol, tol, t_eval=np.append(0.0, case.instants), **options)
+    return at_instants(solve, case, rtol=tol, atol=tol, most_steps=MOST_STEPS)
 
 
 def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:

@@ -13,9 +13,8 @@ from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
-from studies.bench.study import Series, Study, key
-from studies.bench.tables import setting, unfinished
-from studies.energy import runs as energy_runs
+from studies.bench.study import Study, rows_of
+from studies.bench.tables import setting, unfinished, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,
@@ -30,6 +29,8 @@ from studies.energy.runs import (
     TRAPEZOIDAL,
     VARIANTS,
     Variant,
+    measure,
+    runs,
 )
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
@@ -51,13 +52,12 @@ def name_of(row: pd.Series) -> str:
 
 def of(rows: pd.DataFrame, solver: str, variant: Variant = BASIC) -> pd.DataFrame:
     """The runs of a method on certain variables, with a certain choice of the partition."""
-    same = (rows["variables"] == variant[0]) & (rows["partition"] == variant[1])
-    return rows[(rows["solver"] == solver) & same]
+    return where(rows, solver=solver, variables=variant[0], partition=variant[1])
 
 
 def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC, group: str = "fixed") -> pd.Series:
     """The long run of a method with fixed steps (group "fixed") or step-size control ("controlled")."""
-    chosen = of(rows[(rows["case"] == motion) & (rows["group"] == group)], solver, variant)
+    chosen = of(where(rows, case=motion, group=group), solver, variant)
     if chosen.empty:
         raise StudyError(f"the rows have no run of {solver} on {motion}; make them again by python -m studies.energy")
     return chosen.iloc[0]
@@ -131,7 +131,7 @@ def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report and the first screen say."""
     rows = judged(rows)
-    fixed = rows[(rows["group"] == "fixed") & (rows["case"] == SWITCHING)]
+    fixed = where(rows, group="fixed", case=SWITCHING)
     even = fixed["partition"] == "symmetric"
     kinds = {"lasting": ~even, "even": even & (fixed["solver"] != SUN), "uneven": even & (fixed["solver"] == SUN)}
     calm = {name: fixed[which]["verdict"] == NO_DRIFT for name, which in kinds.items()}
@@ -160,9 +160,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def figures_of(rows: pd.DataFrame, series: Series) -> dict[str, Figure]:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Both figures of the report."""
-    return {"energy_cost": cost_figure(judged(rows)), "energy_long": time_figure(judged(rows), series)}
+    rows = judged(rows)
+    return {"energy_cost": cost_figure(rows), "energy_long": time_figure(rows)}
 
 
 def cost_figure(rows: pd.DataFrame) -> Figure:
@@ -180,19 +181,18 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
+def time_figure(rows: pd.DataFrame) -> Figure:
     """Mean energy error over time with fixed steps, on both geometries."""
     dashes = {BASIC: "-", MOMENTA: ":", EVEN: "--"}
     chosen = [(SUN, BASIC), (SUN, MOMENTA), (GAUSS, BASIC), (GAUSS, EVEN), (RADAU, BASIC), (NEWMARK, BASIC)]
     figure, panels = plt.subplots(1, 2, figsize=(10.5, 3.8), sharey=True, layout="constrained")
     for axes, motion in zip(panels, (ONE, SWITCHING), strict=True):
-        fixed = rows[(rows["group"] == "fixed") & (rows["case"] == motion)]
         for solver, variant in chosen:
-            for _, row in of(fixed, solver, variant).iterrows():
-                if key(row, "t") in series:
+            for _, row in of(where(rows, group="fixed", case=motion), solver, variant).iterrows():
+                if curves := row["series"]:
                     look = figures.look(row) | {"linestyle": dashes[variant], "marker": ""}
                     look["label"] = f"{row['name']}, h = {row['h']:g} s"
-                    axes.plot(series[key(row, "t")], np.abs(series[key(row, "mean")]), **look)
+                    axes.plot(curves["t"], np.abs(curves["mean"]), **look)
         axes.set(xscale="log", yscale="log", xlabel="time (s)")
         axes.set_title(f"{motion}: {rows[rows['case'] == motion]['problem'].iloc[0]}", fontsize=9)
     panels[0].set_ylabel("|mean energy error of a window| (J)")
@@ -200,8 +200,5 @@ def time_figure(rows: pd.DataFrame, series: Series) -> Figure:
     return figure
 
 
-STUDY = Study("energy", __doc__, energy_runs.runs, energy_runs.measure, findings_of, figures_of)
+STUDY = Study("energy", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()

@@ -1,5 +1,3 @@
-"""`python -m studies.honesty`."""
-
-from studies.honesty.study import main
+from studies.honesty import main
 
 main()

@@ -5,6 +5,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
+from references.heyoka.taylor import solve_heyoka
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida import solve_ida
@@ -37,53 +38,27 @@ def own(method: str, trap: Trap) -> Result:
     return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, method=name, **options)
 
 
-def scipy(method: str, limited: bool, trap: Trap) -> Result:
-    """One of SciPy's solvers on index 1."""
-    return solve_index1(*_start(trap), method, trap.tolerance, trap.tolerance, **_options(trap, limited))
-
-
-def ida(limited: bool, trap: Trap) -> Result:
-    """IDA through scikit-sundae."""
-    return solve_ida(*_start(trap), "stabilised", trap.tolerance, trap.tolerance, **_options(trap, limited))
-
-
-def ida_c(limited: bool, trap: Trap) -> Result:
-    """IDA's library with compiled functions."""
-    return solve_ida_c(*_start(trap), trap.tolerance, trap.tolerance, **_options(trap, limited))
-
-
-def cvode_c(limited: bool, trap: Trap) -> Result:
-    """CVODE's library with code made of the mechanism."""
-    return solve_cvode_c(*_start(trap), "Adams", trap.tolerance, trap.tolerance, **_options(trap, limited))
-
-
-def heyoka(limited: bool, trap: Trap) -> Result:
-    """heyoka's Taylor series, compiled for the mechanism."""
-    from references.heyoka.taylor import solve_heyoka
-
-    return solve_heyoka(*_start(trap), trap.tolerance, **_options(trap, limited))
-
-
-def _start(trap: Trap) -> tuple[Any, Any, Any, Any]:
-    return trap.system, (0.0, trap.t_end), trap.q0, trap.v0
-
-
-def _options(trap: Trap, limited: bool) -> dict[str, Any]:
+def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
+    """Another project's, as it comes, or with the longest step that ours take by default."""
     longest = LONGEST_UNSEEN * trap.t_end if limited else None
-    return {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
+    options = {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
+    tolerances = {"tol": trap.tolerance} if solve is solve_heyoka else {"rtol": trap.tolerance, "atol": trap.tolerance}
+    return solve(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **tolerances, **options)
 
 
 def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     """Name to call, of those that are asked a group of traps; ours first, then others as they come and limited."""
     ours = (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
     made: dict[str, Call] = {f"{name}{OURS}": partial(own, name) for name in (QUICK_OWN if quick else ours)}
-    others: dict[str, Callable[..., Result]] = {f"{name}, index 1": partial(scipy, name) for name in QUICK_SCIPY}
+    others: dict[str, Callable[..., Result]] = {}
     if not quick:
-        others = {IDA: ida, IDA_C: ida_c, CVODE_C: cvode_c, HEYOKA: heyoka}
-        others |= {f"{name}, index 1": partial(scipy, name) for name in SCIPY}
-    made |= {name: partial(call, False) for name, call in others.items()}
-    # steps do not matter to checks of the input
-    return made | ({} if group == INPUT else {name + LIMITED: partial(call, True) for name, call in others.items()})
+        others = {IDA: partial(solve_ida, form="stabilised"), IDA_C: solve_ida_c}
+        others |= {CVODE_C: partial(solve_cvode_c, method="Adams"), HEYOKA: solve_heyoka}
+    others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in (QUICK_SCIPY if quick else SCIPY)}
+    made |= {name: partial(other, solve, False) for name, solve in others.items()}
+    if group != INPUT:  # to whose checks steps do not matter
+        made |= {name + LIMITED: partial(other, solve, True) for name, solve in others.items()}
+    return made
 
 
 def why_not(name: str, trap: Trap) -> str:

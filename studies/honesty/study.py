@@ -1,33 +1,31 @@
 """Which solver says so when it is wrong: every solver on every trap, right, said so, wrong and silent, or hung."""
 
-import multiprocessing
 import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
-from multiprocessing.connection import Connection
 from typing import Any
 from unittest.mock import patch
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
-from studies.bench import figures, study
+from studies.bench import figures
+from studies.bench.apart import apart
 from studies.bench.cli import StudyError
 from studies.bench.end_states import EXACT
-from studies.bench.render import render, table
+from studies.bench.render import table
 from studies.bench.sharp_forces import T_END
-from studies.bench.store import Output, Row
-from studies.honesty import picture as honesty_picture
-from studies.honesty.solvers import DEFAULT, DEFAULT_COMPILED, LIMITED, OURS, Call, solvers, why_not
+from studies.bench.store import Array, Output, Row
+from studies.bench.study import Study
+from studies.honesty.solvers import CVODE_C, DEFAULT, DEFAULT_COMPILED, HEYOKA, LIMITED, OURS, Call, solvers, why_not
 from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
-
-Array = NDArray[np.float64]
 
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
@@ -42,12 +40,12 @@ REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, t
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
-BUILT = ("heyoka", "cvode_c")  # calls of solvers that are built for each system, which takes longer than they run
+BUILT = (HEYOKA, CVODE_C)  # solvers that are built for each system, which takes longer than they run
 
 PARTS = {  # of the bars of the figure
-    "right": (RIGHT,),
-    "said so": (SAID,),
-    "wrong and silent, or hanging": (SILENT, HANG),
+    "right": ((RIGHT,), figures.BLUE),
+    "said so": ((SAID,), figures.SKY),
+    "wrong and silent, or hanging": ((SILENT, HANG), figures.RED),
 }
 
 
@@ -87,8 +85,8 @@ def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -
     return q
 
 
-def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
-    """Make a run in a process of its own and send what came of it."""
+def cell(call: Call, trap: Trap, truth: Array | None) -> Row:
+    """Make a run: what came of it."""
     made: Row = {"status": "", "message": "", "error": None, "warned": "", "asked": True}
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -102,8 +100,7 @@ def cell(call: Call, trap: Trap, truth: Array | None, pipe: Connection) -> None:
                 made["asked"] = not np.array_equal(result.q, without.q)
         except Exception as error:
             made |= {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
-    made["warned"] = " / ".join(str(each.message) for each in said)
-    pipe.send(made)
+    return made | {"warned": " / ".join(str(each.message) for each in said)}
 
 
 def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
@@ -111,7 +108,7 @@ def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
     if row["status"] == "RAISED" and any(words in row["message"] for words in REFUSALS):
         return NOT_RUN
     if row["status"] != "REACHED_END":
-        return SAID
+        return HANG if row["status"] == HANG else SAID
     limit = LOOSENESS * max(trap.tolerance, LEAST)
     if has_answer and row["error"] is not None and row["error"] <= limit:
         return RIGHT
@@ -128,47 +125,40 @@ def about(name: str, trap: Trap) -> dict[str, str]:
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """One cell, in a process of its own that is ended when it does not come back."""
     row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
-    context = multiprocessing.get_context("fork")
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=cell, args=(call, trap, truth, there), daemon=True)
-    process.start()
-    there.close()
-    began = time.monotonic()
+    began, no_answer = time.monotonic(), {"message": "", "error": None, "warned": ""}
     try:
-        came = here.poll(trap.time_limit + GRACE)
-        row |= here.recv() if came else {"status": "HANG", "message": "", "error": None, "warned": ""}
+        row |= apart(partial(cell, call, trap, truth), trap.time_limit + GRACE)
+    except TimeoutError:
+        row |= {"status": HANG, **no_answer}
     except EOFError:
-        row |= {"status": "CRASHED", "message": "the process ended without an answer", "error": None, "warned": ""}
-        came = True
-    process.kill()
-    process.join()
+        row |= {"status": "CRASHED", **no_answer, "message": "the process ended without an answer"}
     row["seconds"] = time.monotonic() - began
-    return row | {"outcome": outcome(row, trap, truth is not None) if came else HANG}
+    return row | {"outcome": outcome(row, trap, truth is not None)}
 
 
 def make(output: Output) -> pd.DataFrame:
     """Make all cells. The checks of a start in our adapters of foreign solvers are off: those are to answer alone."""
-    rows = []
+    rows: list[Row] = []
+    compiled: set[tuple[Any, ...]] = set()
+
+    def made(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
+        if why := why_not(name, trap):
+            return about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why}
+        warm_up(name, call, trap, compiled)
+        return run(name, call, trap, truth)
+
     with output.kept() as kept, unchecked():
-        compiled: set[tuple[Any, ...]] = set()
         for trap in chain(traps(output.call.quick), held_out(output.call.quick)):
             known = solvers(output.call.quick, trap.group)
             keys = {name: " | ".join(about(name, trap).values()) for name in known}
             truth = None if all(key in kept for key in keys.values()) else right_answer(trap)
-            for name, call in known.items():
-                if (key := keys[name]) not in kept:
-                    if why := why_not(name, trap):
-                        kept.add(key, about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why})
-                    else:
-                        warm_up(name, call, trap, compiled)
-                        kept.add(key, run(name, call, trap, truth))
-                rows.append(kept[key])
+            rows += [kept.made(keys[name], partial(made, name, call, trap, truth)) for name, call in known.items()]
     return pd.DataFrame(rows)
 
 
 def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
     """Compile in this process what the children call, on a harmless motion."""
-    shared = call.func.__name__ if isinstance(call, partial) and not name.endswith(OURS) else name
+    shared = name.removesuffix(LIMITED)
     sane, tolerance = trap.sane or trap.system, 1e-4
     made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *sane.functions[:-2])
     if shared in BUILT:
@@ -296,21 +286,40 @@ def table_of(found: Sequence[dict[str, Any]], what: str, named: bool = False) ->
     return table([what, "ours", "others", *(["silent"] if named else [])], lines)
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings, figure and report."""
-    found = findings_of(rows)
-    output.save_findings(found)
-    figures.save(honesty_picture.picture(found["held_out"]["solvers"], PARTS), output, "honesty")
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """The bars of the forces held out."""
+    return {"honesty": picture(found["held_out"]["solvers"])}
+
+
+def picture(totals: Sequence[dict[str, Any]]) -> Figure:
+    """A bar for each solver, ours first, then others: the share of its runs with the outcomes of each part."""
+    names = [f"{line['solver'].replace(OURS, '')} ({line['n']})" for line in totals]
+    figure, axes = plt.subplots(figsize=(7.6, 0.17 * len(totals) + 0.9), layout="constrained")
+    left = np.zeros(len(totals))
+    for what, (outcomes, color) in PARTS.items():
+        counts = [sum(line[each] for each in outcomes) for line in totals]
+        shares = np.array([100.0 * count / line["n"] for count, line in zip(counts, totals, strict=True)])
+        bars = axes.barh(names, shares, left=left, color=color, label=what)
+        if SILENT in outcomes:
+            axes.bar_label(bars, [str(count) if count else "" for count in counts], label_type="center", fontsize=7)
+        left += shares
+    n_own = sum(line["solver"].endswith(OURS) for line in totals)
+    axes.axhline(n_own - 0.5, color="black", linewidth=0.8)
+    for text, place in (("ours", 0.5 * n_own), ("others", 0.5 * (n_own + len(totals)))):
+        axes.text(101.0, place - 0.5, text, rotation=90.0, va="center")
+    axes.set(xlabel="share of runs (%)", xlim=(0.0, 100.0), ylim=(len(totals) - 0.4, -0.6), ylabel="solver (its runs)")
+    axes.tick_params(axis="y", labelsize=8, length=0.0)
+    axes.grid(False)
+    figures.legend(figure, [axes], "numbers: runs")
+    return figure
+
+
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """Outcomes under the forces held out, and of the mistakes that are not all seen or all right."""
     alike = {*found["all_say_so"], *found["all_right"]}
-    ready = {"forces": table_of(found["held_out"]["families"], "force")}
-    ready["mistakes"] = table_of([line for line in found["traps"] if line["trap"] not in alike], "trap", True)
-    output.write("honesty.md", render("honesty", found, ready, stamp=line, quick=output.call.quick))
+    mistakes = table_of([line for line in found["traps"] if line["trap"] not in alike], "trap", True)
+    return {"forces": table_of(found["held_out"]["families"], "force"), "mistakes": mistakes}
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    study.run_rows("honesty", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study("honesty", __doc__, make, findings_of, figures_of, tables_of)
+main = STUDY.main

@@ -7,9 +7,9 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from studies.bench.cli import StudyError
 from studies.bench.random_linkages import end_of
@@ -17,12 +17,11 @@ from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families
 from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import CHECK, RTOL, march, motion, off
+from studies.bench.store import Array
 from studies.planted_errors.faults import python_copy
 from twoloop import ConstrainedSystem
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
-
-Array = NDArray[np.float64]
 
 NEVER = 1e30  # s
 # what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,
@@ -119,19 +118,10 @@ def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
 
 def chain(n: int, parameters: Array, rows: int = 0) -> ConstrainedSystem:
     """A chain of n points a metre apart that hangs from a pivot, the first `rows` of its constraints twice."""
-    return ConstrainedSystem(
-        n_q=2 * n,
-        n_c=n + rows,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        constraint_rate=constraint_rate,
-        gamma=gamma,
-        parameters=parameters,
-        constant_mass=True,
-        name=f"chain of {n}",
-    )
+    functions: dict[str, Any] = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian}
+    functions |= {"constraint_rate": constraint_rate, "gamma": gamma}
+    about: dict[str, Any] = {"parameters": parameters, "constant_mass": True, "name": f"chain of {n}"}
+    return ConstrainedSystem(n_q=2 * n, n_c=n + rows, **functions, **about)
 
 
 def fails(Q: Array, t: float, *state: Array) -> Array:
@@ -336,16 +326,6 @@ def held_out(quick: bool) -> Iterator[Trap]:
 def of_force(mechanism: Mechanism, group: str, end: Callable[[], Array], n_drawn: int = 1) -> Trap:
     """The trap of a mechanism under a force, whose end is known."""
     sharp = mechanism.sharp
-    return Trap(
-        sharp.family,
-        mechanism.name,
-        mechanism.system,
-        mechanism.q0,
-        mechanism.v0,
-        T_END,
-        mechanism.system,
-        positions=lambda t: end(),
-        group=group,
-        impulse=sharp.driven and bool(sharp.breaks),
-        n_drawn=n_drawn,
-    )
+    about: dict[str, Any] = {"group": group, "impulse": sharp.driven and bool(sharp.breaks), "n_drawn": n_drawn}
+    given = mechanism.system, mechanism.q0, mechanism.v0, T_END, mechanism.system
+    return Trap(sharp.family, mechanism.name, *given, positions=lambda t: end(), **about)

@@ -1,5 +1,3 @@
-"""`python -m studies.planted_errors`."""
-
-from studies.planted_errors.study import main
+from studies.planted_errors import main
 
 main()

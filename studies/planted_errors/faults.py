@@ -9,17 +9,15 @@ from unittest.mock import patch
 
 import numpy as np
 import scipy.integrate
-from numpy.typing import NDArray
 
 from studies.bench import metrics, render, solvers, tables
+from studies.bench.store import Array
 from twoloop import ConstrainedSystem, Result, callback, mechanisms
 from twoloop.mechanisms import Problem
 from twoloop.methods import presets as methods
 from twoloop.methods import tableaux
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
-
-Array = NDArray[np.float64]
 
 TABLEAUX = "tests/test_tableaux.py"
 EXPLICIT = "tests/kernels/test_explicit.py::test_scipy_still_gives_the_numbers_that_we_take_from_it"

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+import tomllib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -32,46 +33,7 @@ FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs"
 SEED, N_EACH, QUICK_EACH = 2016, 10, 1
 TIME_LIMIT = 900.0  # s of the tests of a mutant, longer than they take on a busy machine; none has to end
 NONE = "none"
-# mutants that no test can see, and why: kernel, line, what was there, what is there
-ARGUED: dict[tuple[str, ...], str] = {
-    ("explicit", "if not error <= 1.0:", "<=", "<"): "differs where an error is 1 to the last bit",
-    (
-        "bdf",
-        "if k < options[HIGHEST] and depth > k:",
-        ">",
-        ">=",
-    ): "the estimate is used after k steps of order k only, when the depth is above k",
-    (
-        "bdf",
-        "copy(differences[0], trial[0])",
-        "0",
-        "1",
-    ): "trial[0] and trial[1] are written anew before they are read: the line could go",
-    (
-        "adams",
-        "memory[DEPTH] = 0.0",
-        "0.0",
-        "1.0",
-    ): "another history after three refusals in a row: past a jump it takes fewer steps, to the same answers",
-    (
-        "adams",
-        "width = (n + 3) // 4 * 4",
-        "3",
-        "4",
-    ): "takes four numbers too many; where n_q is a multiple of 4 they lie behind the memory, which no test watches",
-    (
-        "bdf",
-        "for j in range(int(memory[NEXT_DEPTH]) + 1):",
-        "1",
-        "2",
-    ): "copies one row beyond the depth, which is written before it is read",
-    (
-        "adams",
-        "return min(max(error ** (1.0 / (k + 1.0)), 1.0 + 1e-9), SAFETY / SHRINKAGE)",
-        "+",
-        "-",
-    ): "refused steps, one in a hundred, are shortened by up to the same limit: another strategy, no other answer",
-}
+ARGUED = tomllib.loads(Path(__file__).with_name("argued.toml").read_text())
 SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
 COMPARED = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
 SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"} | {
@@ -229,15 +191,11 @@ def make(output: Output) -> pd.DataFrame:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What planted_errors.md says: how many are seen, and which are not."""
     survivors = rows[rows["seen_by"] == NONE]
-    kernels = {
-        str(kernel): {"n": len(own), "seen": int((own["seen_by"] != NONE).sum())}
-        for kernel, own in rows.groupby("kernel", sort=False)
-    }
-    keys = ("kernel", "text", "old", "new")
-    places = [
-        {key: str(row[key]) for key in ("line", *keys)} | {"why": ARGUED.get(tuple(str(row[key]) for key in keys), "")}
-        for _, row in survivors.iterrows()
-    ]
+    seen = (rows["seen_by"] != NONE).groupby(rows["kernel"], sort=False)
+    kernels = {str(kernel): {"n": len(own), "seen": int(own.sum())} for kernel, own in seen}
+    places = survivors[["line", "kernel", "text", "old", "new"]].astype(str).to_dict("records")
+    for place in places:
+        place["why"] = ARGUED.get(" | ".join(place[key] for key in ("kernel", "text", "old", "new")), "")
     return {"n": len(rows), "seen": len(rows) - len(survivors), "kernels": kernels, "survivors": places}
 
 

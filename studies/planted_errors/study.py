@@ -3,18 +3,18 @@
 import contextlib
 import io
 import json
-import multiprocessing
 import os
 import time
 import warnings
 from collections.abc import Sequence
-from multiprocessing.connection import Connection
+from functools import partial
 from typing import Any
 
 import pandas as pd
 import pytest
 
 from studies.bench import study
+from studies.bench.apart import apart
 from studies.bench.cli import ROOT, StudyError
 from studies.bench.collector import Run, warm_up
 from studies.bench.end_states import case_of
@@ -95,35 +95,28 @@ def test_check(tests: Sequence[str]) -> str:
 test_check.__test__ = False  # type: ignore[attr-defined]
 
 
-def look(fault: Fault, planted: bool, pipe: Connection) -> None:
-    """Plant a fault in this process and send what catches it."""
+def look(fault: Fault, planted: bool) -> str:
+    """Plant a fault in this process: what catches it."""
     os.chdir(ROOT)
     warnings.simplefilter("ignore")
     with fault.plant() if planted else contextlib.nullcontext():
-        found = test_check(fault.checks) if fault.problem is None else run_check(fault.problem, fault.solver)
-    pipe.send(found)
+        return test_check(fault.checks) if fault.problem is None else run_check(fault.problem, fault.solver)
 
 
-def apart(fault: Fault, planted: bool) -> str:
+def caught(fault: Fault, planted: bool) -> str:
     """What catches a fault, found in a process of its own; a check that does not come back has caught it, too."""
-    context = multiprocessing.get_context("fork")
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=look, args=(fault, planted, there), daemon=True)
-    process.start()
-    there.close()
     try:
-        found = str(here.recv()) if here.poll(TIME_LIMIT) else "time limit of the check"
+        return str(apart(partial(look, fault, planted), TIME_LIMIT))
+    except TimeoutError:
+        return "time limit of the check"
     except EOFError:
-        found = "the process of the check ended"
-    process.kill()
-    process.join()
-    return found
+        return "the process of the check ended"
 
 
 def row_of(fault: Fault) -> Row:
     """A fault and what catches it."""
     began = time.monotonic()
-    found = apart(fault, True)
+    found = caught(fault, True)
     row: Row = {"fault": fault.name, "place": fault.place, "caught_by": found or NONE}
     row["check"] = fault.checks[0] if fault.checks else f"run by {fault.solver}"
     return row | {"seconds": time.monotonic() - began}
@@ -150,7 +143,7 @@ def check_sound(faults: Sequence[Fault]) -> int:
         if fault.problem is not None:
             made = {problem.name: problem for problem in (make() for make in validation.MAKE)}
             sound = Fault(fault.name, fault.place, problem=made[fault.problem.name], solver=fault.solver)
-        if found := apart(sound, False):
+        if found := caught(sound, False):
             raise StudyError(f"the check {key} fails without a fault: {found}")
     return len(seen)
 
@@ -162,19 +155,14 @@ def make(output: Output) -> pd.DataFrame:
         faults = [fault for k, fault in enumerate(faults) if fault.place == "trace" or k % QUICK == 0]
     check_sound(faults)
     with output.kept() as kept:
-        for fault in faults:
-            if fault.name not in kept:
-                kept.add(fault.name, row_of(fault))
-        return pd.DataFrame([kept[fault.name] for fault in faults])
+        return pd.DataFrame([kept.made(fault.name, partial(row_of, fault)) for fault in faults])
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     missed = rows[rows["caught_by"] == NONE]
-    places = {
-        str(place): {"n": len(own), "caught": int((own["caught_by"] != NONE).sum())}
-        for place, own in rows.groupby("place", sort=False)
-    }
+    caught = (rows["caught_by"] != NONE).groupby(rows["place"], sort=False)
+    places = {str(place): {"n": len(own), "caught": int(own.sum())} for place, own in caught}
     return {"n": len(rows), "missed": missed["fault"].tolist(), "places": places, "tolerance": TOLERANCE}
 
 
@@ -200,7 +188,3 @@ def _file(check: str) -> str:
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
     study.run_rows("planted_errors", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()

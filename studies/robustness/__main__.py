@@ -1,5 +1,3 @@
-"""`python -m studies.robustness`."""
-
-from studies.robustness.study import main
+from studies.robustness import main
 
 main()

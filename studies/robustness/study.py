@@ -10,24 +10,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from studies.bench import study
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
-from studies.bench.render import number, power, render, table
-from studies.bench.store import Output, Row
+from studies.bench.sharp_motion import RIGHT, SAID, SILENT
+from studies.bench.store import Array, Output, Row
+from studies.bench.study import Study
 from studies.robustness import sharp_runs
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
-
-Array = NDArray[np.float64]
 
 METHODS = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 QUICK_METHODS = ("DOP853", "Gauss12", "BDF")
 TOLERANCE = 1e-8  # rtol and atol of all runs
 LOOSENESS = 1e3  # an answer is right within so many tolerances, times the sensitivity of the end to the start
 TIME_LIMIT = 10.0  # s
-RIGHT, SAID, SILENT = "right", "said so", "wrong and silent"
 T_END = 5.0  # s; of a size s it is times sqrt(s)
 SEED = 2016
 N_LINKAGES, N_QUICK = 100, 2  # of each kind
@@ -149,9 +145,7 @@ def make(output: Output) -> pd.DataFrame:
     with output.kept() as kept:
         for part in (linkages, sharp_runs.random_mechanisms, scales, long_runs):
             for key, run in part(output.call.quick):
-                if key not in kept:
-                    kept.add(key, {"rows": run()})
-                rows += kept[key]["rows"]
+                rows += kept.made(key, lambda run=run: {"rows": run()})["rows"]  # type: ignore[misc]
     return pd.DataFrame(rows)
 
 
@@ -166,17 +160,12 @@ def counts_of(own: pd.DataFrame) -> dict[str, Any]:
 
 def limits_of(own: pd.DataFrame) -> dict[str, Any]:
     """Smallest and largest value from which and to which all of a method's runs are right, about 1."""
-    good = (own["outcome"] == RIGHT).groupby(own["value"]).all()
-    low = high = None
-    for value in sorted((x for x in good.index if x <= 1.0), reverse=True):
-        if not good[value]:
-            break
-        low = float(value)
-    for value in sorted(x for x in good.index if x >= 1.0):
-        if not good[value]:
-            break
-        high = float(value)
-    return {"low": low, "high": high, "said": sorted({str(x) for x in own[own["outcome"] == SAID]["status"]})}
+    good = (own["outcome"] == RIGHT).groupby(own["value"]).all()  # in the order of the values
+    found: dict[str, Any] = {}
+    for end, outwards in (("low", good[good.index <= 1.0][::-1]), ("high", good[good.index >= 1.0])):
+        reached = outwards.index[outwards.cummin()]
+        found[end] = float(reached[-1]) if len(reached) else None
+    return found | {"said": sorted({str(x) for x in own[own["outcome"] == SAID]["status"]})}
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -219,68 +208,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
 
 
-def _span(line: dict[str, Any]) -> str:
-    """From where to where a method is right, and what it reports beyond."""
-    if line["low"] is None or line["high"] is None:
-        return "–"
-    beyond = f" ({', '.join(word.lower() for word in line['said'])})" if line["said"] else ""
-    return f"{power(line['low'])} … {power(line['high'])}{beyond}"
-
-
-def tables_of(found: dict[str, Any]) -> dict[str, str]:
-    """The tables of the report."""
-    methods, kinds = (list(dict.fromkeys(line[key] for line in found["linkages"])) for key in ("method", "kind"))
-    of = {(line["method"], line["kind"]): line for line in found["linkages"]}
-    drawn = [
-        [
-            name,
-            *("/".join(str(of[name, kind][what]) for what in (RIGHT, SAID, SILENT)) for kind in kinds),
-            max(of[name, kind]["median"] for kind in kinds),
-            max(of[name, kind]["worst"] for kind in kinds),
-        ]
-        for name in methods
-    ]
-    reach = {(line["method"], line["group"]): line for line in found["scales"]}
-    reached = [[name, *(_span(reach[name, group]) for group in ("size", "density", "ratio"))] for name in methods]
-    lasting = [
-        [
-            line["method"],
-            number(float(line["n_steps"])),
-            *(f"{number(line[f'first_{level}'])} / {number(line[f'last_{level}'])}" for level in "qv"),
-            line["energy"],
-            line["bytes"],
-        ]
-        for line in found["long"]
-    ]
-    always = [line for line in found["sharp"]["methods"] if line["n"] == line[RIGHT] and not line["refused"]]
-    others = [line for line in found["sharp"]["methods"] if line not in always]
-    sharp = [[line["method"], *(line[what] for what in (RIGHT, SAID, SILENT, "refused"))] for line in others]
-    if always:
-        sharp.append([", ".join(line["method"] for line in always), f"all {always[0][RIGHT]}", 0, 0, 0])
-    return {
-        "sharp": table(("method", RIGHT, SAID, SILENT, "no run"), sharp),
-        "linkages": table(("method", *kinds, "median error", "worst / allowed"), drawn),
-        "scales": table(("method", "size, m", "density, kg/m", "density of bar 2 over the others"), reached),
-        "long": table(("method", "steps", "max abs C", "max abs C_q v", "energy (J)", "bytes a step"), lasting),
-    }
-
-
-def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings and report."""
-    found = findings_of(rows)
-    output.save_findings(found)
-    text = render("robustness", found, tables_of(found), stamp=line, quick=output.call.quick)
-    output.write("robustness.md", text)
-
-
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report; with --features a grid of sharp forces in its place, printed only."""
     given = sys.argv[1:] if words is None else words
     if "--features" in given:
         sharp_runs.main("--quick" in given)
         return
-    study.run_rows("robustness", __doc__, words, make, report)
+    STUDY.main(words)
 
 
-if __name__ == "__main__":
-    main()
+STUDY = Study("robustness", __doc__, make, findings_of)

@@ -1,5 +1,3 @@
-"""`python -m studies.sweep_linkages`."""
-
-from studies.sweep_linkages.study import main
+from studies.sweep_linkages import main
 
 main()

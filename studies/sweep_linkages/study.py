@@ -1,7 +1,6 @@
 """Ten thousand random linkages: energy error and period of each, and how a sweep scales on two cores."""
 
 import time
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -9,16 +8,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from studies.bench import figures, study
+from studies.bench import figures
 from studies.bench.cli import StudyError
-from studies.bench.render import render, table
-from studies.bench.store import Output, sources
+from studies.bench.store import Array, Output, sources
+from studies.bench.study import Study
 from twoloop import Result, sweep
 from twoloop.mechanisms import Problem, four_bar
-
-Array = NDArray[np.float64]
 
 SEED = 2016
 N_RUNS, N_QUICK = 10_000, 20
@@ -146,7 +142,7 @@ def _quantiles(values: pd.Series) -> dict[str, float]:
     return {"low": values.min(), "median": values.median(), "high": values.quantile(0.95), "worst": values.max()}
 
 
-def figure_of(rows: pd.DataFrame) -> Figure:
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Energy errors and periods of all linkages."""
     done = rows[(rows["group"] == "linkages") & (rows["status"] == "REACHED_END")]
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.4), layout="constrained")
@@ -155,28 +151,8 @@ def figure_of(rows: pd.DataFrame) -> Figure:
     left.set(xscale="log", xlabel="largest energy error over largest kinetic energy", ylabel="linkages")
     right.hist(done["period"].dropna(), bins=40, color=figures.BLUE)
     right.set(xlabel="period (s)", ylabel="linkages")
-    return figure
+    return {"sweep_linkages": figure}
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings, figure and report."""
-    found = findings_of(rows)
-    output.save_findings(found)
-    figures.save(figure_of(rows), output, "sweep_linkages")
-    scaling = rows[rows["group"] == "scaling"]
-    cells = [(row["parallel"], int(row["workers"]), row["wall"]) for _, row in scaling.iterrows()]
-    ready = {"scaling": table(["workers are", "number", "wall-clock time (s)"], cells)}
-    text = render("sweep_linkages", found, ready, stamp=line, quick=output.call.quick)
-    output.write("sweep_linkages.md", text)
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study."""
-    study.run_rows("sweep_linkages", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    # the functions are to be those of the module, not of the script: other processes look for them there
-    from studies.sweep_linkages.study import main as main_of_module
-
-    main_of_module()
+STUDY = Study("sweep_linkages", __doc__, make, findings_of, figures_of)
+main = STUDY.main

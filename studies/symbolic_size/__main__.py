@@ -1,5 +1,3 @@
-"""`python -m studies.symbolic_size`."""
-
-from studies.symbolic_size.study import main
+from studies.symbolic_size import main
 
 main()

@@ -7,15 +7,15 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from studies.bench import study
 from studies.bench.cli import ROOT
-from studies.bench.render import number, render, table
 from studies.bench.store import Output, Row
+from studies.bench.study import Study
 from studies.symbolic_size.models import MODELS, REPEATS
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem
@@ -47,7 +47,7 @@ def made(coordinates: str, n: int, tangents: bool) -> Row:
 def cost(problem: Problem, times: int) -> tuple[float, int | None]:
     """Least CPU time of an evaluation, us, and how many there were."""
     end = min(LONGEST, problem.t_span[1])
-    least, count = float("inf"), None
+    least, count = np.inf, None
     for _ in range(times):
         result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, "DOP853", rtol=1e-8, atol=1e-8)
         count = result.stats.n_evaluations
@@ -59,13 +59,7 @@ def compared(name: str) -> Row:
     """A ready mechanism and its twin from SymPy: evaluations of a run and what one costs."""
     hand, mechanism = MODELS[name]()
     twin = mechanism.problem(hand.q0, hand.v0, hand.t_span)
-    row: Row = {
-        "group": "twin",
-        "case": name,
-        "status": "REACHED_END",
-        "hand_us": float("inf"),
-        "twin_us": float("inf"),
-    }
+    row: Row = {"group": "twin", "case": name, "status": "REACHED_END"} | dict.fromkeys(("hand_us", "twin_us"), np.inf)
     for _ in range(REPEATS):  # in turn, so that both see the same machine
         for whose, problem in (("hand", hand), ("twin", twin)):
             least, count = cost(problem, REPEATS)
@@ -84,13 +78,8 @@ def make(output: Output) -> pd.DataFrame:
     ]
     names = list(MODELS)[: QUICK_MODELS if quick else None]
     with output.kept() as kept:
-        for which in sizes:
-            if str(which) not in kept:
-                kept.add(str(which), made(*which))
-        for name in names:
-            if name not in kept:
-                kept.add(name, compared(name))
-        return pd.DataFrame([kept[key] for key in (*map(str, sizes), *names)])
+        rows = [kept.made(str(which), partial(made, *which)) for which in sizes]
+        return pd.DataFrame(rows + [kept.made(name, partial(compared, name)) for name in names])
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -113,41 +102,5 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings and report."""
-    found = findings_of(rows)
-    output.save_findings(found)
-    sizes, twins = rows[rows["group"] == "size"], rows[rows["group"] == "twin"]
-    columns = ("lines", "derive_s", "compile_s", "second_s", "evaluation_us")
-    size_cells = [
-        [row["case"], f"{row['n']:g}", "yes" if row["tangents"] else "no", *(number(row.get(name)) for name in columns)]
-        for _, row in sizes.iterrows()
-    ]
-    twin_cells = [
-        [row["case"], number(row["hand_us"]), number(row["twin_us"]), number(row["twin_us"] / row["hand_us"])]
-        for _, row in twins.iterrows()
-    ]
-    header = [
-        "coordinates",
-        "n",
-        "tangents",
-        "lines",
-        "derive (s)",
-        "compile (s)",
-        "second start (s)",
-        "evaluation (µs)",
-    ]
-    ready = {
-        "sizes": table(header, size_cells),
-        "twins": table(["mechanism", "by hand (µs)", "from SymPy (µs)", "ratio"], twin_cells),
-    }
-    output.write("symbolic_size.md", render("symbolic_size", found, ready, stamp=line, quick=output.call.quick))
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    study.run_rows("symbolic_size", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study("symbolic_size", __doc__, make, findings_of)
+main = STUDY.main

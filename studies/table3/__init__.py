@@ -1,5 +1,3 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside other solvers."""
 
-from studies.table3.study import main
-
-__all__ = ["main"]
+from studies.table3.study import main as main

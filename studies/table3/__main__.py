@@ -1,5 +1,3 @@
-"""`python -m studies.table3`."""
-
-from studies.table3.study import main
+from studies.table3 import main
 
 main()

@@ -1,6 +1,7 @@
 """Why the paper's time over ours is not one factor in Table 3: causes and readings of the text, tested on the rows."""
 
 from functools import partial
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.optimize import least_squares
 
 from studies.bench.collector import Case, Run, Solver
 from studies.bench.solvers import ERR_IN, ERR_OUT, IRK, NEWMARK, PAPER_TOL
+from studies.bench.tables import where
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import sun_radau_iib
 
@@ -35,24 +37,20 @@ def printed(group: str) -> tuple[tuple[float | None, ...], ...]:
 
 def machine(rows: pd.DataFrame, group: str, err_in: float, err_out: float) -> pd.Series | None:
     """Our run of a cell."""
-    found = rows[(rows["group"] == group) & (rows["err_in"] == err_in) & (rows["err_out"] == err_out)]
+    found = where(rows, group=group, err_in=err_in, err_out=err_out)
     return None if found.empty else found.iloc[0]
 
 
 def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:
     """All cells that both have: printed time, our time and counts; exchanged: err_in and err_out of the IRK swapped."""
     lines = []
-    for group in FAMILIES:
-        for i, e_in in enumerate(TOLERANCES):
-            for j, e_out in enumerate(TOLERANCES):
-                swapped = exchanged and group == "Table 3: IRK"
-                paper = printed(group)[j][i] if swapped else printed(group)[i][j]
-                ours = machine(rows, group, e_in, e_out)
-                if paper is None or ours is None:
-                    continue
-                attempts = float(ours["n_steps"]) + float(ours["n_rejected"])
-                counts = (float(ours[key]) for key in ("call_s", "n_evaluations", "n_inner"))
-                lines.append((group, paper, *counts, attempts))
+    for group, (i, e_in), (j, e_out) in product(FAMILIES, enumerate(TOLERANCES), enumerate(TOLERANCES)):
+        swapped = exchanged and group == "Table 3: IRK"
+        paper = printed(group)[j][i] if swapped else printed(group)[i][j]
+        ours = machine(rows, group, e_in, e_out)
+        if paper is not None and ours is not None:
+            attempts = float(ours["n_steps"]) + float(ours["n_rejected"])
+            lines.append((group, paper, *ours[["call_s", "n_evaluations", "n_inner"]].astype(float), attempts))
     return pd.DataFrame(lines, columns=["group", "paper", "call_s", "evaluations", "inner", "attempts"])
 
 
@@ -83,10 +81,8 @@ def partition_cost(rows: pd.DataFrame) -> float:
 
     The partition is that of `partition="symmetric"`, in fixed steps of the midpoint rule, which has few evaluations.
     """
-    kept, every = (
-        rows[(rows["group"] == "partition") & (rows["solver"] == f"fixed step, {name}")].iloc[0]
-        for name in ("lasting", "symmetric")
-    )
+    solvers = (f"fixed step, {name}" for name in ("lasting", "symmetric"))
+    kept, every = (where(rows, group="partition", solver=name).iloc[0] for name in solvers)
     evaluation = kept["call_s"] / kept["n_evaluations"]
     # the two runs do not iterate equally often
     extra = every["call_s"] - evaluation * every["n_evaluations"]
@@ -95,8 +91,7 @@ def partition_cost(rows: pd.DataFrame) -> float:
 
 def _paper_irk(test: Reading, case: Case, err_out: float, repeat: int) -> Result:
     method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, err_out, outer_test=test)
-    span, start = (0.0, case.t_end), (case.problem.q0, case.problem.v0)
-    return solve_dae(case.problem.system, span, *start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
+    return solve_dae(*case.start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
 
 
 def reading_runs(case: Case) -> list[Run]:
@@ -114,8 +109,8 @@ def readings(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """Of each reading of (32) run to the end, how far evaluations along err_out are from the printed row, in phase."""
     found = []
     for what in READINGS.values():
-        runs = rows[(rows["group"] == "reading") & (rows["solver"] == f"{IRK}, (32) on {what}")]
-        runs = runs[runs["err_in"] == ERR_IN].set_index("err_out").reindex(TOLERANCES)
+        runs = where(rows, group="reading", solver=f"{IRK}, (32) on {what}", err_in=ERR_IN)
+        runs = runs.set_index("err_out").reindex(TOLERANCES)
         if runs["status"].eq("REACHED_END").all():
             apart = np.log(runs["n_evaluations"].to_numpy(float) / PAPER_IRK[-1])
             # about its mean, as the factor between both is free

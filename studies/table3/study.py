@@ -1,6 +1,5 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside other solvers."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,13 +10,13 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from studies.bench import adaptive, figures, study, tables
+from studies.bench import adaptive, figures, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver, collect, row_of
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import ASTRAY, LOST
-from studies.bench.render import number, power, render, table
+from studies.bench.render import number, power, table
 from studies.bench.solvers import (
     ADAMS,
     CATALOGUE,
@@ -36,7 +35,8 @@ from studies.bench.solvers import (
     paper_irk_at,
     paper_newmark_at,
 )
-from studies.bench.store import Output, Row
+from studies.bench.store import Array, Output, Row
+from studies.bench.study import Study
 from studies.table3.causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, causes, machine, printed, reading_runs
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss
@@ -58,8 +58,7 @@ STEP = 0.01  # s, of the runs that tell what a partition costs
 
 
 def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
-    problem, method = case.problem, RungeKutta(gauss(1), partition=partition)  # type: ignore[arg-type]
-    return solve_dae(problem.system, (0.0, case.t_end), problem.q0, problem.v0, method=method, step_size=step)
+    return solve_dae(*case.start, method=RungeKutta(gauss(1), partition=partition), step_size=step)  # type: ignore[arg-type]
 
 
 def runs(first: Case, second: Case, quick: bool) -> list[Run]:
@@ -109,43 +108,35 @@ def make(output: Output) -> pd.DataFrame:
     return pd.concat([rows, more], ignore_index=True)
 
 
-def grid(rows: pd.DataFrame, group: str) -> str:
-    """A table of times, err_in by err_out, beside the printed ones."""
-    lines = []
-    for e_in, paper in zip(TOLERANCES, printed(group), strict=True):
-        cells = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
-        shown = ["not run" if cell is None else _time(cell, time) for cell, time in zip(cells, paper, strict=True)]
-        lines.append([power(e_in), *shown])
-    return table(["err_in \\ err_out", *(power(e) for e in TOLERANCES)], lines)
-
-
-def _time(cell: pd.Series, paper: float | None) -> str:
+def cell_of(rows: pd.DataFrame, group: str, e_in: float, e_out: float) -> str:
+    """Our time of a cell and, of a run as long as the paper's, the printed one and its ratio to ours."""
+    paper = printed(group)[TOLERANCES.index(e_in)][TOLERANCES.index(e_out)]
+    cell = machine(rows, group, e_in, e_out)
+    if cell is None:
+        return "not run"
     mark = "★" if cell["lost"] else "†" if cell["astray"] else ""
     spread = tables.with_quartiles(cell["call_s"], cell["call_q1"], cell["call_q3"]) + mark
     if cell["t_end"] != PAPER_END:  # a quick run: nothing printed is for so short a motion
         return spread
-    if paper is None:
-        return f"{spread} / ★"
-    return f"{spread} / {paper:.2f} ×{number(paper / cell['call_s'])}"
+    return f"{spread} / " + ("★" if paper is None else f"{paper:.2f} ×{number(paper / cell['call_s'])}")
 
 
-def ratios(rows: pd.DataFrame, group: str) -> list[list[float]]:
+def grid(rows: pd.DataFrame, group: str) -> str:
+    """A table of times, err_in by err_out, beside the printed ones."""
+    lines = [[power(e_in), *(cell_of(rows, group, e_in, e_out) for e_out in TOLERANCES)] for e_in in TOLERANCES]
+    return table(["err_in \\ err_out", *map(power, TOLERANCES)], lines)
+
+
+def ratios(rows: pd.DataFrame, group: str) -> Array:
     """The paper's time over ours, err_in by err_out; NaN where the paper or we have no result that is of use."""
-    found = []
-    for e_in, paper in zip(TOLERANCES, printed(group), strict=True):
-        cells = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
-        found.append(
-            [
-                np.nan if cell is None or time is None or cell["lost"] else time / cell["call_s"]
-                for cell, time in zip(cells, paper, strict=True)
-            ]
-        )
-    return found
+    own = rows[(rows["group"] == group) & ~rows["lost"].astype(bool)]
+    ours = own.pivot_table("call_s", "err_in", "err_out").reindex(index=TOLERANCES, columns=TOLERANCES)
+    return np.array(printed(group), dtype=float) / ours.to_numpy(float)
 
 
 def picture(rows: pd.DataFrame) -> Figure:
     """The paper's time over ours, of both procedures: one colour, were the machine all the difference."""
-    known = {group: np.array(ratios(rows, group)) for group in FAMILIES}
+    known = {group: ratios(rows, group) for group in FAMILIES}
     every = np.concatenate([np.ravel(each) for each in known.values()])
     norm = LogNorm(np.nanmin(every), max(np.nanmax(every), 1.01 * np.nanmin(every)))
     figure, panels = plt.subplots(1, 2, figsize=(7.4, 3.2), sharey=True, layout="constrained")
@@ -170,15 +161,17 @@ def picture(rows: pd.DataFrame) -> Figure:
 
 def counts(rows: pd.DataFrame) -> str:
     """A table of evaluations and error of both procedures with err_in = 1e-9, on which they hardly depend."""
-    lines = []
-    for group, name in (("Table 3: IRK", "Runge–Kutta"), ("Table 3: Newmark", "Newmark")):
-        line = [name]
-        for err_out in TOLERANCES:
-            cell = machine(rows, group, ERR_IN, err_out)
-            keys = ("n_evaluations", "error_q")
-            line.append("not run" if cell is None else "; ".join(number(float(cell[key])) for key in keys))
-        lines.append(line)
-    return table(["err_out", *(power(e) for e in TOLERANCES)], lines)
+
+    def told(cell: pd.Series | None) -> str:
+        return (
+            "not run" if cell is None else f"{number(float(cell['n_evaluations']))}; {number(float(cell['error_q']))}"
+        )
+
+    lines = [
+        [name, *(told(machine(rows, group, ERR_IN, err_out)) for err_out in TOLERANCES)]
+        for group, name in zip(FAMILIES, ("Runge–Kutta", "Newmark"), strict=True)
+    ]
+    return table(["err_out", *map(power, TOLERANCES)], lines)
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -268,34 +261,25 @@ def _compared(first: pd.DataFrame) -> pd.DataFrame:
     return first[first["group"].isin(("comparison", *FAMILIES)) & fine]
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
-    """Write findings, figure and report; the findings."""
-    rows = tables.medians(rows)
-    findings = findings_of(rows)
-    output.save_findings(findings)
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Cost over error and, where runs are as long as the paper's, the ratios of the times."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    compared = _compared(first)
-    seconds = f"{number(findings['t_end'])} s"
-    plot = figures.work_precision(compared, DRAWN, f"{first['problem'].iloc[0]}, {seconds}")
-    figures.save(plot, output, "table3")
-    if findings["t_end"] == PAPER_END:
-        figures.save(picture(first), output, "table3_ratios")
-    header = ["solver", *(power(target) for target in TARGETS)]
-    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(compared, TARGETS, LISTED)]
-    ready = {"work": table(header, costs)}
-    for name, group in (("irk", "Table 3: IRK"), ("newmark", "Table 3: Newmark")):
+    title = f"{first['problem'].iloc[0]}, {number(found['t_end'])} s"
+    made = {"table3": figures.work_precision(_compared(first), DRAWN, title)}
+    return made | ({"table3_ratios": picture(first)} if found["t_end"] == PAPER_END else {})
+
+
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """The tables of the report, of which the times are printed, too."""
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(_compared(first), TARGETS, LISTED)]
+    ready = {"work": table(["solver", *map(power, TARGETS)], costs), "counts": counts(first)}
+    for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         ready[name] = grid(first, group)
-        print(f"\n{group}, CPU time in s over {seconds} / the paper's, × its ratio to ours\n{ready[name]}")
-    ready["counts"] = counts(first)
-    problem = first["problem"].iloc[0]
-    output.write("table3.md", render("table3", findings, ready, stamp=line, quick=output.call.quick, problem=problem))
-    return findings
+        about = f"{group}, CPU time in s over {number(found['t_end'])} s / the paper's, × its ratio to ours"
+        print(f"\n{about}\n{ready[name]}")
+    return ready
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    study.run_rows("table3", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study("table3", __doc__, make, findings_of, figures_of, tables_of, medians=True)
+main = STUDY.main

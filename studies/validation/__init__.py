@@ -1,5 +1,3 @@
 """Mechanisms that others published: which solver is right, to how many digits, on which of them."""
 
-from studies.validation.study import main
-
-__all__ = ["main"]
+from studies.validation.study import main as main

@@ -1,5 +1,3 @@
-"""`python -m studies.validation`."""
-
-from studies.validation.study import main
+from studies.validation import main
 
 main()

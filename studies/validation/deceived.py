@@ -8,15 +8,12 @@ shares no code with our methods.
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.scipy.index1 import solve_index1
 from studies.bench.collector import Case, Run, attempt
-from studies.bench.store import Row
+from studies.bench.store import Array, Row
 from twoloop import Result
 from twoloop.mechanisms import Problem
-
-Array = NDArray[np.float64]
 
 DECEIVED = "deceived steps"  # group of runs
 SAMPLED = 26  # steps of a run, evenly spaced, the first of which is judged apart: it has no history to estimate from

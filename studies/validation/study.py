@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -11,10 +11,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.bench import figures, study
 from studies.bench.collector import Run, warm_up
 from studies.bench.end_states import DECADES, EXACT, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
-from studies.bench.render import number, percent, power, render, table
+from studies.bench.render import number, power, table
 from studies.bench.solvers import (
     ADAMS,
     CATALOGUE,
@@ -29,7 +28,8 @@ from studies.bench.solvers import (
     OWN_EXPLICIT,
     TAYLOR,
 )
-from studies.bench.store import Output
+from studies.bench.store import Output, Row
+from studies.bench.study import Study
 from studies.validation import deceived
 from twoloop import mechanisms
 from twoloop.mechanisms import Problem
@@ -127,20 +127,20 @@ def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run
 
 def make(output: Output) -> pd.DataFrame:
     """Make all rows, those kept from an unfinished run aside."""
-    todo = runs(output.call.quick)
+    todo, warm = runs(output.call.quick), set[tuple[Any, ...]]()
+
+    def made(run: Run) -> Row:
+        # what is built for a mechanism, or for each of its tolerances, is no part of the run and its time limit
+        what = (run.case.name, run.solver.name, run.value if run.solver.builds_each else None)
+        if what not in warm:
+            warm.add(what)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                warm_up(run, 0, set(), COMPILING)
+        return deceived.row_of(run) if run.group == deceived.DECEIVED else row_of(run)
+
     with output.kept() as kept:
-        warm: set[tuple[Any, ...]] = set()
-        for run in todo:
-            if run.key(0) not in kept:
-                # what is built for a mechanism, or for each of its tolerances, is no part of the run and its time limit
-                what = (run.case.name, run.solver.name, run.value if run.solver.builds_each else None)
-                if what not in warm:
-                    warm.add(what)
-                    with warnings.catch_warnings():
-                        warnings.simplefilter("ignore")
-                        warm_up(run, 0, set(), COMPILING)
-                kept.add(run.key(0), deceived.row_of(run) if run.group == deceived.DECEIVED else row_of(run))
-        return pd.DataFrame([kept[run.key(0)] for run in todo])
+        return pd.DataFrame([kept.made(run.key(0), partial(made, run)) for run in todo])
 
 
 def slope(own: pd.DataFrame) -> float | None:
@@ -153,23 +153,18 @@ def slope(own: pd.DataFrame) -> float | None:
 
 def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
     """What the table says of a solver over all problems."""
-    tight = own[own["tol"] == TIGHT]
+    tight, outcomes = own[own["tol"] == TIGHT], own["outcome"].value_counts()
     found: dict[str, Any] = {"solver": name, "family": str(own["family"].iloc[0])}
-    found |= {what: int((own["outcome"] == what).sum()) for what in OUTCOMES}
+    found |= {what: int(outcomes.get(what, 0)) for what in OUTCOMES}
     found["limit"] = int(((own["outcome"] == "said so") & (own["status"] == "TIME_LIMIT")).sum())
     found["said so"] -= found["limit"]
     slopes = [p for _, each in own.groupby("case", sort=False) if (p := slope(each)) is not None]
     found["slope"] = [float(x) for x in np.percentile(slopes, [25, 50, 75])] if slopes else None
-    ratios = (own["error_q"] / own["tol"])[own["error_q"].notna()].astype(float)
-    found["ratio"] = float(ratios.median()) if len(ratios) else None
-    for level in LEVELS:
-        got = tight[f"digits_{level}"].dropna().astype(float)
-        found[f"digits_{level}"] = float(got.median()) if len(got) else None
-    for level in ("energy", "violation_q", "violation_v", "violation_a"):
-        sizes = tight[tight["error_q"].notna()][level].dropna().astype(float)
-        found[level] = float(sizes.max()) if len(sizes) else None
-    found["evaluations"] = float(tight["n_evaluations"].dropna().median()) if len(tight) else None
-    return found
+    found["ratio"] = (own["error_q"] / own["tol"]).astype(float).median()
+    found |= {what: tight[what].astype(float).median() for what in (f"digits_{level}" for level in LEVELS)}
+    ended = tight[tight["error_q"].notna()]
+    found |= {what: ended[what].astype(float).max() for what in ("energy", *(f"violation_{level}" for level in "qva"))}
+    return found | {"evaluations": tight["n_evaluations"].astype(float).median()}
 
 
 def of_steps(name: str, own: pd.DataFrame) -> dict[str, Any]:
@@ -187,14 +182,13 @@ def of_steps(name: str, own: pd.DataFrame) -> dict[str, Any]:
 def of_model(case: str, own: pd.DataFrame) -> dict[str, Any]:
     """What Exudyn's solvers make of a mechanism: errors at the shorter step, and the orders seen."""
     found: dict[str, Any] = {"case": case, "solvers": {}}
-    for name, each in own.groupby("solver", sort=False):
-        coarse, fine = (each.sort_values("h", ascending=False).iloc[k] for k in (0, -1))
+    for name, each in own.sort_values("h", ascending=False, kind="stable").groupby("solver", sort=False):
+        coarse, fine = each.iloc[0], each.iloc[-1]
         line: dict[str, Any] = {"error": None, "order": None, "status": str(fine["status"])}
         if pd.notna(fine["error_q"]):
             line["error"] = float(fine["error_q"])
-        if pd.notna(fine["error_q"]) and pd.notna(coarse["error_q"]):
-            ratio = float(coarse["error_q"]) / float(fine["error_q"])
-            line["order"] = float(np.log(ratio) / np.log(coarse["h"] / fine["h"]))
+            if pd.notna(coarse["error_q"]):
+                line["order"] = float(np.log(coarse["error_q"] / fine["error_q"]) / np.log(coarse["h"] / fine["h"]))
         found["solvers"][str(name)] = line
     return found
 
@@ -215,28 +209,23 @@ def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
 
 def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """By problem, the methods aimed at that stop with TIGHT, and those that have fewer digits than wanted."""
-    found = []
+    found: dict[str, dict[str, Any]] = {}
     for _, row in rows[(rows["tol"] == TIGHT) & rows["solver"].isin(AIMED)].iterrows():
-        line: dict[str, Any] = {"case": row["case"], "solver": row["solver"]}
-        for level, wanted in REACH.items():
-            got = row[f"digits_{level}"]
-            if level == "q" and pd.isna(got):
-                found.append(line | {"level": level, "digits": None})
-            elif pd.notna(got) and got < wanted and _holds(row["case"], level) > wanted:
-                found.append(line | {"level": level, "digits": float(got)})
-    grouped: dict[str, dict[str, Any]] = {}
-    for line in found:
-        of = grouped.setdefault(line["case"], {"case": line["case"], "stopped": [], "short": []})
-        if line["digits"] is None:
-            of["stopped"].append(line["solver"])
-        else:
-            of["short"].append(line)
-    return list(grouped.values())
+        about = {"case": row["case"], "solver": row["solver"]}
+        got = {level: row[f"digits_{level}"] for level in REACH}
+        short = [level for level, wanted in REACH.items() if got[level] < wanted < _holds(row["case"], level)]
+        stopped = [row["solver"]] if pd.isna(got["q"]) else []
+        if short or stopped:
+            of = found.setdefault(row["case"], {"case": row["case"], "stopped": [], "short": []})
+            of["stopped"] += stopped
+            of["short"] += [about | {"level": level, "digits": float(got[level])} for level in short]
+    return list(found.values())
 
 
+@cache
 def _holds(name: str, level: str) -> float:
     """Digits that the reference of a problem holds."""
-    known = {problem.name: problem for problem in (make() for make in MAKE)}[name].reference
+    known = next(problem for problem in (make() for make in MAKE) if problem.name == name).reference
     assert known is not None
     return float(known.digits.get(level, 0.0))
 
@@ -246,14 +235,14 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
     models = rows[rows["group"] == MODELLED]
     rows = rows[~rows["group"].isin(APART)]
-    solvers = [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]
+    ours, ended = rows["family"] == "two-loop", rows["outcome"].isin(("right", "inexact", "wrong"))
     problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
-    wrong = rows[rows["outcome"] == "wrong"]
+    wrong = rows[rows["outcome"] == "wrong"][["case", "solver", "family", "tol", "error_q"]].to_dict("records")
     stepped = [of_steps(name, own) for name, own in steps.groupby("solver", sort=False)]
     found: dict[str, Any] = {
         "n": len(problems),
         "tight": TIGHT,
-        "solvers": solvers,
+        "solvers": [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)],
         "problems": problems,
         "decades": DECADES,
         "models": [of_model(case, own) for case, own in models.groupby("case", sort=False)],
@@ -261,59 +250,56 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "steps": stepped,
         "steps_at": list(DECEIVED_AT),
         "first_deceived": [line["solver"] for line in stepped if line["first"]],
+        "ours_short": short_of_reach(rows),
+        "reach": REACH,
+        "aimed": list(AIMED),
+        "wrong": wrong,
+        "only_others": [line["case"] for line in problems if line["others_right"] and not line["ours_right"]],
     }
-    found |= {"ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED)}
-    found["wrong"] = [
-        {key: row[key] for key in ("case", "solver", "family", "tol", "error_q")} for _, row in wrong.iterrows()
-    ]
-    found["only_others"] = [line["case"] for line in problems if line["others_right"] and not line["ours_right"]]
     alone = [line for line in problems if line["ours_right"] and not line["others_right"]]
     # alone is ours where others were put to it and none of these was ended by our limit of time
     asked = [line["case"] for line in alone if line["others_put"] and not line["others_stopped"]]
     found["only_ours"] = [{"case": line["case"], "put": line["others_put"]} for line in alone if line["case"] in asked]
     found["not_put"] = [line["case"] for line in alone if line["case"] not in asked]
     found["refused"] = bool((rows["outcome"] == "not run").any())
-    found["n_others"] = int(rows[rows["family"] != "two-loop"]["solver"].nunique())
+    found["n_others"] = int(rows[~ours]["solver"].nunique())
     singular = [problem.name for problem in (make() for make in MAKE) if "singular" in problem.tags]
-    found["none_right_singular"] = all(
-        line["case"] in singular for line in problems if not line["ours_right"] and not line["others_right"]
-    )
-    found["none_right"] = [line["case"] for line in problems if not line["ours_right"] and not line["others_right"]]
-    found["at_looser"] = {}
-    for name in found["none_right"]:
-        good = rows[(rows["case"] == name) & (rows["outcome"] == "right")]
-        if len(good):
-            least = good["tol"].min()
-            solvers_there = good[good["tol"] == least]["solver"].tolist()
-            found["at_looser"][name] = {"tol": float(least), "solvers": solvers_there}
-    always = [set(line["ours_right"]) for line in problems]
-    found["ours_always"] = [name for name in OWN if all(name in each for each in always)]
-    found |= {"judged": [], "judged_at": sorted({float(tol) for tol in judged["tol"]}, reverse=True)}
-    for name, own in judged.groupby("case", sort=False):
-        best = own.sort_values("condition").iloc[0]
-        line = {"case": name, "t_end": float(best["t_end"]), "best": None, "error": None, "tol": None}
-        if pd.notna(best["condition"]):
-            line |= {"error": float(best["condition"]), "best": best["solver"], "tol": float(best["tol"])}
-        passed = own[own["outcome"] == "right"]["solver"]
-        line["default"] = [float(tol) for tol in own[(own["solver"] == DEFAULT) & (own["outcome"] == "right")]["tol"]]
-        found["judged"].append(line | {"passed": list(dict.fromkeys(passed))})
-    ours = [line for line in found["wrong"] if line["family"] == "two-loop"]
-    found["ours_wrong_tight"] = [line for line in ours if line["tol"] == TIGHT]
-    inexact = rows[rows["outcome"] == "inexact"]["family"] == "two-loop"
-    found["n_inexact"] = {"ours": int(inexact.sum()), "others": int((~inexact).sum())}
+    none_right = [line["case"] for line in problems if not line["ours_right"] and not line["others_right"]]
+    found |= {"none_right_singular": set(none_right) <= set(singular), "none_right": none_right}
+    right = rows[(rows["outcome"] == "right") & rows["case"].isin(none_right)]
+    found["at_looser"] = {
+        str(name): {"tol": float(own["tol"].min()), "solvers": own[own["tol"] == own["tol"].min()]["solver"].tolist()}
+        for name, own in right.groupby("case", sort=False)
+    }
+    found["ours_always"] = [name for name in OWN if all(name in line["ours_right"] for line in problems)]
+    found["judged"] = [of_condition(str(name), own) for name, own in judged.groupby("case", sort=False)]
+    found["judged_at"] = sorted(map(float, judged["tol"].unique()), reverse=True)
+    found["ours_wrong_tight"] = [line for line in wrong if line["family"] == "two-loop" and line["tol"] == TIGHT]
     found["exact"] = EXACT
-    found["n_wrong"] = {"ours": len(ours), "others": len(found["wrong"]) - len(ours)}
-    given = [line for line in found["wrong"] if line["family"] != "two-loop" and line["solver"] != IDA_C]
+    for name, which in (
+        ("inexact", rows["outcome"] == "inexact"),
+        ("wrong", rows["outcome"] == "wrong"),
+        ("ended", ended),
+    ):
+        found[f"n_{name}"] = {"ours": int((which & ours).sum()), "others": int((which & ~ours).sum())}
+    given = [line for line in wrong if line["family"] != "two-loop" and line["solver"] != IDA_C]
     found["n_singular"] = sum(line["case"] in singular for line in given)
-    sides = {"ours": rows["family"] == "two-loop", "python": rows["called_from"] == "Python"}
-    stopped = rows["status"].eq("TIME_LIMIT")
+    stopped, sides = rows["status"].eq("TIME_LIMIT"), {"ours": ours, "python": rows["called_from"] == "Python"}
     found["n_stopped"] = {side: [int(stopped[which].sum()), int(which.sum())] for side, which in sides.items()}
-    ended = rows[rows["outcome"].isin(("right", "inexact", "wrong"))]["family"] == "two-loop"
-    found["n_ended"] = {"ours": int(ended.sum()), "others": int((~ended).sum())}  # runs that report success
     return found | {"time_limit": TIME_LIMIT}
 
 
-def picture(rows: pd.DataFrame) -> Figure:
+def of_condition(name: str, own: pd.DataFrame) -> dict[str, Any]:
+    """The smallest error of one problem by the authors' own condition, and who passes."""
+    best, passed = own.sort_values("condition").iloc[0], own[own["outcome"] == "right"]
+    line = {"case": name, "t_end": float(best["t_end"]), "best": None, "error": None, "tol": None}
+    if pd.notna(best["condition"]):
+        line |= {"error": float(best["condition"]), "best": best["solver"], "tol": float(best["tol"])}
+    by_default = passed[passed["solver"] == DEFAULT]["tol"].tolist()
+    return line | {"default": by_default, "passed": passed["solver"].drop_duplicates().tolist()}
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Problem x solver: digits of q with TIGHT."""
     tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin(APART)]
     cases, solvers = list(dict.fromkeys(tight["case"])), list(dict.fromkeys(tight["solver"]))
@@ -337,18 +323,7 @@ def picture(rows: pd.DataFrame) -> Figure:
     axes.axvline(n_own - 0.5, color="white", linewidth=3.0)
     axes.set_title(f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: two-loop, right: others")
     figure.colorbar(image, ax=axes, label="decimals")
-    return figure
-
-
-def lines(found: Sequence[dict[str, Any]], steps: Sequence[dict[str, Any]]) -> Iterator[list[Any]]:
-    """Of the table of solvers, by their runs and by their steps."""
-    stepped = {line["solver"]: percent(line["deceived"]) for line in steps if line["n"]}
-    keys = ("right", "inexact", "wrong", "said so", "limit", "ratio", "digits_q")
-    for line in found:
-        yield [line["solver"], *(line[key] for key in keys), stepped.get(line["solver"], "–")]
-
-
-HEADER = ("solver", "right", "inexact", "wrong", "said so", "our limit", "error/tol", "decimals", "deceived")
+    return {"validation": figure}
 
 
 def _of_exudyn(line: dict[str, Any] | None) -> str:
@@ -358,26 +333,14 @@ def _of_exudyn(line: dict[str, Any] | None) -> str:
     return f"{number(line['error'])}{order}" if line["error"] is not None else SHORT.get(line["status"], "failed")
 
 
-def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings, figure and report."""
-    found = findings_of(rows)
-    output.save_findings(found)
-    figures.save(picture(rows), output, "validation")
-    ready = {"solvers": table(HEADER, lines(found["solvers"], found["steps"]))}
-    ready["models"] = table(
-        ("mechanism", *EXUDYN),
-        [
-            [line["case"], *(_of_exudyn(line["solvers"].get(f"Exudyn, {name}")) for name in EXUDYN)]
-            for line in found["models"]
-        ],
-    )
-    output.write("validation.md", render("validation", found, ready, stamp=line, quick=output.call.quick))
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """Exudyn's solvers on its own models."""
+    lines = [
+        [line["case"], *(_of_exudyn(line["solvers"].get(f"Exudyn, {name}")) for name in EXUDYN)]
+        for line in found["models"]
+    ]
+    return {"models": table(("mechanism", *EXUDYN), lines)}
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    study.run_rows("validation", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study("validation", __doc__, make, findings_of, figures_of, tables_of)
+main = STUDY.main

@@ -1,5 +1,3 @@
-"""`python -m studies.work_precision`."""
-
-from studies.work_precision.study import main
+from studies.work_precision import main
 
 main()

@@ -15,8 +15,8 @@ import site
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from types import ModuleType
@@ -53,15 +53,15 @@ EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a f
 
 def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     """One row a mechanism and solver."""
-    keys = []
-    for name, solver in product(list(MECHANISMS)[: 1 if quick else None], QUICK if quick else (DEFAULT, *BUILDING)):
-        key = f"{GROUP} | {name} | {solver}"
-        keys.append(key)
-        if key not in kept:
-            row: Row = {"group": GROUP, "case": name, "solver": solver, "tol": TOLERANCE, "repeat": 0}
-            row |= {"family": CATALOGUE[solver].family, **dict.fromkeys(TIMES)}
-            kept.add(key, row | in_process(name, solver))
-    return pd.DataFrame([kept[key] for key in keys])
+
+    def made(name: str, solver: str) -> Row:
+        row: Row = {"group": GROUP, "case": name, "solver": solver, "tol": TOLERANCE, "repeat": 0}
+        return row | {"family": CATALOGUE[solver].family, **dict.fromkeys(TIMES), **in_process(name, solver)}
+
+    pairs = product(list(MECHANISMS)[: 1 if quick else None], QUICK if quick else (DEFAULT, *BUILDING))
+    return pd.DataFrame(
+        [kept.made(f"{GROUP} | {name} | {solver}", partial(made, name, solver)) for name, solver in pairs]
+    )
 
 
 def in_process(name: str, solver: str) -> Row:
@@ -146,16 +146,6 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
             line["never"] += pays is None and solver != DEFAULT
         found.append(line)
     return found
-
-
-def lines(found: list[dict[str, Any]]) -> Iterator[list[Any]]:
-    """Of the table."""
-    for line in found:
-        pays = sorted(line["pays"])
-        from_run = "–" if not pays else "–".join(dict.fromkeys(f"{n:.0f}" for n in (pays[0], pays[-1])))
-        never = f"never on {line['never']}" if line["never"] else ""
-        said = ", ".join(text for text in ("" if not pays else from_run, never) if text)
-        yield [f"`{line['solver']}`", line["first_call_s"], 1e3 * line["call_s"], said or "–"]
 
 
 if __name__ == "__main__":

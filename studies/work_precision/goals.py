@@ -69,8 +69,7 @@ def _stiff(case: Case, rows: pd.DataFrame) -> dict[str, Any]:
     settings = [each for _, each in tables.put(of_case[of_case["solver"].str.startswith(FROM_C)]).groupby("solver")]
     for error in BEAM_ERRORS:
         ranked = tables.ranking(of_case, error)
-        own = ranked if ranked.empty else ranked[ranked["family"] == "two-loop"]
-        ida = ranked if ranked.empty else ranked[ranked["solver"].str.startswith(FROM_C)]
+        own, ida = ranked[ranked["family"] == "two-loop"], ranked[ranked["solver"].str.startswith(FROM_C)]
         told = len(own) > 0 and len(ida) > 0
         found["ratios"].append(float(ida["call_s"].iloc[0] / own["call_s"].iloc[0]) if told else None)
         found["ours_miss"] += [] if len(own) else [error]

@@ -7,7 +7,6 @@ added by `python -m studies.work_precision.processors FOLDER`, the folder of rep
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from io import StringIO
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -17,16 +16,15 @@ import pandas as pd
 
 from studies.bench import headline, tables
 from studies.bench.cli import REPORTS, StudyError
-from studies.bench.store import WHOLE_CALL, Output
+from studies.bench.store import WHOLE_CALL, Output, read_rows
 from studies.work_precision import rivals
 
 FILE = "processors.csv"
 TIMES = {WHOLE_CALL: "call_s", "inside": "inside_s"}  # the measure of record first
 PLACE = ["case", "error", "who"]
 
-Standings = Sequence[
-    tuple[str, float, Mapping[str, Mapping[str, Any]]]
-]  # mechanism, error, and how each of ours stands
+# mechanism, error, and how each of ours stands
+Standings = Sequence[tuple[str, float, Mapping[str, Mapping[str, Any]]]]
 
 
 def standings(rows: pd.DataFrame, column: str) -> Standings:
@@ -115,8 +113,7 @@ def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
     path = folder / "work_precision.csv"
     if not path.is_file():
         raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")
-    stamp, rest = path.read_text().split("\n", 1)
-    return pd.read_csv(StringIO(rest), low_memory=False), stamp
+    return read_rows(path)
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -173,8 +173,6 @@ def aims(geometries: Iterable[pd.DataFrame]) -> list[dict[str, Any]]:
     ratios: dict[str, list[float]] = {kind: [] for kind in AHEAD}
     for rows, error in product(geometries, SHOWN):
         ranked = tables.ranking(rows, error)
-        if ranked.empty:
-            continue
         ours = ranked["family"] == "two-loop"
         own, others = ranked[ours]["call_s"], ranked[~ours]
         heyoka, python = others["solver"] == HEYOKA, others["called_from"] == "Python"

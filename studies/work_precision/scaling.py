@@ -6,13 +6,13 @@ up. The rival is SciPy's DOP853 on the accelerations, whose linear algebra is de
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from references.scipy.index1 import solve_index1
-from studies.bench.render import table
 from studies.bench.store import KeptRows, Row
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, n_four_bar
@@ -85,22 +85,21 @@ FAMILIES: dict[str, tuple[Callable[[int], Problem], tuple[int, ...]]] = {
 
 def collect(quick: bool, kept: KeptRows) -> pd.DataFrame:
     """One row a family, size, method and round; the rounds are interleaved."""
-    keys: list[str] = []
-    warm: set[tuple[str, str]] = set()
-    for repeat in range(1 if quick else ROUNDS):
-        for family, (make, sizes) in FAMILIES.items():
-            for n in QUICK if quick else sizes:
-                for method in QUICK_METHODS if quick else (*METHODS, RIVAL):
-                    if n > LARGEST.get(method, LARGEST_ELSE) or (repeat > 0 and n >= ONCE):
-                        continue
-                    key = f"{GROUP} | {family} | {n} | {method} | {repeat}"
-                    keys.append(key)
-                    if key not in kept:
-                        if (family, method) not in warm:  # compiles
-                            warm.add((family, method))
-                            _row(family, make(sizes[0]), sizes[0], method, repeat)
-                        kept.add(key, _row(family, make(n), n, method, repeat))
-    return pd.DataFrame([kept[key] for key in keys])
+    rows, warm = [], set[tuple[str, str]]()
+
+    def made(family: str, n: int, method: str, repeat: int) -> Row:
+        make, sizes = FAMILIES[family]
+        if (family, method) not in warm:  # compiles
+            warm.add((family, method))
+            _row(family, make(sizes[0]), sizes[0], method, repeat)
+        return _row(family, make(n), n, method, repeat)
+
+    for repeat, (family, (_, sizes)) in product(range(1 if quick else ROUNDS), FAMILIES.items()):
+        for n, method in product(QUICK if quick else sizes, QUICK_METHODS if quick else (*METHODS, RIVAL)):
+            if n <= LARGEST.get(method, LARGEST_ELSE) and (repeat == 0 or n < ONCE):
+                key = f"{GROUP} | {family} | {n} | {method} | {repeat}"
+                rows.append(kept.made(key, partial(made, family, n, method, repeat)))
+    return pd.DataFrame(rows)
 
 
 def _row(family: str, problem: Problem, n: int, method: str, repeat: int) -> Row:
@@ -163,11 +162,3 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
         line["step_exponent"] = exponent(sizes, middle["step_us"])
         found.append(line | {"evaluation_us": float(middle["evaluation_us"].iloc[-1])})
     return found
-
-
-def pivot(found: list[dict[str, Any]]) -> str:
-    """A table: by mechanism and method the exponent of a step."""
-    methods, families = (list(dict.fromkeys(line[key] for line in found)) for key in ("method", "family"))
-    cells = {(line["family"], line["method"]): line["step_exponent"] if line["sizes"] else "failed" for line in found}
-    lines = [[family, *(cells.get((family, method), "–") for method in methods)] for family in families]
-    return table(["mechanism", *methods], lines)

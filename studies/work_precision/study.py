@@ -15,7 +15,7 @@ import pandas as pd
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, row_of
-from studies.bench.render import number, render, table
+from studies.bench.render import number, render
 from studies.bench.solvers import (
     COMPARED,
     COMPARED_OWN,
@@ -160,7 +160,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)
-    text = render("work_precision", findings, ready(findings), stamp=line, quick=output.call.quick)
+    text = render("work_precision", findings, {}, stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
 
@@ -190,15 +190,6 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
         figures.save(plot, output, case["figure"].removesuffix(".png"))
     figures.save(rivals.picture(everywhere), output, "work_precision")
     figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")
-
-
-def ready(findings: dict[str, Any]) -> dict[str, str]:
-    """The tables of the report."""
-    first = ["solver", "first call (s)", "later call (ms)", "pays from run"]
-    return {
-        "scaling": scaling.pivot(findings["scaling"]),
-        "first": table(first, first_calls.lines(findings["first_calls"])),
-    }
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -22,4 +22,4 @@ def unsaved(monkeypatch):
     monkeypatch.setattr(figures, "save", lambda *arguments: None)
     monkeypatch.setattr(figures, "work_precision", lambda *arguments: SimpleNamespace(axes=[]))
     for study in (ablation, energy, motion, step_size, violation):
-        monkeypatch.setattr(study, "STUDY", replace(study.STUDY, figures=lambda rows, series: {}))
+        monkeypatch.setattr(study, "STUDY", replace(study.STUDY, figures=lambda rows, found: {}))

@@ -98,7 +98,7 @@ def test_the_answer_turns_with_the_rows(made):
 
 def test_a_report_is_short_and_a_quick_one_says_so(made, tmp_path, unsaved):
     with Output(Call("ablation", True, tmp_path, False, "")) as output:
-        ablation.STUDY.report(output, made, {}, "stamp")
+        ablation.STUDY.report(output, made, "stamp")
     text = (tmp_path / "ablation.md").read_text()
     assert "**Quick run**" in text and "**Quick run**" not in text_of(made)
     assert len(text.split()) < 1000

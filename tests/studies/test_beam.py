@@ -59,7 +59,7 @@ def rows(t_end=2.0):
 def found_of(tmp_path, made, quick=False):
     """The findings, with which the report was written."""
     with Output(Call("beam", quick, tmp_path, False, "")) as output:
-        study.report(output, made, "stamp")
+        study.STUDY.report(output, made, "stamp")
     return json.loads((tmp_path / "beam.json").read_text())
 
 

@@ -51,12 +51,12 @@ def quick(tmp_path_factory):
 @pytest.fixture(scope="module")
 def loaded(quick):
     output = Output(Call("energy", True, quick, False, ""))
-    return output.load_rows()[0], output.load_series()
+    return output.load_rows(curves=True)[0]
 
 
 @pytest.fixture
 def rows(loaded):
-    return energy.judged(loaded[0])
+    return energy.judged(loaded)
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def found_of(tmp_path, loaded, unsaved):
     def made(changed):
         """The findings, with which the report was written."""
         with Output(Call("energy", True, tmp_path, False, "")) as output:
-            energy.STUDY.report(output, changed, loaded[1], "stamp")
+            energy.STUDY.report(output, changed, "stamp")
         return json.loads((tmp_path / "energy.json").read_text())
 
     return made

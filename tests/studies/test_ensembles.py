@@ -65,8 +65,8 @@ def rows(error=lambda way, tol: tol, **seconds):
 
 
 def said(times, **more):
-    found = ensembles.findings_of(rows(**times, **more))
-    return render("ensembles", found, {"ways": "", "geometry": ""}, stamp="stamp", quick=False)
+    made = rows(**times, **more)
+    return render("ensembles", ensembles.findings_of(made), {}, stamp="stamp", quick=False, rows=made)
 
 
 def test_sentences_follow_the_rows():

@@ -11,9 +11,7 @@ from matplotlib.colors import to_hex
 from studies import motion, step_size, violation
 from studies.bench import figures
 from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, IRK_LINE, NEWMARK, gear
-from studies.bench.study import key
 from studies.energy import study as energy
-from studies.honesty import picture as honesty_picture
 from studies.honesty import study as honesty
 from studies.motion import GRIDS
 from studies.table3 import study as table3
@@ -163,9 +161,8 @@ def test_the_motion_is_drawn_with_both_two_loop_procedures():
     made = [about | {"solver": name} for name in (IRK, NEWMARK)]
     stand_in = about | {"family": "stand-in", "group": "GSTIFF stand-in", "h": motion.MIDDLE, "error_y3_short": 1.0}
     made += [stand_in | {"solver": gear(order), "error_y3": float(order < 3)} for order in GEAR_ORDERS]
-    made = pd.DataFrame(made)
-    series = {key(row, name): grid for _, row in made.iterrows() for name, grid in GRIDS.items()}
-    (axes,) = motion.motion_figure(made, series, "last", (motion.MIDDLE,)).axes
+    made = pd.DataFrame(made).assign(series=[GRIDS] * len(made))
+    (axes,) = motion.motion_figure(made, "last", (motion.MIDDLE,)).axes
     assert list(drawn(axes)) == ["true motion", IRK, NEWMARK, gear(1), gear(2)]
     assert axes.get_xlabel() == "t (s)" and axes.get_ylabel() == "y3 (m)"
 
@@ -176,7 +173,7 @@ def test_the_bars_of_honesty_are_the_shares_of_the_outcomes():
     made = pd.DataFrame([{"solver": name, "outcome": what} for name, each in outcomes.items() for what in each])
     totals = honesty.totals(made)
     assert [(line["solver"], line["n"]) for line in totals] == [("auto (two-loop)", 4), ("LSODA, index 1", 3)]
-    (axes,) = honesty_picture.picture(totals, honesty.PARTS).axes
+    (axes,) = honesty.picture(totals).axes
     shares = [[bar.get_width() for bar in bars] for bars in axes.containers]
     assert np.allclose(shares, [[75.0, 0.0], [25.0, 100.0 / 3.0], [0.0, 200.0 / 3.0]])
     assert np.allclose(np.sum(shares, axis=0), 100.0)

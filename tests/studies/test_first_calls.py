@@ -8,6 +8,7 @@ import pytest
 
 from references import driver
 from references.driver import user_call
+from studies.bench.render import render
 from studies.bench.solvers import CATALOGUE
 from studies.work_precision import first_calls
 
@@ -55,8 +56,8 @@ def test_a_line_a_solver_and_never_where_its_calls_are_no_cheaper():
     found = {line["solver"]: line for line in first_calls.findings_of(pd.concat([made, failed]))}
     assert found["auto, compiled"]["pays"] == [11.0] and found["auto, compiled"]["n"] == 1
     assert found["heyoka"]["never"] == 1 and found["auto"]["pays"] == [] and found["auto"]["never"] == 0
-    lines = list(first_calls.lines(list(found.values())))
-    assert lines[1] == ["`auto, compiled`", 1.0, 100.0, "11"] and lines[2][-1] == "never on 1"
+    text = render("first_calls", {"first_calls": list(found.values())}, {})
+    assert "| `auto, compiled` | 1.0 | 100 | 11 |" in text and "| never on 1 |\n" in text
 
 
 @pytest.mark.slow

@@ -10,8 +10,7 @@ from studies import motion
 from studies.bench.cli import Call
 from studies.bench.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
 from studies.bench.store import Output
-from studies.bench.study import key
-from studies.motion import GRIDS, VISIBLE, find
+from studies.motion import VISIBLE, find
 
 
 def rows():
@@ -47,9 +46,8 @@ def rows():
 
 def found_of(folder, made, quick=False):
     """The findings, with which the report was written."""
-    series = {key(row, name): 1e-9 + grid**2 for _, row in made.iterrows() for name, grid in GRIDS.items()}
     with Output(Call("motion", quick, folder, False, "")) as output:
-        motion.STUDY.report(output, made, series, "stamp")
+        motion.STUDY.report(output, made, "stamp")
     return json.loads((folder / "motion.json").read_text())
 
 

@@ -9,8 +9,8 @@ import pytest
 from studies.bench import tables
 from studies.bench.render import number, render
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
+from studies.bench.store import KeptRows
 from studies.work_precision import goals, rivals, scaling
-from studies.work_precision import study as work_precision
 from twoloop import solve_dae
 
 
@@ -109,7 +109,7 @@ def test_the_reference_of_the_second_geometry_is_held_by_a_second_way():
 
 
 class Kept(dict):
-    add = dict.__setitem__
+    add, made = dict.__setitem__, KeptRows.made
 
 
 def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
@@ -157,7 +157,7 @@ def test_a_failed_size_is_a_row_and_no_cost():
     row = scaling._row("open chain", scaling.chain(2, False), 2, "Unknown", 0)
     assert row["status"] == "FAILED" and row["step_us"] is None
     (line,) = scaling.findings_of(pd.DataFrame([row]))
-    assert line["failed"] and "| open chain | failed |" in scaling.pivot([line])
+    assert line["failed"] and "| open chain | failed |" in render("scaling", {"scaling": [line]}, {})
 
 
 def test_bars_of_a_chain_hang_together():
@@ -185,7 +185,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
     }
     found |= {"goals": goals.findings_of([], table.assign(case="other"), table)}
     found |= {"asked": {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "outclassed": 10.0, "limit": 1.0}}
-    return render("work_precision", found | changed, work_precision.ready(found | changed), stamp="", quick=False)
+    return render("work_precision", found | changed, {}, stamp="", quick=False)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from studies import step_size
 from studies.bench.cli import Call
 from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
 from studies.bench.store import Output
-from studies.bench.study import key
 from studies.step_size import OTHERS, PAPER
 
 
@@ -49,13 +48,8 @@ def rows():
 
 def found_of(folder, made, quick=False):
     """The findings, with which the report was written."""
-    curve = np.array([[0.0, 1.0, 2.0], [0.06, 0.05, 0.06]])
-    paper = {row["solver"]: row for _, row in made[made["group"] == "paper"].iterrows()}
-    kinds = ("whole", "zoom", "error", "convergence", "switch")
-    series = {key(row, kind): curve for row in paper.values() for kind in kinds}
-    series[key(paper[IRK], "convergence")] = np.empty((2, 0))  # no such attempt is no error
     with Output(Call("step_size", quick, folder, False, "")) as output:
-        step_size.STUDY.report(output, made, series, "stamp")
+        step_size.STUDY.report(output, made, "stamp")
     return json.loads((folder / "step_size.json").read_text())
 
 

@@ -46,12 +46,13 @@ def test_a_folder_that_cannot_be_written_is_refused_before_any_run(tmp_path):
 
 def test_rows_findings_and_series_come_back(tmp_path):
     rows = pd.DataFrame({"solver": ["a, b", "c"], "x": [0.1, None], "lost": [True, False]})
+    curves = [{"t": [0.0, 0.5, 1.0], "mean": np.zeros((2, 3))}, np.nan]  # none of a run without a result
     with Output(call(tmp_path)) as output:
-        output.save_rows(rows, STAMP)
+        output.save_rows(rows.assign(series=curves), STAMP)
         again, line = output.load_rows()
         output.save_findings({"n": np.int64(3), "x": np.float64(np.nan), "ok": np.bool_(True), "two": [1.0, "b"]})
-        output.save_series({"t": np.linspace(0.0, 1.0, 3)})
-        assert output.load_series()["t"].tolist() == [0.0, 0.5, 1.0]
+        first, second = output.load_rows(curves=True)[0]["series"]
+        assert first["t"].tolist() == [0.0, 0.5, 1.0] and first["mean"].shape == (2, 3) and second == {}
     pd.testing.assert_frame_equal(again, rows)
     assert line == STAMP
     assert json.loads((tmp_path / "x.json").read_text()) == {"n": 3, "x": None, "ok": True, "two": [1.0, "b"]}

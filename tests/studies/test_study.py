@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 
 from studies import motion, step_size, violation
-from studies.bench.study import key
-from studies.energy import study as energy
+from studies.bench.store import key
+from studies.energy import runs as energy
 
 
 def rows_of(study, quick):
@@ -16,16 +16,16 @@ def rows_of(study, quick):
     return pd.DataFrame(told)
 
 
-@pytest.mark.parametrize("study", [energy.STUDY, motion.STUDY, step_size.STUDY, violation.STUDY], ids=lambda s: s.name)
+@pytest.mark.parametrize("study", [energy, motion, step_size, violation], ids=lambda study: study.__name__)
 def test_every_run_has_curves_of_its_own(study):
     for quick in (True, False):
         rows = rows_of(study, quick)
-        keys = [key(row, "curve") for _, row in rows.iterrows()]
+        keys = [key(row) for _, row in rows.iterrows()]
         assert len(set(keys)) == len(keys) > 10
 
 
 def test_a_key_survives_the_file_of_rows(tmp_path):
-    rows = rows_of(energy.STUDY, True)
+    rows = rows_of(energy, True)
     rows.to_csv(tmp_path / "rows.csv", index=False)
     read = pd.read_csv(tmp_path / "rows.csv")
-    assert [key(row, "t") for _, row in read.iterrows()] == [key(row, "t") for _, row in rows.iterrows()]
+    assert [key(row) for _, row in read.iterrows()] == [key(row) for _, row in rows.iterrows()]

@@ -33,8 +33,7 @@ def made_up(**changes):
 
 
 def said(rows):
-    tables = {"scaling": "", "many": ""}
-    return render("sweep_linkages", study.findings_of(rows), tables, stamp="stamp", quick=False)
+    return render("sweep_linkages", study.findings_of(rows), {}, stamp="stamp", quick=False, rows=rows)
 
 
 def test_the_default_linkage_has_the_period_of_its_reference():

@@ -18,7 +18,7 @@ def rows():
 
 def text(rows):
     found = symbolic_size.findings_of(rows)
-    return render("symbolic_size", found, {"sizes": "", "twins": ""}, stamp="stamp", quick=False)
+    return render("symbolic_size", found, {}, stamp="stamp", quick=False, rows=rows)
 
 
 def test_sentences_turn_with_the_rows():

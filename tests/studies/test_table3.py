@@ -75,7 +75,7 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
 def found_of(tmp_path, made, quick=False):
     """The findings, with which the report was written."""
     with Output(Call("table3", quick, tmp_path, True, "")) as output:
-        table3.report(output, made, "stamp")
+        table3.STUDY.report(output, made, "stamp")
     return json.loads((tmp_path / "table3.json").read_text())
 
 

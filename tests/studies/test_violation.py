@@ -10,7 +10,6 @@ from studies import violation
 from studies.bench.cli import Call
 from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C, IRK, baumgarte, gear
 from studies.bench.store import Output
-from studies.bench.study import key
 from studies.violation import ALONG, LOOSE, PAIRS, TIGHT, grows, kind
 
 DRIFTS = {"violation_q": 1e-7, "violation_v": 1e-8, "growth_q": 2.0, "growth_v": 1.0, "early_q": 1e-9, "late_q": 1e-7}
@@ -52,10 +51,8 @@ def rows():
 
 def found_of(folder, made, quick=False):
     """The findings, with which the report was written."""
-    line_up = made[made["group"] == "line-up"]
-    series = {key(row, level): np.full(violation.CURVE, 1e-15) for _, row in line_up.iterrows() for level in "qv"}
     with Output(Call("violation", quick, folder, False, "")) as output:
-        violation.STUDY.report(output, made, series, "stamp")
+        violation.STUDY.report(output, made, "stamp")
     return json.loads((folder / "violation.json").read_text())
 
 

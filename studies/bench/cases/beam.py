@@ -17,16 +17,7 @@ TAGS = {SOFT: ("stiff", "vibrations wanted"), STIFF: ("stiff", "vibrations irrel
 T_END, T_END_QUICK = 2.0, 0.1  # s; the paper does not say how long its runs are
 TIGHT = 1e-10  # tolerance of the reference
 CHECK = 1e-9  # of the two runs that it is compared with
-TOLERANCES = (
-    1e-1,
-    1e-2,
-    1e-3,
-    1e-4,
-    1e-5,
-    1e-6,
-    1e-7,
-    1e-8,
-)  # looser than elsewhere: there implicit methods step over vibrations
+TOLERANCES = tuple(float(f"1e-{k}") for k in range(1, 9))  # from looser ones on: these step over vibrations
 TIME_LIMIT = 10.0  # s of a run: no run of use takes so long
 NOTE = (
     "The start is assumed, the paper's text does not tell it: straight along x, gravity across it, only the base node "
