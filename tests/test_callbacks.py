@@ -93,11 +93,6 @@ def test_a_constant_mass_is_factored_once():
     assert 0.9 * always.stats.n_factorizations < once.stats.n_factorizations <= always.stats.n_factorizations
 
 
-def test_unknown_kind_lists_the_known():
-    with pytest.raises(ValueError, match=r"kind must be one of mass, force.*reaction_by_q.*; given 'stiffness'"):
-        callback("stiffness")
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_other_arguments_than_the_kind_has_are_named(kind):
     def wrong(t, q):
@@ -131,11 +126,6 @@ def test_what_numba_cannot_compile_takes_two_lines():
 def test_plain_functions_are_sent_to_from_python(kind):
     with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):
         ConstrainedSystem(**{**PENDULUM, kind: lambda t, q, p, x: None})
-
-
-def test_a_callback_of_another_kind_is_refused():
-    with pytest.raises(TypeError, match=r"mass must be compiled by @twoloop.callback\('mass'\)"):
-        ConstrainedSystem(**{**PENDULUM, "mass": gravity})
 
 
 # --- what follows from an entry of the table

@@ -85,14 +85,6 @@ def test_an_event_ends_a_run_with_output_at_the_end_only(default_four_bar):
     assert result.t_events[0] == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("times", [[1.0], [0.0], [0.0, 1.0], [0.3], [0.3, 0.30000001], [1e-9, 1.0 - 1e-9]])
-def test_few_output_times(default_four_bar, times):
-    result = run(default_four_bar, 1.0, t_eval=times)
-    assert (result.t == times).all()
-    assert result.q.shape == (9, len(times))
-    assert result.lam.shape == (8, len(times))
-
-
 @pytest.mark.parametrize("method", PAPERS)
 def test_the_procedures_of_the_paper_land(default_four_bar, method):
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}

@@ -5,16 +5,15 @@ import time
 import numpy as np
 import pytest
 
-from tests.general.chain import slack_chain
+from studies.work_precision.scaling import chain
 from twoloop import solve_dae
 
 
 def run_chain(n, steps=10):
     """A few steps of constant size, far below the shortest period, which is of the order of 1/n."""
-    system, q, v = slack_chain(n)
-    h = 0.02 / n
+    problem, h = chain(n, False), 0.02 / n
     options = {"method": "DOP853", "step_size": h, "check_derivatives": False}
-    return solve_dae(system, (0.0, steps * h), q, v, **options)
+    return solve_dae(problem.system, (0.0, steps * h), problem.q0, problem.v0, **options)
 
 
 def time_of_an_evaluation(n):

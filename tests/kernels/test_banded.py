@@ -251,31 +251,6 @@ def test_bandwidth_of_velocities_and_constraints():
         solve_dae(far, (0.0, 0.1), q0, np.zeros(4))
 
 
-@pytest.mark.parametrize(
-    ("bandwidth", "error", "message"),
-    [
-        (-1, ValueError, "bandwidth must be at least 0; given -1"),
-        (1.5, TypeError, "bandwidth must be an int; given 1.5"),
-    ],
-)
-def test_bandwidth_is_checked(bandwidth, error, message):
-    with pytest.raises(error, match=message):
-        chain(bandwidth=bandwidth)
-
-
-def test_bandwidth_needs_a_constant_mass():
-    with pytest.raises(ValueError, match="bandwidth needs a constant mass matrix; given bandwidth=0"):
-        ConstrainedSystem.from_python(
-            n_q=2,
-            n_c=1,
-            mass=lambda t, q: np.eye(2),
-            force=lambda t, q, v: q,
-            constraint=lambda t, q: q[:1],
-            jacobian=lambda t, q: np.eye(1, 2),
-            bandwidth=0,
-        )
-
-
 @pytest.mark.slow
 def test_cost_of_a_step_from_4_to_64_elements():
     """At most 24 times; 13 times as many coordinates and measured about 12."""

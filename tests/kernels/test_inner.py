@@ -46,14 +46,6 @@ def test_constraints_hold_at_every_accepted_step_of_a_long_run(request, name, ge
     assert late < 1e-9
 
 
-def test_multipliers_close_the_equation_of_motion(default_four_bar):
-    problem = default_four_bar
-    result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0)
-    assert force_residual(problem.system, result) < 1e-10
-    for t, q, v, a in zip(result.t, result.q.T, result.v.T, result.a.T, strict=True):
-        assert np.abs(problem.system.jacobian(t, q) @ a - problem.system.gamma(t, q, v)).max() < 1e-10
-
-
 def test_multipliers_and_accelerations_with_a_mass_that_varies_in_time_and_place():
     system = oblique_pendulum()
     times = np.linspace(0.0, 5.0, 21)
