@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.compiled import circle, radius
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
@@ -58,18 +59,7 @@ def gravity(t, q, v, p, Q):
     Q[1] = -9.81 * p[0]
 
 
-@callback("constraint")
-def circle(t, q, p, C):
-    C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)
-
-
-@callback("jacobian")
-def radius(t, q, p, Cq):
-    Cq[0, 0] = q[0]
-    Cq[0, 1] = q[1]
-
-
-PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}
+PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}  # p = mass
 
 
 def test_parameters_reach_every_callback():

@@ -56,8 +56,9 @@ def test_the_chunks_of_a_run_do_not_show(default_four_bar, chunk, monkeypatch):
     assert (other.q == usual.q).all() and (other.lam == usual.lam).all()
 
 
-@pytest.mark.parametrize("times", [[1.0], [0.0], [0.0, 1.0]])
-@pytest.mark.parametrize("method", ADAPTIVE)
+@pytest.mark.parametrize(
+    ("method", "times"), [*((name, [0.0, 1.0]) for name in ADAPTIVE), ("auto", [0.0]), ("auto", [1.0])]
+)
 def test_nothing_is_interpolated_at_the_ends_of_a_run(default_four_bar, method, times, monkeypatch):
     made = []
     kept = Interpolator.__init__

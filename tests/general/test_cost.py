@@ -1,6 +1,4 @@
-"""The cost of an evaluation grows like the length of a chain, up to 1000 rows."""
-
-import time
+"""Long chains: links, energy and counts. How programs of elimination grow: tests/kernels/test_factors.py."""
 
 import numpy as np
 import pytest
@@ -14,34 +12,6 @@ def run_chain(n, steps=10):
     problem, h = chain(n, False), 0.02 / n
     options = {"method": "DOP853", "step_size": h, "check_derivatives": False}
     return solve_dae(problem.system, (0.0, steps * h), problem.q0, problem.v0, **options)
-
-
-def time_of_an_evaluation(n):
-    """The least of three runs, s."""
-    results = [run_chain(n) for _ in range(3)]
-    assert all(result.success for result in results), results[0].message
-    return min(result.stats.cpu_time / result.stats.n_evaluations for result in results)
-
-
-def time_to_fill(n):
-    """The time to write one dense C_q (n, 2n), as the callback does: the least of three, s."""
-    array, times = np.ones((n, 2 * n)), []
-    for _ in range(3):
-        start = time.process_time()
-        for _ in range(20):
-            array[:] = 0.0
-        times.append((time.process_time() - start) / 20)
-    return min(times)
-
-
-@pytest.mark.slow
-def test_an_evaluation_is_linear_in_the_length():
-    """A ratio, not a time: eight times the length may cost 16 times as much, where dense algebra costs 512 times.
-
-    The dense C_q that the callback fills is quadratic; four passes over it are allowed.
-    """
-    short, long = time_of_an_evaluation(125), time_of_an_evaluation(1000)
-    assert long < 16.0 * short + 4.0 * time_to_fill(1000)
 
 
 @pytest.mark.parametrize("n", [50, 200])

@@ -249,18 +249,3 @@ def test_bandwidth_of_velocities_and_constraints():
     far = system(lambda t, q, v: -q, product, by_q)
     with pytest.raises(ValueError, match=r"second derivative of constraint 0 by q has the entry \(3, 0\) = 1"):
         solve_dae(far, (0.0, 0.1), q0, np.zeros(4))
-
-
-@pytest.mark.slow
-def test_cost_of_a_step_from_4_to_64_elements():
-    """At most 24 times; 13 times as many coordinates and measured about 12."""
-
-    def cost(n_elements):
-        problem = very_flexible_beam(n_elements)
-        runs = [
-            solve_dae(problem.system, (0.0, 0.02), problem.q0, problem.v0, NEWTON, step_size=1e-4) for _ in range(3)
-        ]
-        assert all(run.success for run in runs)
-        return min(run.stats.cpu_time for run in runs)
-
-    assert cost(64) < 24.0 * cost(4)

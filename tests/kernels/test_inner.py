@@ -16,7 +16,7 @@ from tests.problems import (
     violations,
     worst,
 )
-from twoloop import ConstrainedSystem, Newmark, RungeKutta, solve_dae
+from twoloop import Newmark, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 METHODS = {
@@ -64,20 +64,6 @@ def test_multiplier_is_the_tension_of_the_pendulum():
     assert worst(result.lam[0], pendulum_state(times)[2]) < 1e-8
 
 
-@pytest.mark.parametrize(
-    ("make", "start"),
-    [
-        (moving_pivot, lambda: moving_pivot_state(0.0)),
-        (oblique_pendulum, oblique_start),
-        (pendulum, lambda: (np.array([0.6, -0.8]), np.array([0.8, 0.6]))),
-    ],
-)
-def test_gamma_by_differences_gives_the_same_accelerations(make, start):
-    runs = [solve_dae(make(gamma=given), (0.0, 1.0), *start(), step_size=0.01) for given in (True, False)]
-    assert worst(runs[0].a, runs[1].a) < 1e-9
-    assert worst(runs[0].lam, runs[1].lam) < 1e-9
-
-
 @pytest.mark.parametrize("gamma", [True, False])
 def test_rheonomic_constraints(gamma):
     times = np.linspace(0.0, 3.0, 13)
@@ -102,24 +88,3 @@ def test_newton_takes_few_iterations(default_four_bar):
     problem = default_four_bar
     stats = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0).stats
     assert stats.n_inner < 2.0 * stats.n_evaluations
-
-
-def test_gamma_is_differenced_even_where_all_coordinates_are_zero():
-    # a bead on y = x^2 that passes the vertex
-    def bead(**gamma):
-        return ConstrainedSystem.from_python(
-            n_q=2,
-            n_c=1,
-            mass=np.eye(2),
-            force=lambda t, q, v: np.array([0.0, -9.81]),
-            constraint=lambda t, q: np.array([q[1] - q[0] ** 2]),
-            jacobian=lambda t, q: np.array([[-2.0 * q[0], 1.0]]),
-            **gamma,
-        )
-
-    runs = [
-        solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
-        for system in (bead(), bead(gamma=lambda t, q, v: np.array([2.0 * v[0] ** 2])))
-    ]
-    assert worst(runs[0].a[:, 0], [0.0, 18.0]) < 1e-6
-    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-8
