@@ -145,22 +145,6 @@ def test_a_parallelogram_is_left_or_ends_with_a_status_soon():
             assert "close to losing rank" in result.message and "singular" in result.message
 
 
-# --- Newmark's tolerance
-
-
-@pytest.mark.parametrize("linkage", [{}, {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}])
-def test_the_error_of_newmark_is_proportional_to_its_tolerance(linkage):
-    problem = four_bar(**linkage)
-    reference = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11)
-    errors = []
-    for tolerance in (1e-4, 1e-5, 1e-6):
-        run = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Newmark", tolerance, tolerance)
-        errors.append(worst(run.q[:, -1], reference.q[:, -1]))
-    slopes = np.diff(np.log10(errors)) / -1.0
-    assert (np.abs(slopes - 1.0) < 0.3).all(), errors
-    assert errors[-1] < 300.0 * 1e-6
-
-
 # --- values that are not finite
 
 

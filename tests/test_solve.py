@@ -20,7 +20,6 @@ from tests.problems import (
 from twoloop import (
     ConstrainedSystem,
     ConstraintWarning,
-    Newmark,
     RungeKutta,
     Status,
     paper_irk,
@@ -347,13 +346,6 @@ def test_newmark_pays_three_to_five_times_as_much_per_two_decades(default_four_b
     assert (growth < 5.0).all()
     assert spans[0] > 1.0  # err_out = 1e-3 loses the solution
     assert spans[3] < 1e-2
-
-
-def test_newmark_error_tolerance_is_its_own():
-    loose, tight = (swing(method=Newmark(error_tol=tol), rtol=1.0, atol=1.0) for tol in (1e-4, 1e-7))
-    assert tight.stats.n_accepted > 5 * loose.stats.n_accepted
-    other = swing(method=Newmark(error_tol=1e-7), rtol=1e-9, atol=1e-9)
-    assert other.stats.n_accepted == tight.stats.n_accepted
 
 
 def test_memory_of_a_run_grows_only_with_the_stored_output(default_four_bar):
