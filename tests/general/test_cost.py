@@ -29,4 +29,4 @@ def test_as_many_evaluations_whatever_the_length():
     """Same steps, same loops: what is counted does not depend on the length."""
     short, long = run_chain(50).stats, run_chain(200).stats
     assert long.n_evaluations == short.n_evaluations
-    assert long.n_factorizations <= short.n_factorizations + 5
+    assert long.n_factorizations <= 1.1 * short.n_factorizations  # those of a few iterations more
