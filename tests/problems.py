@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from numba import njit
 from scipy.integrate import solve_ivp
-from scipy.special import ellipj, ellipk
+from scipy.special import ellipj
 
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, Kit
@@ -81,10 +81,6 @@ def pendulum_state(t, angle=-0.5 * np.pi):
     q = np.array([np.sin(theta), -np.cos(theta)])
     v = rate * np.array([np.cos(theta), np.sin(theta)])
     return q, v, rate**2 - G * q[1]
-
-
-def pendulum_period(angle=-0.5 * np.pi):
-    return 4.0 * ellipk(np.sin(0.5 * angle) ** 2) / np.sqrt(G)
 
 
 def pendulum_energy(q, v):
@@ -207,6 +203,31 @@ def double_pendulum_canonical(q, v):
 def _double_pendulum_mass(angles):
     coupling = np.cos(angles[0] - angles[1])
     return np.array([[2.0, coupling], [coupling, 1.0]])
+
+
+# --- a mass on a rigid rod, and a second one on a spring and a damper from the first
+
+SPRUNG_START = (np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4))
+
+
+def sprung_pair(stiffness, damping=0.0, compile=False):
+    """The stiffness may be a function of t; the damping is given over it."""
+    stiffness_at = stiffness if callable(stiffness) else njit(lambda t: stiffness)
+
+    def force(t, q, v):
+        d, u, k = q[2:] - q[:2], v[2:] - v[:2], stiffness_at(t)
+        length = np.sqrt(d[0] * d[0] + d[1] * d[1])
+        pull = k * (length - 1.0 + damping * (d[0] * u[0] + d[1] * u[1]) / length) / length
+        return np.array([pull * d[0], pull * d[1] - 9.81, -pull * d[0], -pull * d[1] - 9.81])
+
+    return pendulum(
+        n_q=4,
+        mass=np.eye(4),
+        force=force,
+        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
+        compile=compile,
+        name="sprung pair",
+    )
 
 
 # --- oblique polar coordinates: x = r(cos phi, sin phi), r = q0, phi = q1 + 0.3 q0; a damped pendulum whose pivot is

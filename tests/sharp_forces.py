@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from tests import problems
 from twoloop import ConstrainedSystem
 
 T_END = 3.0
@@ -42,19 +43,8 @@ def switching(t, q, v):
     return np.array([4.0 * np.tanh(50.0 * np.sin(20.0 * t)), -9.81])
 
 
-def pendulum(force: Callable, compiled: bool = True) -> ConstrainedSystem:
-    """A point of mass 1 at distance 1 from the origin."""
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=lambda t, q: np.array([[1.0, 0.0], [0.0, 1.0]]),
-        force=force,
-        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-        jacobian=lambda t, q: np.array([[q[0], q[1]]]),
-        gamma=lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])]),
-        compile=compiled,
-        name="pendulum under a sharp force",
-    )
+def pendulum(force: Callable) -> ConstrainedSystem:
+    return problems.pendulum(compile=True, constant_mass=True, force=force)
 
 
 def position(angle: float) -> np.ndarray:

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.problems import swing
 from twoloop import solve_dae
 from twoloop.mechanisms import pendulum, spatial_slider_crank
 from twoloop.result.animation import projected
@@ -169,12 +168,8 @@ def test_between_stored_times_with_and_without_the_dense_solution(crank, tmp_pat
 
 
 def test_what_cannot_be_animated(swung, tmp_path):
-    with pytest.raises(ValueError, match=r"path must end in .html, .gif, .mp4; given '.*swing.avi'"):
-        swung.animate(tmp_path / "swing.avi")
     with pytest.raises(ValueError, match="seconds must be positive"):
         swung.animate(tmp_path / "swing.gif", seconds=0.0)
-    with pytest.raises(ValueError, match=r"this result knows no drawing: put the system into a problem"):
-        swing().animate(tmp_path / "swing.gif")
     short = replace(swung, t=swung.t[:1], q=swung.q[:, :1], v=swung.v[:, :1], a=swung.a[:, :1])
     with pytest.raises(ValueError, match="two times at least; this one has 1"):
         short.animate(tmp_path / "swing.gif")

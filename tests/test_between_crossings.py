@@ -5,7 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from twoloop import ConstrainedSystem, Status, solve_dae
+from tests.problems import pendulum
+from twoloop import Status, solve_dae
 from twoloop.mechanisms import four_bar, n_four_bar
 
 PARTS = (0.13, 0.3, 0.5, 0.75)
@@ -59,21 +60,13 @@ def test_no_event_that_is_none_ends_a_run():
     assert worst(result, problem.motion).max() < 1e-5
 
 
-def pendulum(force):
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=force,
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: q[None, :],
-        gamma=lambda t, q, v: np.array([-(v @ v)]),
-    )
+def swung_by(force):
+    return pendulum(force=force, constant_mass=True)
 
 
-GUST = pendulum(lambda t, q, v: np.array([20.0 * np.exp(-(((t - 1.5) / 0.03) ** 2)), -9.81])), [0.0, -1.0]
-RUBBING = pendulum(lambda t, q, v: np.array([0.0, -9.81]) - 3.0 * np.tanh(v / 0.01)), [1.0, 0.0]
-BRAKE = pendulum(lambda t, q, v: np.array([0.0, -9.81]) - (3.0 * v if t > 1.0 else 0.0 * v)), [1.0, 0.0]
+GUST = swung_by(lambda t, q, v: np.array([20.0 * np.exp(-(((t - 1.5) / 0.03) ** 2)), -9.81])), [0.0, -1.0]
+RUBBING = swung_by(lambda t, q, v: np.array([0.0, -9.81]) - 3.0 * np.tanh(v / 0.01)), [1.0, 0.0]
+BRAKE = swung_by(lambda t, q, v: np.array([0.0, -9.81]) - (3.0 * v if t > 1.0 else 0.0 * v)), [1.0, 0.0]
 
 
 @pytest.mark.parametrize(

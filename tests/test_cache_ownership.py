@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.own_cache import with_kernels
 from twoloop.kernels.compile import caches, ownership
 from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder, read_own, write_own
 
@@ -52,7 +53,7 @@ def first_warning(monkeypatch):
 def user(tmp_path):
     """Runs of a mechanism with caches of its own: its value, how often it was read, and what was said."""
     (tmp_path / "mechanism.py").write_text(MECHANISM)
-    cache, home = tmp_path / "cache", tmp_path / "home"
+    cache, home = with_kernels(tmp_path / "cache"), tmp_path / "home"
 
     def run(umask=0o022):
         paths = {"NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(home), "PYTHONPATH": f"{tmp_path}:{ROOT}"}

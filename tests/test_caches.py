@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from tests.own_cache import with_kernels
 from twoloop.kernels.compile.caches import UNWRITABLE, watch
 
 ROOT = Path(__file__).parents[1]
@@ -62,7 +63,7 @@ class Folder:
 
     def __init__(self, path):
         self.path = path
-        self.cache = path / "cache"
+        self.cache = with_kernels(path / "cache")
         self.write("constants", "")
         self.write("helpers", "")
         self.write("own_caches", "")
@@ -315,7 +316,8 @@ print(next(iter(through_python(sys.argv[1]).overloads.values())).fndesc.mangled_
 
 def test_closures_of_one_name_from_two_processes_have_symbols_of_their_own(tmp_path):
     # numba numbers symbols within a process: each of these two gives its only closure the same number
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    cache = with_kernels(tmp_path / "cache")
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
     symbols = set()
     for kind in ("force_by_q", "reaction_by_q"):
         done = subprocess.run(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.compiled import circle, radius
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
@@ -58,18 +59,7 @@ def gravity(t, q, v, p, Q):
     Q[1] = -9.81 * p[0]
 
 
-@callback("constraint")
-def circle(t, q, p, C):
-    C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)
-
-
-@callback("jacobian")
-def radius(t, q, p, Cq):
-    Cq[0, 0] = q[0]
-    Cq[0, 1] = q[1]
-
-
-PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}
+PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}  # p = mass
 
 
 def test_parameters_reach_every_callback():
@@ -91,11 +81,6 @@ def test_a_constant_mass_is_factored_once():
     np.testing.assert_allclose(once.q[:, -1], always.q[:, -1], atol=1e-10)
     # T^T M T is factored at every state, with M constant not again at the same
     assert 0.9 * always.stats.n_factorizations < once.stats.n_factorizations <= always.stats.n_factorizations
-
-
-def test_unknown_kind_lists_the_known():
-    with pytest.raises(ValueError, match=r"kind must be one of mass, force.*reaction_by_q.*; given 'stiffness'"):
-        callback("stiffness")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -131,11 +116,6 @@ def test_what_numba_cannot_compile_takes_two_lines():
 def test_plain_functions_are_sent_to_from_python(kind):
     with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):
         ConstrainedSystem(**{**PENDULUM, kind: lambda t, q, p, x: None})
-
-
-def test_a_callback_of_another_kind_is_refused():
-    with pytest.raises(TypeError, match=r"mass must be compiled by @twoloop.callback\('mass'\)"):
-        ConstrainedSystem(**{**PENDULUM, "mass": gravity})
 
 
 # --- what follows from an entry of the table

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.compiled import PENDULUM
 from tests.problems import run
 from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, load, solve_dae
 from twoloop.mechanisms import (
@@ -26,11 +27,6 @@ from twoloop.run.dense import DenseSolution
 END = 3.0
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = 1.0
-
-
 @callback("force")
 def force(t, q, v, p, Q):
     rate = q[0] * v[1] - q[1] * v[0]
@@ -38,35 +34,9 @@ def force(t, q, v, p, Q):
     Q[0], Q[1] = -tangential * q[1], tangential * q[0] - 9.81
 
 
-@callback("constraint")
-def constraint(t, q, p, C):
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
-
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
-
-
-@callback("gamma")
-def gamma(t, q, v, p, Qd):
-    Qd[0] = -(v[0] * v[0] + v[1] * v[1])
-
-
 def swing(gust=0.0, at=1.5, width=1.0, friction=0.0, below=1.0):
     """A pendulum under a gust along its path, and dry friction that is smooth below a speed."""
-    return ConstrainedSystem(
-        n_q=2,
-        n_c=1,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        gamma=gamma,
-        parameters=[gust, at, width, friction, below],
-        constant_mass=True,
-        name="swing",
-    )
+    return ConstrainedSystem(**{**PENDULUM, "force": force}, parameters=[gust, at, width, friction, below])
 
 
 def swung(method="auto", tolerance=1e-6, system=None, **options):

@@ -20,14 +20,10 @@ CRANK = 8
 
 def rod(length, offset=0.0):
     """A pendulum of any length whose pivot may be far away."""
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
+    return pendulum(
+        constant_mass=True,
         constraint=lambda t, q: np.array([0.5 * ((q[0] - offset) ** 2 + q[1] ** 2 - length**2)]),
         jacobian=lambda t, q: np.array([[q[0] - offset, q[1]]]),
-        gamma=lambda t, q, v: np.array([-(v @ v)]),
     )
 
 
@@ -165,30 +161,11 @@ def test_the_sign_tells_the_two_assemblies_apart(theta3):
     assert min(state.margin for state in states) > 0.01
 
 
-@pytest.mark.parametrize("beside", [1e-3, 1e-4, 1e-6])
-def test_a_guess_near_a_dead_centre_is_refused(beside):
-    problem = four_bar((0.8, 1.2, 1.0), 2.0, theta3=STRETCHED - beside)
-    other = four_bar((0.8, 1.2, 1.0), 2.0, theta3=STRETCHED - beside, branch=1)
-    rest = np.zeros(9)
-    assert consistent_state(problem.system, 0.0, problem.q0, rest, keep=[CRANK]).margin < 0.1  # known well enough
-    rough = problem.q0 + 0.02 * np.array([1.0, -1.0, 0.5, 1.0, 0.3, -1.0, 0.2, 0.4, 0.0])
-    with pytest.raises(ValueError, match=r"does not say on which assembly" + r".*loses rank" * (beside < 1e-3)):
-        consistent_state(problem.system, 0.0, rough, rest, keep=[CRANK])
-    with pytest.raises(ValueError, match=r"keep leaves too little freedom|does not say on which assembly"):
-        consistent_state(problem.system, 0.0, 0.5 * (problem.q0 + other.q0), rest, keep=[CRANK])
-
-
 def test_a_guess_near_a_position_without_rank_is_refused():
     flat = np.array([0.5, 0.0, 0.0, 2.0, 0.0, 0.0, 2.5, 0.0, np.pi])  # a parallelogram folded into one line
     system = four_bar((1.0, 2.0, 1.0), 2.0, theta3=2.0).system
     with pytest.raises(ValueError, match=r"does not say on which assembly.*or farther from a dead centre"):
         consistent_state(system, 0.0, flat + 0.01 * np.cos(np.arange(9.0)), np.zeros(9))
-
-
-def test_a_guess_halfway_to_another_position_is_refused():
-    consistent_state(pendulum(), 0.0, [0.7, 0.0], REST)
-    with pytest.raises(ValueError, match=r"q does not say on which assembly.*coordinate 0 from 0.1 to 1"):
-        consistent_state(pendulum(), 0.0, [0.1, 0.0], REST)
 
 
 @pytest.mark.parametrize("keep", [[2, 8], range(9)])

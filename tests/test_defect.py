@@ -58,6 +58,14 @@ def test_no_method_passes_over_a_hundredth_of_the_run(name, method):
         assert result.widest_gap <= 0.01 * T_END * (1.0 + 1e-9)
 
 
+@pytest.mark.parametrize("name", ["brake", "switching"])
+@pytest.mark.parametrize(("method", "tolerances"), [("TRBDF2", (1e-4, 1e-7)), ("ESDIRK4", (1e-6, 1e-8))])
+def test_few_digits_and_many_are_what_was_asked_for(name, method, tolerances):
+    for tolerance in tolerances:
+        _, error = off(name, method=method, rtol=tolerance, atol=tolerance, max_step=0.01 * T_END)
+        assert error < 300.0 * tolerance
+
+
 def test_other_methods_do_not_say_a_defect():
     result, _ = off("brake", method="DOP853")
     assert result.defect is None

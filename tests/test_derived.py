@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests import problems
 from tests.problems import called, worst
 from twoloop import ConstrainedSystem, consistent_state, mechanisms, solve_dae
 from twoloop.generate.derived import standing_for
@@ -36,16 +37,7 @@ def bar(speed=SPEED, length=1.0, **more):
 
 
 def pendulum(**more):
-    """A point on a bar of 1 m; what is None is not given."""
-    functions = {
-        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        "jacobian": lambda t, q: q[None, :],
-        "gamma": lambda t, q, v: np.array([-(v @ v)]),
-    } | more
-    given = {kind: function for kind, function in functions.items() if function is not None}
-    return ConstrainedSystem.from_python(
-        n_q=2, n_c=1, mass=np.eye(2), force=lambda t, q, v: np.array([0.0, -9.81]), **given
-    )
+    return problems.pendulum(constant_mass=True, **more)
 
 
 @compiled

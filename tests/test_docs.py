@@ -1,4 +1,4 @@
-"""The documentation: its code as printed, its links, what it says of every status, and the generated pages."""
+"""The documentation and the README: their code as printed, links, what they say of every status, generated pages."""
 
 import importlib.util
 import re
@@ -6,36 +6,49 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 
-from tests.test_pages import blocks
-from twoloop import Result, Status, mechanisms
+from twoloop import Result, Status, mechanisms, solve_dae
 from twoloop.run.record import explained
 
-DOCS = Path(__file__).parents[1] / "docs"
+mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 PAGES = sorted(page.stem for page in DOCS.glob("*.md"))
-ELSEWHERE = {"between_steps": "test_pages.py", "compare": "studies/test_compare.py"}  # whose code other tests run
+ELSEWHERE = {"compare": "studies/test_compare.py"}  # whose code other tests run
 WITHOUT_CODE = {"errors", "how_it_is_built", "method", "reference"}
+
+
+def blocks(page):
+    """The Python code of a page."""
+    return [part.split("```")[0] for part in (ROOT / page).read_text(encoding="utf-8").split("```python\n")[1:]]
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory):
-    """What the code of a page defines, run once, in a folder of its own."""
+    """What the code of a page defines, run once, in a folder of its own; `_results`: `result` after each block."""
     mpl.use("Agg")
     made = {}
 
     def run(page):
         if page not in made:
-            made[page] = {"__name__": page}
+            folder = tmp_path_factory.mktemp(page)
+            made[page] = {"__name__": page, "_folder": folder, "_results": []}
             with pytest.MonkeyPatch.context() as patch:
-                patch.chdir(tmp_path_factory.mktemp(page))
+                patch.chdir(folder)
                 for block in blocks(f"docs/{page}.md"):
                     exec(block, made[page])
+                    made[page]["_results"].append(made[page].get("result"))
         return made[page]
 
     return run
+
+
+def pictures(page):
+    """Sizes of the pictures that the code of a page has written."""
+    return {path.name: path.stat().st_size for path in page["_folder"].glob("*.png")}
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in ELSEWHERE])
@@ -47,6 +60,13 @@ def test_the_code_of_a_page_runs(page, names, recwarn):
 def test_code_that_is_run_elsewhere_is(names):
     for page, test in ELSEWHERE.items():
         assert f"docs/{page}.md" in (DOCS.parent / "tests" / test).read_text(encoding="utf-8")
+
+
+def test_the_code_of_the_readme(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for block in blocks("README.md"):
+        exec(block, {})
+    assert {path.name for path in tmp_path.iterdir()} == {"run.png", "run.html"}
 
 
 # --- what the pages promise
@@ -94,6 +114,83 @@ def test_the_adapter_of_the_page_has_the_order_of_its_method(names):
     errors = page["rows"].query("solver == 'RATTLE'")["error_q"].to_numpy()
     assert errors[0] / errors[1] == pytest.approx(100.0, rel=0.1)
     assert (page["rows"]["status"] == "REACHED_END").all()
+
+
+def test_many_runs(names):
+    page = names("many_runs")
+    assert page["runs"].success.all() and page["q0"].shape == (2000, 9)
+    assert page["result"].success and page["again"].success
+    assert np.ptp(page["high"] - page["low"]) > 1e-3
+    sizes = pictures(page)
+    assert min(sizes["tolerances.png"], sizes["workspace.png"]) > 5000
+
+
+def test_dense_output(names):
+    page = names("between_steps")
+    assert page["state"].q.shape == (9, 10_001)
+    assert np.isfinite(page["state"].lam).all()
+    assert (page["again"].sol(3.21).q == page["_results"][0].sol(3.21).q).all()
+
+
+def test_reactions(names):
+    page = names("between_steps")
+    pin = page["pin"]
+    assert pin.force.shape == (2, 1001)
+    assert np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max()
+    assert page["clamp"].force[:, -1] == pytest.approx([0.0, 29.43], abs=1e-10)
+    assert page["clamp"].torque[-1] == pytest.approx(14.715, abs=1e-10)
+
+
+def test_the_third_event_ends_the_run(names):
+    page = names("between_steps")
+    result = page["result"]
+    assert result.status == 1
+    assert result.t_events[0].size == 3
+    assert np.abs(result.q_events[0][:, 8] - 1.0).max() < 1e-14
+    assert (result.v_events[0][:, 8] > 0.0).all()
+
+
+def test_impacts(names):
+    page = names("between_steps")
+    assert pictures(page)["impacts.png"] > 10_000
+    arcs, problem = page["arcs"], page["problem"]
+    assert [arc.status for arc in arcs] == [1] * (len(arcs) - 1) + [0]
+    assert len(arcs) > 3
+    for before, after in pairwise(arcs):
+        assert abs(before.q[8, -1] - 1.0) < 1e-14
+        assert after.t[0] == before.t[-1]
+        assert after.v[8, 0] == pytest.approx(-0.6 * before.v[8, -1], rel=1e-12)
+        # one degree of freedom: of the kinetic energy 0.36 is left
+        q, v = before.q[:, -1], before.v[:, -1]
+        kinetic = 0.5 * v @ problem.system.mass(0.0, q) @ v
+        lost = problem.energy(before.t, before.q, before.v)[-1] - problem.energy(after.t, after.q, after.v)[0]
+        assert lost == pytest.approx(0.64 * kinetic, rel=1e-9)
+    assert max(arc.q[8].max() for arc in arcs) < 1.0 + 1e-14
+    assert max(arc.sol(np.linspace(arc.t[0], arc.t[-1], 200)).q[8].max() for arc in arcs) < 1.0 + 1e-12
+
+
+def test_all_three_are_one_mechanism(names):
+    page = names("your_mechanism")
+    systems = page["plain"], page["compiled"], page["problem"].system
+    generic = np.random.default_rng(2)
+    for _ in range(5):
+        q, v = generic.normal(size=3), generic.normal(size=3)
+        for kind, state in (("mass", [q]), ("force", [q, v]), ("constraint", [q]), ("jacobian", [q])):
+            first, *others = (system.evaluate(kind, 0.0, *state) for system in systems)
+            assert all(np.abs(other - first).max() < 1e-13 * max(1.0, np.abs(first).max()) for other in others)
+    ends = [solve_dae(s, (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8).q[:, -1] for s in systems]
+    assert np.ptp(ends, axis=0).max() < 1e-5
+    assert page["problem"].q0 == pytest.approx(page["q0"], abs=1e-14)
+    assert np.ptp(page["energy"]) < 1e-5
+
+
+def test_what_the_page_says_of_the_others(names):
+    page = names("your_mechanism")
+    assert page["problem"].conserved
+    assert not page["start"].conserved
+    assert page["heavier"].system.given == page["problem"].system.given
+    assert page["heavier"].parameters["m3"] == 3.0
+    assert np.ptp(page["swing"].energy(page["swung"].t, page["swung"].q, page["swung"].v)) < 1e-4
 
 
 # --- statuses

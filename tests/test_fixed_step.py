@@ -25,12 +25,6 @@ def test_the_last_fixed_step_is_shortened():
     assert worst(result.q[:, -1], pendulum_state(1.05)[0]) < 1e-6
 
 
-def test_fixed_steps_store_at_multiples_and_at_the_end():
-    result = swing(1.05, step_size=0.02, t_eval=[0.0, 0.3, 1.0, 1.05])
-    assert (result.t == [0.0, 0.3, 1.0, 1.05]).all()
-    assert len(result.h) == 53
-
-
 @pytest.mark.parametrize("method", ["SunRadau5", "Newmark", "BDF", "DOP853", "PaperIRK"])
 def test_a_fixed_step_that_cannot_converge_says_so_and_does_not_change(default_four_bar, method):
     result = run(default_four_bar, step_size=2.0, method=method)

@@ -87,6 +87,22 @@ def test_what_cannot_reach_the_tolerance_is_a_status():
     assert run.t[0] == 0.0
 
 
+def test_differences_where_all_coordinates_are_zero():
+    """A bead on y = x^2 that passes the vertex."""
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([q[1] - q[0] ** 2]),
+        jacobian=lambda t, q: opaque(np.array([[-2.0 * q[0], 1.0]])),
+    )
+    run = solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
+    assert worst(run.a[:, 0], [0.0, 18.0]) < 1e-6
+    energy = 0.5 * (run.v**2).sum(axis=0) + 9.81 * run.q[1]
+    assert worst(energy, 4.5) < 1e-7
+
+
 def test_rest_and_a_turning_point_need_no_shorter_differences():
     system = ConstrainedSystem.from_python(
         n_q=2,

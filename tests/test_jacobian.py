@@ -80,15 +80,6 @@ def test_a_run_without_jacobian_is_as_good(compiled):
     assert worst(result.lam, lam) < 1e-6
 
 
-def test_the_four_bar_runs_alike_without_jacobian():
-    problem = four_bar()
-    options = {"q0": problem.q0, "v0": problem.v0, "method": "DOP853", "rtol": 1e-8, "atol": 1e-8}
-    runs = [solve_dae(system, (0.0, 2.0), **options) for system in (problem.system, without_jacobian(problem))]
-    # rounding may decide which of two partitions as good as each other is taken
-    assert abs(runs[0].stats.n_accepted - runs[1].stats.n_accepted) <= 0.1 * runs[0].stats.n_accepted
-    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-6
-
-
 def test_differences_of_differences_lose_digits_as_documented():
     q, v = moving_pivot_state(0.0)
     full = moving_pivot()

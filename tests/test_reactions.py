@@ -378,9 +378,6 @@ def test_a_point_elsewhere_carries_the_moment_of_the_force():
 
 
 def test_names():
-    result = run(four_bar(), 0.1)
-    with pytest.raises(ValueError, match=r"name must be a joint of 'four-bar': 'O', '1-2', '2-3', 'A'; given 'B'"):
-        result.reactions("B")
     spatial = [joint.name for joint in spatial_slider_crank().joints]
     assert spatial == [
         "revolute crank-ground",
@@ -392,10 +389,7 @@ def test_names():
 
 @pytest.mark.parametrize("make", [andrews, sundials_slider_crank, rolling_disc, n_four_bar])
 def test_mechanisms_without_absolute_coordinates_have_no_joints(make):
-    problem = make()
-    assert problem.joints == ()
-    with pytest.raises(ValueError, match=r"Name them in the system, joints=\[twoloop.Joint"):
-        run(problem, 1e-3).reactions("O")
+    assert make().joints == ()
 
 
 def test_results_in_files(tmp_path):

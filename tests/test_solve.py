@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import trajectory
-from tests.problems import START, pendulum, pendulum_energy, pendulum_state, run, swing, violations, worst
+from tests.problems import (
+    START,
+    force_residual,
+    pendulum,
+    pendulum_energy,
+    pendulum_state,
+    run,
+    swing,
+    violations,
+    worst,
+)
 from twoloop import (
     ConstrainedSystem,
     ConstraintWarning,
-    Newmark,
     RungeKutta,
     Status,
     paper_irk,
@@ -44,14 +53,15 @@ def test_every_preset_solves_the_pendulum(method):
     assert violations(pendulum(), result)[0] < 1e-9
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss6", "Gauss12", "Newmark", "BDF", "DOP853", "Adams"])
-def test_a_smaller_tolerance_gives_a_smaller_error(default_four_bar, method):
-    errors = [
-        worst(run(default_four_bar, method=method, rtol=tol, atol=tol).q[:, -1], default_four_bar.reference.q)
-        for tol in (1e-4, 1e-6, 1e-8)
-    ]
+# of the others: tests/kernels/adaptive.py; the bounds are about 1.3 times what was counted when they were written
+@pytest.mark.parametrize(("method", "bound"), [("SunRadau5", 35_000), ("Gauss6", 28_000), ("Gauss12", 19_000)])
+def test_error_and_price_of_ten_seconds(default_four_bar, method, bound):
+    runs = [run(default_four_bar, method=method, rtol=tol, atol=tol) for tol in (1e-4, 1e-6, 1e-8)]
+    errors = [worst(result.q[:, -1], default_four_bar.reference.q) for result in runs]
     assert errors[1] < 0.5 * errors[0]
     assert errors[2] < 0.5 * errors[1]
+    assert errors[2] < 1e-8
+    assert runs[2].stats.n_evaluations < bound
 
 
 def test_angles_beyond_a_turn():
@@ -83,7 +93,9 @@ def test_every_accepted_step_is_stored_by_default():
     assert (result.q[:, 0] == START[0]).all()
 
 
-@pytest.mark.parametrize("times", [[0.0, 0.5, 2.0], [0.3, 0.31, 0.7, 1.9], [2.0], [0.0], [1.0], [0.0, 2.0]])
+@pytest.mark.parametrize(
+    "times", [[0.0, 0.5, 2.0], [0.3, 0.31, 0.7, 1.9], [2.0], [0.0], [1.0], [0.0, 2.0], [0.3, 0.30000001]]
+)
 def test_output_times_are_landed_on_exactly(times):
     result = swing(t_eval=times, rtol=1e-9, atol=1e-9)
     assert result.success
@@ -94,24 +106,12 @@ def test_output_times_are_landed_on_exactly(times):
     assert result.h.sum() == pytest.approx(2.0, abs=1e-13)  # the run goes to its end all the same
 
 
-def test_shapes_are_one_column_an_instant(default_four_bar):
-    result = run(default_four_bar, 1.0, t_eval=[0.0, 0.25, 0.5])
-    assert result.t.shape == (3,)
-    assert result.q.shape == result.v.shape == result.a.shape == (9, 3)
-    assert result.lam.shape == (8, 3)
-
-
 def test_more_output_than_a_buffer_holds(default_four_bar):
     times = np.linspace(0.0, 10.0, 3001)
     result = run(default_four_bar, t_eval=times, method="Gauss6")
     assert (result.t == times).all()
     assert worst(result.q, trajectory(default_four_bar.parameters, times)[0]) < 1e-7
     assert worst(run(default_four_bar, method="Newmark").h.sum(), 10.0) < 1e-11  # more steps than a buffer holds
-
-
-def test_many_output_times_cost_no_accuracy_in_the_times():
-    times = np.arange(1, 200) * 0.01
-    assert (swing(t_eval=times).t == times).all()
 
 
 # --- step sizes
@@ -159,21 +159,6 @@ def test_max_steps_ends_the_run_with_what_there_is():
     assert "max_steps = 7" in part.message
     assert f"t = {part.t[-1]:.6g}"[:8] in part.message
     assert swing(max_steps=whole.stats.n_accepted).success  # just enough
-
-
-def test_max_steps_with_output_times_keeps_those_reached():
-    part = swing(max_steps=20, t_eval=[0.0, 0.01, 1.999])
-    assert part.status == Status.MAX_STEPS
-    assert (part.t == [0.0, 0.01]).all()
-
-
-def test_reaching_the_end_is_said():
-    result = swing()
-    assert result.status == Status.REACHED_END == 0
-    assert result.success
-    assert "end" in result.message
-    assert result.sol is None
-    assert result.t_events is None
 
 
 def crossing_lines():
@@ -275,19 +260,7 @@ def test_evaluations_are_calls_of_the_force():
     assert max(calls) <= 1.0 + 1e-12
 
 
-def test_the_same_run_twice_is_the_same(default_four_bar):
-    first, second = run(default_four_bar), run(default_four_bar)
-    assert (first.q == second.q).all()
-    assert first.stats.n_evaluations == second.stats.n_evaluations
-
-
 # --- functions in plain Python
-
-
-def test_compiled_functions_give_the_same_run():
-    plain, compiled = swing(method="DOP853"), swing(system=pendulum(compile=True), method="DOP853")
-    assert plain.stats.n_evaluations == compiled.stats.n_evaluations
-    assert worst(plain.q, compiled.q) < 1e-12
 
 
 def test_a_closure_that_changes_is_followed():
@@ -347,13 +320,6 @@ def test_a_loose_outer_loop_is_cheaper_and_worse_a_tight_one_dearer_and_no_bette
     assert error[None] < 2.0 * error[1e-13]
 
 
-@pytest.mark.parametrize(("method", "bound"), [("SunRadau5", 35_000), ("Gauss6", 28_000), ("Gauss12", 19_000)])
-def test_price_of_ten_seconds_at_1e_8(default_four_bar, method, bound):
-    result = run(default_four_bar, method=method, rtol=1e-8, atol=1e-8)
-    assert result.stats.n_evaluations < bound
-    assert worst(result.q[:, -1], default_four_bar.reference.q) < 1e-8
-
-
 def test_price_and_accuracy_of_the_papers_method_over_100_s(default_four_bar):
     result = run(default_four_bar, 100.0, method=paper_irk(1e-9, 1e-9), rtol=1e-5, atol=1e-5)
     assert result.success
@@ -380,13 +346,6 @@ def test_newmark_pays_three_to_five_times_as_much_per_two_decades(default_four_b
     assert (growth < 5.0).all()
     assert spans[0] > 1.0  # err_out = 1e-3 loses the solution
     assert spans[3] < 1e-2
-
-
-def test_newmark_error_tolerance_is_its_own():
-    loose, tight = (swing(method=Newmark(error_tol=tol), rtol=1.0, atol=1.0) for tol in (1e-4, 1e-7))
-    assert tight.stats.n_accepted > 5 * loose.stats.n_accepted
-    other = swing(method=Newmark(error_tol=1e-7), rtol=1e-9, atol=1e-9)
-    assert other.stats.n_accepted == tight.stats.n_accepted
 
 
 def test_memory_of_a_run_grows_only_with_the_stored_output(default_four_bar):
@@ -416,11 +375,9 @@ def test_multipliers_and_accelerations_solve_the_equations_of_motion(default_fou
     problem = default_four_bar
     options = {"step_size": 0.01} if fixed else {"rtol": 1e-6, "atol": 1e-6}
     result = run(problem, 0.3, method=method, **options)
-    for k in range(result.t.size):
-        t, q, v, a, lam = result.t[k], *(part[:, k] for part in (result.q, result.v, result.a, result.lam))
-        residual = problem.system.mass(t, q) @ a + problem.system.jacobian(t, q).T @ lam - problem.system.force(t, q, v)
-        assert np.abs(residual).max() < 1e-10
-        assert np.abs(problem.system.jacobian(t, q) @ a - problem.system.gamma(t, q, v)).max() < 1e-10
+    assert force_residual(problem.system, result) < 1e-10
+    for t, q, v, a in zip(result.t, result.q.T, result.v.T, result.a.T, strict=True):
+        assert worst(problem.system.jacobian(t, q) @ a, problem.system.gamma(t, q, v)) < 1e-10
 
 
 def test_the_extrapolated_state_is_better_with_either_outer_loop(default_four_bar):

@@ -98,7 +98,9 @@ def test_two_assemblies_within_reach_are_refused_unless_one_says_otherwise(besid
     problems = [four_bar((0.8, 1.2, 1.0), 2.0, theta3=STRETCHED - beside, branch=branch) for branch in (-1, 1)]
     rough = problems[0].q0 + 0.02 * np.array([1.0, -1.0, 0.5, 1.0, 0.3, -1.0, 0.2, 0.4, 0.0])
     rest, system = np.zeros(9), problems[0].system
-    with pytest.raises(ValueError, match=r"does not say on which assembly.*check_assembly=False takes the one found"):
+    assert consistent_state(system, 0.0, problems[0].q0, rest, keep=[CRANK]).margin < 0.1  # known well enough
+    words = "does not say on which assembly.*check_assembly=False takes the one" + ".*loses rank" * (beside < 1e-3)
+    with pytest.raises(ValueError, match=words):
         consistent_state(system, 0.0, rough, rest, keep=[CRANK])
     found = consistent_state(system, 0.0, rough, rest, keep=[CRANK], check_assembly=False)
     assert min(off(found, problem.q0) for problem in problems) < 1e-6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import twoloop
-from tests.problems import pendulum, run, swing
+from tests.problems import run, swing
 from twoloop import Result, Statistics, Status
 
 
@@ -71,14 +71,6 @@ def test_failures_and_what_foreign_solvers_do_not_tell(tmp_path):
     result = Result(row[0], row, row, row, row, row[0], Status.SOLVER_FAILED, "said: äöü", Statistics(n_outer=3))
     result.save(tmp_path / "foreign.npz")
     same(result, twoloop.load(tmp_path / "foreign.npz"))
-
-
-def test_another_system_is_refused(default_four_bar, tmp_path):
-    run(default_four_bar, 0.1, dense_output=True).save(tmp_path / "run.npz")
-    with pytest.raises(ValueError, match=r"n_q = 9 and n_c \+ n_a = 8; 'pendulum' has 2 and 1"):
-        twoloop.load(tmp_path / "run.npz", pendulum())
-    with pytest.raises(TypeError, match=r"give its system, problem\.system"):
-        twoloop.load(tmp_path / "run.npz", default_four_bar)
 
 
 @pytest.mark.parametrize("content", [b"", b"no archive", None, "pickled"])

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from tests.problems import pendulum, worst
+from tests.problems import worst
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.generate import straight_code
 from twoloop.generate.coefficients import Coefficients
@@ -19,7 +19,6 @@ from twoloop.generate.derivative import Derivative
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import function_of, own_code
 from twoloop.generate.straight_line import Choice, Factors, Outputs, Solution, StraightLine
-from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile import caches
 from twoloop.kernels.data.common import BY_GENERAL, DONE
@@ -154,30 +153,6 @@ def test_a_run_ends_at_its_reference_by_as_many_evaluations(make, method):
     assert with_code.stats.n_evaluations < 1.1 * without.stats.n_evaluations
     for t, q in zip(with_code.t, with_code.q.T, strict=True):
         assert np.abs(problem.system.constraint(t, q)).max(initial=0.0) < 1e-12
-
-
-def test_gamma_need_not_be_given():
-    runs = [
-        solve_dae(pendulum(gamma=gamma), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "DOP853", 1e-11, 1e-11, compiled=True)
-        for gamma in (True, False)
-    ]
-    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-12
-
-
-@ending_at_a_reference
-@pytest.mark.parametrize("make", [four_bar, driven_crank, spatial_four_bar, knife_edge])
-def test_gamma_from_the_rules_of_differentiation_is_that_of_the_formula(make):
-    problem = make()
-    system = problem.system
-    kind = "nonholonomic_gamma" if system.n_a else "gamma"
-    given = {name: function for name, function in system.given.items() if name not in (kind, "kinematics")}
-    sizes = {name: getattr(system, name) for name in ("n_q", "n_c", "n_a", "constant_mass", "parameters")}
-    equations = Equations(ConstrainedSystem(**sizes, **given))
-    outputs = Outputs({"gamma": list(equations.of(kind))}, [])
-    holds, (gamma,) = compute(equations.graph, outputs, (0.2, problem.q0, problem.v0))
-    known = system.evaluate(kind, 0.2, problem.q0, problem.v0)
-    assert holds
-    assert worst(gamma, known) < 1e-12 * max(1.0, np.abs(gamma).max())
 
 
 @pytest.mark.parametrize("make", [four_bar, andrews, heavy_top, spatial_four_bar, rolling_disc])
@@ -327,14 +302,6 @@ def test_methods_that_make_no_use_of_it_refuse(method):
     problem = four_bar()
     with pytest.raises(ValueError, match=r"compiled=True goes with .*; given method"):
         solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, method, compiled=True)
-
-
-def test_equations_that_branch_are_refused_by_name():
-    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0]))
-    with pytest.raises(ValueError, match=r"compiled=True .* force of 'pendulum': it branches .* Leave it out"):
-        solve_dae(system, (0.0, 0.1), [1.0, 0.0], [0.0, 0.0], "DOP853", compiled=True)
-    with pytest.raises(TypeError, match="compiled must be True or False"):
-        solve_dae(system, (0.0, 0.1), [1.0, 0.0], [0.0, 0.0], "DOP853", compiled="yes")
 
 
 def test_redundant_rows_that_stop_holding_end_the_run():

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from tests.compiled import PENDULUM as COMPILED
 from tests.problems import pendulum as bare_pendulum
 from twoloop import ConstrainedSystem, callback, sweep
 from twoloop.generate import stage_code, straight_code
@@ -25,29 +26,6 @@ GRAVITY = 9.81
 TABLE = np.linspace(0.0, 1.0, 2000)  # its repr leaves most of it out
 QUICK = {"t_span": (0.0, 0.01), "check_derivatives": False}
 RUNS = [{"k": k} for k in range(6)]
-
-
-@callback("mass")
-def unit_mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = 1.0
-
-
-@callback("force")
-def weight(t, q, v, p, Q):
-    Q[1] = -p[0]
-
-
-@callback("constraint")
-def length(t, q, p, C):
-    C[0] = q[0] * q[0] + q[1] * q[1] - 1.0
-
-
-@callback("jacobian")
-def direction(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = 2.0 * q[0], 2.0 * q[1]
-
-
-COMPILED = {"mass": unit_mass, "force": weight, "constraint": length, "jacobian": direction}
 
 
 def swinging(k):
@@ -329,8 +307,13 @@ def test_a_worker_that_cannot_begin_is_an_error(monkeypatch):
 # --- memory
 
 
+@callback("force")
+def attraction(t, q, v, p, Q):
+    Q[1] = -p[0]
+
+
 def swinging_under(gravity):
-    system = ConstrainedSystem(**COMPILED, n_q=2, n_c=1, parameters=[gravity])
+    system = ConstrainedSystem(**{**COMPILED, "force": attraction}, parameters=[gravity])
     return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
 
 

@@ -73,26 +73,6 @@ def test_a_constant_mass_need_not_be_diagonal():
     assert worst(full @ a + q * lam, [[0.0], [-9.81]]) < 1e-11
 
 
-def test_as_many_constraints_as_coordinates_leave_no_freedom():
-    # driven completely: q = (cos t, sin t)
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=2,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.zeros(2),
-        constraint=lambda t, q: q - [np.cos(t), np.sin(t)],
-        jacobian=lambda t, q: np.eye(2),
-        constraint_rate=lambda t, q: np.array([np.sin(t), -np.cos(t)]),
-        gamma=lambda t, q, v: -np.array([np.cos(t), np.sin(t)]),
-    )
-    result = solve_dae(system, (0.0, 3.0), [1.0, 0.0], [0.0, 1.0])
-    assert result.success
-    expected = np.array([np.cos(result.t), np.sin(result.t)])
-    assert worst(result.q, expected) < 1e-12
-    assert worst(result.a, -expected) < 1e-12
-    assert worst(result.lam, expected) < 1e-12
-
-
 # --- consistent_state
 
 
@@ -142,21 +122,6 @@ def test_what_cannot_be_projected_says_how_far_it_is():
     )  # no real position at all
     with pytest.raises(ValueError, match=r"q cannot be projected.*'pendulum'.*max\|C\| is .*nearer"):
         consistent_state(empty, 0.0, [1.0, 1.0], [0.0, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("q", "v", "error", "words"),
-    [
-        ([1.0], [0.0, 0.0], ValueError, r"q must have shape \(2,\); given shape \(1,\)"),
-        ([1.0, 0.0], [0.0, 0.0, 0.0], ValueError, r"v must have shape \(2,\); given shape \(3,\)"),
-        ([1.0, np.nan], [0.0, 0.0], ValueError, r"q must be finite; entries \[1\]"),
-        ([1.0, 0.0], [np.inf, 0.0], ValueError, r"v must be finite; entries \[0\]"),
-        (["one", 0.0], [0.0, 0.0], TypeError, "q must be an array of real numbers"),
-    ],
-)
-def test_wrong_guesses_are_named(q, v, error, words):
-    with pytest.raises(error, match=words):
-        consistent_state(pendulum(), 0.0, q, v)
 
 
 def bead(**changed):

@@ -209,14 +209,7 @@ def test_sun_damps_nothing_and_radau_iia_everything_stiff(s):
     assert np.abs(radau_iia(s).A[-1] - radau_iia(s).b).max() < 1e-15  # stiffly accurate
 
 
-@pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("s", [2.0, "3", None, True])
-def test_number_of_stages_must_be_an_int(family, s):
-    with pytest.raises(TypeError, match=rf"\bs\b.*{family}"):
-        FAMILIES[family](s)
-
-
-@pytest.mark.parametrize(("family", "s"), [("gauss", 0), ("radau_iia", -1), ("sun_radau_iib", 0), ("lobatto_iiie", 1)])
-def test_number_of_stages_must_be_large_enough(family, s):
-    with pytest.raises(ValueError, match=rf"\bs\b.*at least.*{family}.*given {s}"):
-        FAMILIES[family](s)
+def test_number_of_stages_must_be_an_int(s):
+    with pytest.raises(TypeError, match=r"\bs\b.*lobatto_iiie"):  # of the others: tests/bad_input
+        lobatto_iiie(s)

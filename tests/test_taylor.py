@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from twoloop import ConstrainedSystem, Taylor, callback, consistent_state, solve_dae
+from tests.problems import pendulum
+from twoloop import ConstrainedSystem, Taylor, solve_dae
 from twoloop.generate import series_code
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import own_code
@@ -200,18 +201,6 @@ def test_the_error_follows_the_tolerance():
         assert np.abs(result.q[:, -1] - problem.reference.q).max() < 5.0 * tolerance
 
 
-def test_between_steps_the_solution_is_as_good_as_at_their_ends():
-    problem = four_bar()
-    times = np.linspace(0.0, 3.0, 61)
-    options = {"t_eval": times, "rtol": 1e-12, "atol": 1e-12}
-    series, other = (
-        solve_dae(problem.system, (0.0, 3.0), problem.q0, problem.v0, method, **options)
-        for method in ("Taylor", "DOP853")
-    )
-    assert np.abs(series.q - other.q).max() < 1e-10
-    assert np.abs(series.v - other.v).max() < 1e-9
-
-
 def test_the_program_shares_what_is_computed_twice():
     program = series_program(four_bar().system)
     assert len(program.early.first.column) == 12  # sines and cosines of three angles, and their products with rates
@@ -219,39 +208,11 @@ def test_the_program_shares_what_is_computed_twice():
     assert len(program.early.groups) == 2
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    M[0, 0] = 1.0
-
-
-@callback("force")
-def stop(t, q, v, p, Q):
-    Q[0] = -100.0 * q[0] if q[0] < 0.0 else -1.0
-
-
 def test_a_callback_that_branches_is_refused_by_name_and_auto_goes_on_without():
-    system = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=stop, constant_mass=True, name="stop")
-    with pytest.raises(ValueError, match=r"force of 'stop': it branches .* Take 'Adams' or 'DOP853'"):
+    system = one_coordinate(lambda t, q, v: -100.0 * q if q < 0.0 else -1.0)
+    with pytest.raises(ValueError, match=r"force of 'one coordinate': it branches .* Take 'Adams' or 'DOP853'"):
         solve_dae(system, (0.0, 1.0), [0.1], [0.0], "Taylor")
     assert solve_dae(system, (0.0, 1.0), [0.1], [0.0]).success
-
-
-def pendulum(**changes):
-    functions = {
-        "mass": lambda t, q: np.eye(2),
-        "force": lambda t, q, v: np.array([0.0, -9.81]),
-        "constraint": lambda t, q: np.array([q[0] ** 2 + q[1] ** 2 - 1.0]),
-        "jacobian": lambda t, q: np.array([[2.0 * q[0], 2.0 * q[1]]]),
-    }
-    return ConstrainedSystem.from_python(n_q=2, n_c=1, name="pendulum", **(functions | changes))
-
-
-def test_neither_gamma_nor_the_jacobian_is_needed():
-    known = solve_dae(pendulum(), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "DOP853", 1e-11, 1e-11)
-    result = solve_dae(pendulum(), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "Taylor", 1e-11, 1e-11)
-    assert np.abs(result.q[:, -1] - known.q[:, -1]).max() < 1e-8
-    less = solve_dae(pendulum(jacobian=None), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "Taylor", 1e-11, 1e-11)
-    assert np.abs(less.q[:, -1] - known.q[:, -1]).max() < 1e-8
 
 
 def test_a_python_function_that_changes_is_followed():
@@ -278,13 +239,3 @@ def test_an_order_out_of_range_is_refused(order, kind):
 def test_the_method_alone_says_what_it_needs():
     with pytest.raises(ValueError, match="for_system"):
         Taylor().plan(2, 1e-8, 1e-8, False)
-
-
-def test_a_start_between_known_states_is_consistent_first():
-    problem = four_bar()
-    moved = problem.q0.copy()
-    moved[2] += 0.01
-    q, v = consistent_state(problem.system, 0.0, moved, problem.v0)
-    result = solve_dae(problem.system, (0.0, 1.0), q, v, "Taylor", 1e-10, 1e-10)
-    other = solve_dae(problem.system, (0.0, 1.0), q, v, "DOP853", 1e-10, 1e-10)
-    assert np.abs(result.q[:, -1] - other.q[:, -1]).max() < 1e-8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.problems import G, pendulum, pendulum_state, worst
-from twoloop import ConstrainedSystem, Status, solve_dae
+from twoloop import Status, solve_dae
 
 START = ([-1.0, 0.0], [0.0, 0.0])
 METHODS = ["SunRadau5", "Gauss12", "RadauIIA5", "Newmark", "BDF", "DOP853", "Adams"]
@@ -39,15 +39,7 @@ def test_the_step_is_compared_with_the_time_reached_not_with_the_end(method, end
 
 def slow_pendulum(period):
     """A pendulum of 1 m whose gravity makes its time scale that of `period`."""
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -G / period**2]),
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: q[None, :],
-        gamma=lambda t, q, v: np.array([-(v @ v)]),
-    )
+    return pendulum(force=lambda t, q, v: np.array([0.0, -G / period**2]), constant_mass=True)
 
 
 @pytest.mark.parametrize("scale", [1e9, 1e3, 1e-3, 1e-6])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.bad_input.case import Case, argument, linkage, solve
+from tests.bad_input.case import Case, argument, cases_of, linkage, solve
 from twoloop import load
 
 
@@ -53,6 +53,7 @@ NUMBER = "return one real number, e.g. float(q[0])"
 COUNT = "give True or a count"
 WITHIN = "ask between start and end"
 FUNCTION = "give a function event(t, q, v), or a list of such"
+of_load = cases_of("load")
 BETWEEN_STEPS = [
     event_case("`events=3`", 3, TypeError, "events must be a function", FUNCTION),
     event_case("`events='hit'`", "hit", TypeError, "events must be a function", FUNCTION),
@@ -93,28 +94,23 @@ BETWEEN_STEPS = [
             (True, TypeError, "must be an array of real numbers", "write 1.0"),
         ],
     ),
-    Case(
-        "load",
+    of_load(
         "a file of something else",
         lambda: loaded(b"text"),
-        ValueError,
         "must lead to a file written by Result.save",
         "give a file that result.save(path) wrote",
     ),
-    Case(
-        "load",
+    of_load(
         "the result of another system",
         lambda: loaded(None, linkage().system),
-        ValueError,
         r"system must be the one that was solved, with n_q = 2 and n_c \+ n_a = 1",
         "give the system that was solved",
     ),
-    Case(
-        "load",
+    of_load(
         "a problem in the place of its system",
         lambda: loaded(None, linkage()),
-        TypeError,
         r"give its system, problem\.system",
         "give problem.system",
+        TypeError,
     ),
 ]

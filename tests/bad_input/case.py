@@ -36,6 +36,15 @@ class Case:
         return f"{self.group}: {self.what}"
 
 
+def cases_of(group):
+    """What makes the cases of a group: of (what, call, words, advice), and of the error, if it is no ValueError."""
+
+    def case(what, call, words, advice, error=ValueError):
+        return Case(group, what, call, error, words, advice)
+
+    return case
+
+
 @cache
 def swinging():
     return pendulum()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.bad_input.case import Case
+from tests.bad_input.case import cases_of
 from twoloop import Integrator, consistent_states, ensemble
 from twoloop.mechanisms import four_bar
 
@@ -24,18 +24,8 @@ def moved(run, by):
     return q
 
 
-def of_ensemble(what, call, words, advice, error=ValueError):
-    return Case("ensemble", what, call, error, words, advice)
-
-
-def of_states(what, call, words, advice):
-    return Case("consistent_states", what, call, ValueError, words, advice)
-
-
-def of_integrator(what, call, words, advice, error=ValueError):
-    return Case("Integrator", what, call, error, words, advice)
-
-
+of_ensemble, of_states = cases_of("ensemble"), cases_of("consistent_states")
+of_integrator = cases_of("Integrator")
 A_ROW = "give a row for each run, or one for all"
 ENSEMBLES = [
     of_ensemble("starts as columns", lambda: many(THREE.T), r"q0 must have shape \(9,\) or \(n_runs, 9\)", A_ROW),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.bad_input.case import Case, linkage, solve
+from tests.bad_input.case import Case, cases_of, linkage, solve
 from tests.bad_input.systems import make
 from twoloop import Joint, solve_dae
 
@@ -15,15 +15,12 @@ def joints(what, given, error, words, advice):
     return Case("ConstrainedSystem.from_python, joints", what, lambda: make(joints=given), error, words, advice)
 
 
-def reactions(what, call, error, words, advice):
-    return Case("result.reactions", what, call, error, words, advice)
-
-
 def swing(name):
     problem = linkage()
     return solve_dae(problem.system, (0.0, 1e-3), problem.q0, problem.v0).reactions(name)
 
 
+reactions = cases_of("result.reactions")
 ROWS = "name the rows of the joint, counted as in result.lam"
 LINK = Joint("link", (0,), (0, 1))
 JOINTS = [
@@ -102,15 +99,13 @@ JOINTS = [
     reactions(
         "a name that no joint has",
         lambda: swing("B"),
-        ValueError,
         "name must be a joint of 'four-bar': 'O', '1-2', '2-3', 'A'; given 'B'",
         "give one of those named",
     ),
-    reactions("`name=0`", lambda: swing(0), TypeError, "name must be a string; given 0", "give the name of a joint"),
+    reactions("`name=0`", lambda: swing(0), "name must be a string; given 0", "give the name of a joint", TypeError),
     reactions(
         "a system without joints",
         lambda: solve().reactions("pin"),
-        ValueError,
         r"this result has none. Name them in the system, joints=\[twoloop.Joint",
         "name the joints where the system is made",
     ),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, Case, argument
+from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, argument, cases_of
 from twoloop import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark
 from twoloop.methods.tableaux import Tableau, gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
@@ -22,6 +22,7 @@ def tableau(**changed):
 
 STAGES = "give the number of stages, an int"
 UNIT = "give a number from 0 to 1"
+of_runge_kutta = cases_of("RungeKutta")
 METHODS = [
     *argument(
         "RungeKutta",
@@ -33,11 +34,9 @@ METHODS = [
             (DOUBLE, ValueError, "must have distinct nodes", "take another tableau"),
         ],
     ),
-    Case(
-        "RungeKutta",
+    of_runge_kutta(
         "an explicit tableau with `outer='newton'`",
         lambda: RungeKutta(EXPLICIT, outer="newton"),
-        ValueError,
         "tableau must have an invertible A.*Heun.*fixed-point",
         "take outer='fixed-point'",
     ),
@@ -56,19 +55,15 @@ METHODS = [
     *argument("RungeKutta", runge_kutta, "outer_test", [(1, TypeError, "must be 'all'", "take one of these")]),
     *argument("RungeKutta", runge_kutta, "inner_tol", FEW_POSITIVES),
     *argument("RungeKutta", runge_kutta, "outer_tol", [*FEW_POSITIVES, INFINITE]),
-    Case(
-        "RungeKutta",
+    of_runge_kutta(
         "`outer='newton', variables='momenta'`",
         lambda: runge_kutta(outer="newton", variables="momenta"),
-        ValueError,
         "outer='newton' goes with variables='velocities' only",
         "take outer='fixed-point' for momenta",
     ),
-    Case(
-        "RungeKutta",
+    of_runge_kutta(
         "`outer='paper', partition='symmetric'`",
         lambda: runge_kutta(outer="paper", partition="symmetric"),
-        ValueError,
         "outer='paper' is the paper's procedure",
         "take outer='fixed-point' for symmetric partitions",
     ),

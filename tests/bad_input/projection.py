@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.bad_input.case import FEW_VECTORS, HUGE, Case, argument, linkage, swinging
+from tests.bad_input.case import FEW_VECTORS, HUGE, argument, cases_of, linkage, swinging
 from tests.problems import pendulum
 from twoloop import consistent_state
 
@@ -12,14 +12,14 @@ def project(system=None, t=0.0, q=(0.6, -0.8), v=(0.0, 0.0), **options):
 
 
 FINITE = "give a finite time, s"
+of_projection = cases_of("consistent_state")
 PROJECTION = [
-    Case(
-        "consistent_state",
+    of_projection(
         "a `Problem` as `system`",
         lambda: project(linkage()),
-        TypeError,
         r"system must be a ConstrainedSystem; given a Problem.*problem\.system",
         "give problem.system",
+        TypeError,
     ),
     *argument(
         "consistent_state",
@@ -51,51 +51,39 @@ PROJECTION = [
             ([0, 0], ValueError, "must name each coordinate once", "name each once"),
         ],
     ),
-    Case(
-        "consistent_state",
+    of_projection(
         "`keep` of all coordinates of a guess that is not consistent",
         lambda: project(q=[0.6, -0.7], keep=[0, 1]),
-        ValueError,
         r"keep leaves too little freedom.*\[0, 1\].*rank 0 of 1",
         "keep fewer",
     ),
-    Case(
-        "consistent_state",
+    of_projection(
         "`keep` of a coordinate at a dead centre, with a speed",
         lambda: project(q=[1.0, 0.0], v=[1.0, 0.0], keep=[0]),
-        ValueError,
         "keep leaves too little freedom.*C_q v",
         "move the guess away from the dead centre",
     ),
-    Case(
-        "consistent_state",
+    of_projection(
         "a guess halfway to another assembly",
         lambda: project(q=[0.1, 0.0]),
-        ValueError,
         "q does not say on which assembly.*from 0.1 to 1",
         "give a guess nearer to the assembly that is meant",
     ),
-    Case(
-        "consistent_state",
+    of_projection(
         "a guess where C_q is zero",
         lambda: project(q=[0.0, 0.0]),
-        ValueError,
         r"q cannot be projected.*max\|C\| is 0.5.*nearly loses rank",
         "give a guess nearer to an assembled position",
     ),
-    Case(
-        "consistent_state",
+    of_projection(
         "a kept coordinate out of reach",
         lambda: project(q=[1.1, 0.1], keep=[0]),
-        ValueError,
         "q cannot be projected.*nearer to an assembled position",
         "keep a value that the mechanism can have",
     ),
-    Case(
-        "consistent_state",
+    of_projection(
         "`constraint` returns NaN",
         lambda: project(pendulum(constraint=lambda t, q: np.full(1, np.nan))),
-        ValueError,
         "q and v cannot be projected: constraint of 'pendulum' returned values that are not finite",
         "find out where the NaN comes from",
     ),

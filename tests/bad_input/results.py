@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.bad_input.case import Case, linkage, solve
+from tests.bad_input.case import Case, cases_of, linkage, solve
 from twoloop import Drawing, citation, sweep
 from twoloop.mechanisms import Problem, four_bar, pendulum
 
@@ -22,22 +22,8 @@ def swept(problem_of=four_bar, parameters=({"theta3": 0.1},), **options):
     return sweep(problem_of, parameters, **{"t_span": (0.0, 1e-3), "parallel": "threads", **options})
 
 
-def of_result(what, call, words, advice):
-    return Case("result.to_dataframe, .energy, .plot, .animate", what, call, ValueError, words, advice)
-
-
-def of_certify(what, call, words, advice):
-    return Case("result.certify", what, call, ValueError, words, advice)
-
-
-def of_problem(what, call, error, words, advice):
-    return Case("Problem and Drawing", what, call, error, words, advice)
-
-
-def of_sweep(what, call, error, words, advice):
-    return Case("sweep", what, call, error, words, advice)
-
-
+of_result, of_certify = cases_of("result.to_dataframe, .energy, .plot, .animate"), cases_of("result.certify")
+of_problem, of_sweep = cases_of("Problem and Drawing"), cases_of("sweep")
 A_PROBLEM = "put the system into a `Problem` with an energy and a drawing, and solve `problem.system`"
 ONE_BY_ONE = "let `problem_of` take `L1`, `L2`, `L3`"
 RESULTS = [
@@ -73,48 +59,43 @@ RESULTS = [
     of_problem(
         "two coordinates of one name",
         lambda: problem(coordinates=("x (m)", "x (m)")),
-        ValueError,
         "coordinates must be n_q = 2 different names",
         "name each coordinate",
     ),
     of_problem(
         "a bar to a point that is not there",
         lambda: problem(drawing=Drawing(bob, [(0, 1)])),
-        ValueError,
         "must name points from 0 to 0; they name 1",
         "count the points from 0",
     ),
     of_problem(
         "points of the wrong shape",
         lambda: problem(drawing=Drawing(np.sum, [(0, 1)])),
-        ValueError,
         r"points of a drawing must give an array of shape \(n_points, 2 or 3\)",
         "give a row for each point",
     ),
-    of_problem("`bars=[0, 1]`", lambda: Drawing(bob, [0, 1]), TypeError, "bars must be pairs", "write `bars=[(0, 1)]`"),
+    of_problem("`bars=[0, 1]`", lambda: Drawing(bob, [0, 1]), "bars must be pairs", "write `bars=[(0, 1)]`", TypeError),
     of_sweep(
         "a mapping of lists",
         lambda: swept(parameters={"theta3": [0.1, 0.2]}),
-        TypeError,
         "parameters must be a list of mappings, one for each run",
         "make a mapping for each run",
+        TypeError,
     ),
     of_sweep(
         "a tuple as a parameter",
         lambda: swept(parameters=[{"lengths": (1.0, 2.0, 1.5)}]),
-        TypeError,
         "must be a number, a string, True or False",
         ONE_BY_ONE,
+        TypeError,
     ),
     of_sweep(
         "a parameter that `problem_of` does not have",
         lambda: swept(parameters=[{"angle": 0.1}]),
-        TypeError,
         r"problem_of does not take parameters\[0\]",
         "name them as `problem_of` does",
+        TypeError,
     ),
-    of_sweep("`tol=1e-6`", lambda: swept(tol=1e-6), TypeError, "sweep has no argument 'tol'", "give `rtol` and `atol`"),
-    of_sweep(
-        "`workers=0`", lambda: swept(workers=0), ValueError, "workers must be at least 1", "leave it out: all cores"
-    ),
+    of_sweep("`tol=1e-6`", lambda: swept(tol=1e-6), "sweep has no argument 'tol'", "give `rtol` and `atol`", TypeError),
+    of_sweep("`workers=0`", lambda: swept(workers=0), "workers must be at least 1", "leave it out: all cores"),
 ]

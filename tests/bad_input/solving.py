@@ -17,8 +17,8 @@ from tests.bad_input.case import (
     V0,
     VECTORS,
     WRONG,
-    Case,
     argument,
+    cases_of,
     linkage,
     solve,
 )
@@ -26,6 +26,7 @@ from tests.problems import pendulum
 from twoloop import ConstrainedSystem, Newmark, solve_dae
 from twoloop.methods.tableaux import gauss
 
+of_solve = cases_of("solve_dae")
 SOLVE = [
     *argument("solve_dae", solve, "q0", VECTORS),
     *argument("solve_dae", solve, "v0", FEW_VECTORS),
@@ -69,11 +70,9 @@ SOLVE = [
             ([0.5, 1.0 - 1e-16], ValueError, "must not come within rounding of the end", "give the end itself"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`t_eval=[0.2, 0.25]` with `step_size=0.1`",
         lambda: solve(t_eval=[0.2, 0.25], step_size=0.1),
-        ValueError,
         r"t_eval must hold multiples of step_size = 0.1.*0.25",
         "give times on the fixed grid, or leave step_size out",
     ),
@@ -90,11 +89,9 @@ SOLVE = [
             (["small", "small"], WRONG, "must be", "give positive tolerances"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`rtol=1e-20, atol=1e-20`",
         lambda: solve(rtol=1e-20, atol=1e-20),
-        ValueError,
         "rtol and atol must not both be below",
         "raise one of them to 1e-15 or more",
     ),
@@ -110,19 +107,15 @@ SOLVE = [
             (2.0, ValueError, "must not exceed the length of t_span, 1; given 2.0", "give a smaller step"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`step_size=0.1, first_step=0.1`",
         lambda: solve(step_size=0.1, first_step=0.1),
-        ValueError,
         "step_size is a constant step.*first_step",
         "give step_size alone",
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`step_size=0.1, max_step=0.1`",
         lambda: solve(step_size=0.1, max_step=0.1),
-        ValueError,
         "step_size is a constant step.*max_step",
         "give step_size alone",
     ),
@@ -149,21 +142,19 @@ SOLVE = [
             (5, TypeError, "must be a name .*given 5", "take a name or a method object"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`method=Newmark`, the class",
         lambda: solve(method=Newmark),
-        TypeError,
         "method must be a name .*or an object",
         "write Newmark()",
+        TypeError,
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`method=gauss(2)`, a tableau",
         lambda: solve(method=gauss(2)),
-        TypeError,
         "method must be a name .*or an object",
         "write RungeKutta(gauss(2))",
+        TypeError,
     ),
     *argument(
         "solve_dae",
@@ -174,37 +165,30 @@ SOLVE = [
             (1, TypeError, "must be True or False; given 1", "give True or leave it out"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`compiled=True` with an implicit method",
         lambda: solve(method="RadauIIA5", compiled=True),
-        ValueError,
         "compiled=True goes with 'auto', .*given method Radau IIA",
         "leave it out, or take a method that is named",
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`compiled=True` with `step_size` and the default method",
         lambda: solve(step_size=0.1, compiled=True),
-        ValueError,
         "compiled=True goes with .*given method auto with step_size",
         "name a method, or leave one of the two out",
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`compiled=True` where a callback branches on q",
         lambda: solve(pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0])), compiled=True),
-        ValueError,
         "compiled=True needs equations .*force of 'pendulum': it branches",
         "leave it out, or write the callback without `if`, `abs`, `max`",
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "a `Problem` as `system`",
         lambda: solve(linkage()),
-        TypeError,
         r"system must be a ConstrainedSystem.*problem\.system",
         "give problem.system",
+        TypeError,
     ),
     *argument(
         "solve_dae",
@@ -215,13 +199,12 @@ SOLVE = [
             ({"n_q": 2}, TypeError, "must be a ConstrainedSystem", "make one with ConstrainedSystem.from_python"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "the class `ConstrainedSystem` as `system`",
         lambda: solve(ConstrainedSystem),
-        TypeError,
         "system must be a ConstrainedSystem",
         "make one with ConstrainedSystem.from_python",
+        TypeError,
     ),
     *argument(
         "solve_dae",
@@ -241,19 +224,15 @@ SOLVE = [
             (1, TypeError, "must be True or False; given 1", "give True or False"),
         ],
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`Newmark(beta=1/6)` without `step_size`",
         lambda: solve(method=Newmark(beta=1.0 / 6.0)),
-        ValueError,
         "Newmark with beta = 0.166667.*has no error estimate",
         "give step_size, or take beta=1/4",
     ),
-    Case(
-        "solve_dae",
+    of_solve(
         "`Newmark(gamma=0.6)` without `step_size`",
         lambda: solve(method=Newmark(gamma=0.6)),
-        ValueError,
         "gamma = 0.6 has no error estimate",
         "give step_size, or take gamma=1/2",
     ),

@@ -3,7 +3,7 @@
 import sympy as sp
 from sympy.physics.mechanics import KanesMethod, Point, ReferenceFrame, dynamicsymbols
 
-from tests.bad_input.case import Case
+from tests.bad_input.case import Case, cases_of
 from twoloop.symbolic import from_lagrangian, from_matrices, from_method
 
 t = dynamicsymbols._t
@@ -39,6 +39,7 @@ def case(what, words, advice, error=ValueError, call=lagrangian, group="symbolic
 ONE_LIST = "give a list of expressions, each of which is zero"
 REAL = "write it with the functions that are listed"
 SMOOTH = "smooth it, or end the run by an event where it switches"
+of_mechanism = cases_of("symbolic.SymbolicMechanism")
 SYMBOLIC = [
     case(
         "V=m * g * h * y",
@@ -195,27 +196,21 @@ SYMBOLIC += [
         "method must be a LagrangesMethod, a KanesMethod or a System; given 'Kane'",
         "give the object itself; energies go to from_lagrangian",
     ),
-    Case(
-        "symbolic.SymbolicMechanism",
+    of_mechanism(
         "`with_parameters({'mass': 2.0})`",
         lambda: lagrangian().with_parameters({"mass": 2.0}),
-        ValueError,
         "parameters must be of m, g, L; given mass",
         "use the symbols, or their names",
     ),
-    Case(
-        "symbolic.SymbolicMechanism",
+    of_mechanism(
         "`problem(..., t_span=2.0)`",
         lambda: lagrangian().problem([1.0, 0.0], [0.0, 0.0], 2.0),
-        ValueError,
         r"t_span must have shape \(2,\)",
         "give (start, end)",
     ),
-    Case(
-        "symbolic.SymbolicMechanism",
+    of_mechanism(
         "`problem({'z': 1.0}, ...)`",
         lambda: lagrangian().problem({"z": 1.0}, [0.0, 0.0], (0.0, 1.0)),
-        ValueError,
         "q0 must name coordinates, x, y; given z",
         "use the coordinates, or their names",
     ),

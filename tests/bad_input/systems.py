@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.bad_input.case import HUGE, Case, argument, linkage
+from tests.bad_input.case import HUGE, argument, cases_of, linkage
 from twoloop import ConstrainedSystem, callback
 
 
@@ -25,6 +25,9 @@ def compiled(**changed):
 
 
 COUNT = "give the number of coordinates, an int"
+of_from_python = cases_of("ConstrainedSystem.from_python")
+of_compiled = cases_of("ConstrainedSystem")
+of_callback = cases_of("callback")
 SYSTEMS = [
     *argument(
         "ConstrainedSystem.from_python",
@@ -92,27 +95,22 @@ SYSTEMS = [
             (1.5, TypeError, "must be an int; given 1.5", "give an int of at least 0, or leave it out"),
         ],
     ),
-    Case(
-        "ConstrainedSystem.from_python",
+    of_from_python(
         "`force(t, v, q)`: arguments in another order",
         lambda: make(force=lambda t, v, q: np.zeros(2)),
-        TypeError,
         r"force is called as force\(t, q, v\); the function given takes \(t, v, q\)",
         "put them in the order named",
+        TypeError,
     ),
-    Case(
-        "ConstrainedSystem.from_python",
+    of_from_python(
         "`force_by_v` without `force_by_q`",
         lambda: make(force_by_v=lambda t, q, v: np.zeros((2, 2))),
-        ValueError,
         "force_by_v.* go with force_by_q",
         "give force_by_q too",
     ),
-    Case(
-        "ConstrainedSystem.from_python",
+    of_from_python(
         "`bandwidth` with a mass that is a function",
         lambda: make(bandwidth=1, mass=lambda t, q: np.eye(2)),
-        ValueError,
         "bandwidth needs a constant mass",
         "give the mass as an array",
     ),
@@ -143,44 +141,38 @@ SYSTEMS = [
         "bandwidth",
         [(2, ValueError, "needs a constant mass matrix", "give constant_mass=True where that is so")],
     ),
-    Case(
-        "ConstrainedSystem",
+    of_compiled(
         "a plain function as `force`",
         lambda: compiled(force=lambda t, q, v, p, Q: None),
-        TypeError,
         r"force must be compiled by @twoloop.callback\('force'\).*from_python",
         "decorate it with @callback, or use from_python",
+        TypeError,
     ),
-    Case(
-        "ConstrainedSystem",
+    of_compiled(
         "the callback of another kind as `force`",
         lambda: compiled(force=linkage().system.functions.constraint),
-        TypeError,
         r"force must be compiled by @twoloop.callback\('force'\)",
         "give the callback made for this kind",
+        TypeError,
     ),
-    Case(
-        "callback",
+    of_callback(
         '`@callback("friction")`',
         lambda: callback("friction"),
-        ValueError,
         "kind must be one of mass.*given 'friction'",
         "take one of the kinds named",
     ),
-    Case(
-        "callback",
+    of_callback(
         "`@callback` without a kind",
         lambda: callback(lambda t, q, v, p, Q: None),
-        TypeError,
         "the decorator needs the kind of callback",
         'write @callback("force")',
+        TypeError,
     ),
-    Case(
-        "callback",
+    of_callback(
         "a force with the arguments `(t, q, Q)`",
         lambda: callback("force")(lambda t, q, Q: None),
-        TypeError,
         r"declared as the callback 'force', whose arguments are \(t, q, v, p, Q\); it has \(t, q, Q\)",
         "take the arguments named",
+        TypeError,
     ),
 ]

@@ -11,6 +11,7 @@ from tests.mechanisms.motions import planar
 from twoloop import mechanisms
 
 CRANK, ROD = 0.5, 1.2
+
 # --- the motion, from the triangle
 
 
@@ -67,10 +68,3 @@ def driven_slider_crank(redundant):
         state=state,
         rank=9,
     )
-
-
-def driven_acceleration(t):
-    """Accelerations of the driven slider-crank."""
-    angle, rate, acceleration = drive(t)
-    _, u, w = kinematics(angle)
-    return u * acceleration + w * rate**2

@@ -1,48 +1,17 @@
-"""The cost of an evaluation grows like the length of a chain, up to 1000 rows."""
-
-import time
+"""Long chains: links, energy and counts. How programs of elimination grow: tests/kernels/test_factors.py."""
 
 import numpy as np
 import pytest
 
-from tests.general.chain import slack_chain
+from studies.work_precision.scaling import chain
 from twoloop import solve_dae
 
 
 def run_chain(n, steps=10):
     """A few steps of constant size, far below the shortest period, which is of the order of 1/n."""
-    system, q, v = slack_chain(n)
-    h = 0.02 / n
+    problem, h = chain(n, False), 0.02 / n
     options = {"method": "DOP853", "step_size": h, "check_derivatives": False}
-    return solve_dae(system, (0.0, steps * h), q, v, **options)
-
-
-def time_of_an_evaluation(n):
-    """The least of three runs, s."""
-    results = [run_chain(n) for _ in range(3)]
-    assert all(result.success for result in results), results[0].message
-    return min(result.stats.cpu_time / result.stats.n_evaluations for result in results)
-
-
-def time_to_fill(n):
-    """The time to write one dense C_q (n, 2n), as the callback does: the least of three, s."""
-    array, times = np.ones((n, 2 * n)), []
-    for _ in range(3):
-        start = time.process_time()
-        for _ in range(20):
-            array[:] = 0.0
-        times.append((time.process_time() - start) / 20)
-    return min(times)
-
-
-@pytest.mark.slow
-def test_an_evaluation_is_linear_in_the_length():
-    """A ratio, not a time: eight times the length may cost 16 times as much, where dense algebra costs 512 times.
-
-    The dense C_q that the callback fills is quadratic; four passes over it are allowed.
-    """
-    short, long = time_of_an_evaluation(125), time_of_an_evaluation(1000)
-    assert long < 16.0 * short + 4.0 * time_to_fill(1000)
+    return solve_dae(problem.system, (0.0, steps * h), problem.q0, problem.v0, **options)
 
 
 @pytest.mark.parametrize("n", [50, 200])
@@ -60,4 +29,4 @@ def test_as_many_evaluations_whatever_the_length():
     """Same steps, same loops: what is counted does not depend on the length."""
     short, long = run_chain(50).stats, run_chain(200).stats
     assert long.n_evaluations == short.n_evaluations
-    assert long.n_factorizations <= short.n_factorizations + 5
+    assert long.n_factorizations <= 1.1 * short.n_factorizations  # those of a few iterations more

@@ -9,14 +9,9 @@ from scipy.integrate import quad
 from tests.general import knife_edge
 from tests.general.faulty import without_inertia
 from tests.general.mechanism import G
-from tests.general.wrong_rows import ROWS, edge, slide
+from tests.general.wrong_rows import edge, slide
 from twoloop import solve_dae
 from twoloop.methods.presets import PRESETS
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_each_mistake_is_listed_once():
-    assert len({case.id for case in ROWS}) == len(ROWS)
 
 
 @pytest.mark.parametrize("method", PRESETS)

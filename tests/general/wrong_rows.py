@@ -5,13 +5,11 @@ Each is a case as in `tests/bad_input`.
 
 import numpy as np
 
-from tests.bad_input.case import HUGE, WRONG, Case, argument
+from tests.bad_input.case import HUGE, WRONG, argument, cases_of
 from tests.general import knife_edge
 from tests.general.faulty import parted_drives, parted_velocities, without_inertia
 from twoloop import ConstrainedSystem, RungeKutta, consistent_state, solve_dae
 from twoloop.methods.tableaux import gauss
-
-GROUP = "Rows and inertia"
 
 
 def edge(**changed):
@@ -33,8 +31,7 @@ def drift(mass):
     return solve_dae(without_inertia(mass), (0.0, 0.1), [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 
-def case(what, call, error, words, advice):
-    return Case(GROUP, what, call, error, words, advice)
+case = cases_of("Rows and inertia")
 
 
 def shape_cases():
@@ -46,23 +43,21 @@ def shape_cases():
             yield case(
                 f"`{kind}` returns an array of shape {np.shape(value)}",
                 lambda kind=kind, value=value: slide(edge(**{kind: lambda *arguments: value})),
-                ValueError,
                 rf"{kind} of system 'knife edge' must return an array of shape {words}.*returned shape {given}",
                 "return an array of the shape named",
             )
         yield case(
             f"`{kind}` returns NaN",
             lambda kind=kind, shape=shape: slide(edge(**{kind: lambda *arguments: np.full(shape, np.nan)})),
-            ValueError,
             f"{kind} of 'knife edge' returned values that are not finite",
             "find out where the NaN comes from",
         )
         yield case(
             f"`{kind}` returns None",
             lambda kind=kind: slide(edge(**{kind: lambda *arguments: None})),
-            TypeError,
             f"{kind} of system 'knife edge' must return a real array.*returned None",
             "return an array of real numbers",
+            TypeError,
         )
 
 
@@ -85,65 +80,59 @@ ROWS = [
     case(
         "`n_a=1` without `nonholonomic`",
         lambda: edge(nonholonomic=None, nonholonomic_gamma=None),
-        WRONG,
         "n_a = 1.*nonholonomic",
         "give nonholonomic(t, q), or leave n_a out",
+        WRONG,
     ),
     case(
         "`nonholonomic` without `n_a`",
         lambda: edge(n_a=0),
-        WRONG,
         "nonholonomic.*n_a",
         "give n_a, the number of its rows",
+        WRONG,
     ),
     case(
         "`nonholonomic_rate` without `nonholonomic`",
         lambda: edge(n_a=0, nonholonomic=None, nonholonomic_gamma=None, nonholonomic_rate=lambda t, q: np.zeros(0)),
-        WRONG,
         "nonholonomic_rate.*nonholonomic",
         "give nonholonomic(t, q) too",
+        WRONG,
     ),
     case(
         "`nonholonomic_gamma` without `nonholonomic`",
         lambda: edge(n_a=0, nonholonomic=None),
-        WRONG,
         "nonholonomic_gamma.*nonholonomic",
         "give nonholonomic(t, q) too",
-    ),
-    case(
-        "`n_c=1` without `constraint`",
-        lambda: edge(n_c=1),
         WRONG,
-        "constraint",
-        "give constraint(t, q), or n_c=0",
     ),
+    case("`n_c=1` without `constraint`", lambda: edge(n_c=1), "constraint", "give constraint(t, q), or n_c=0", WRONG),
     case(
         "`constraint` with `n_c=0`",
         lambda: edge(constraint=lambda t, q: np.zeros(1)),
-        WRONG,
         "constraint.*n_c",
         "give n_c, the number of its rows",
+        WRONG,
     ),
     case(
         "`jacobian` with `n_c=0`",
         lambda: edge(jacobian=lambda t, q: np.zeros((1, 3))),
-        WRONG,
         "jacobian.*(n_c|constraint)",
         "leave it out: non-holonomic rows have none",
+        WRONG,
     ),
     case(
         "`nonholonomic` with its arguments in another order",
         lambda: edge(nonholonomic=lambda q, t: np.zeros((1, 3))),
-        TypeError,
         r"nonholonomic is called as nonholonomic\(t, q\); the function given takes \(q, t\)",
         "name and order the arguments as they are called",
+        TypeError,
     ),
     case(
         "`nonholonomic` that is an array",
         lambda: edge(nonholonomic=np.zeros((1, 3))),
-        TypeError,
         "nonholonomic must be a function; given",
         "give nonholonomic(t, q)",
+        TypeError,
     ),
     # --- what the functions return
     *shape_cases(),
@@ -153,14 +142,12 @@ ROWS = [
             edge(nonholonomic_gamma=lambda t, q, v: -knife_edge.nonholonomic_gamma(t, q, v)),
             v0=[1.0, 0.0, knife_edge.SPIN],
         ),
-        ValueError,
         "nonholonomic_gamma of 'knife edge' is not .*entry 0 is",
         "correct the formula, or leave nonholonomic_gamma out",
     ),
     case(
         "`nonholonomic_gamma` that forgets how the rate changes",
         lambda: slide(edge(nonholonomic_rate=lambda t, q: np.array([-np.sin(t)]))),
-        ValueError,
         "nonholonomic_gamma of 'knife edge' is not .*entry 0 is",
         "correct the formula, or leave nonholonomic_gamma out",
     ),
@@ -168,28 +155,24 @@ ROWS = [
     case(
         "velocities across the blade",
         lambda: slide(v0=[0.0, 0.3, knife_edge.SPIN]),
-        ValueError,
         r"v0 is not consistent.*'knife edge'.*0\.3.*consistent_state",
         "project the guess with consistent_state",
     ),
     case(
         "rows that no velocity satisfies",
         lambda: solve_dae(parted_velocities(), (0.0, 0.1), [0.0, 0.0], [1.0, 0.0]),
-        ValueError,
         "(v0 is not consistent|contradict)",
         "correct one of the rows",
     ),
     case(
         "rows that no velocity satisfies, to be projected upon",
         lambda: consistent_state(parted_velocities(), 0.0, [0.0, 0.0], [1.0, 0.0]),
-        ValueError,
         r"(A v|velocit|contradict)",
         "correct one of the rows",
     ),
     case(
         "a row that follows from another but for its accelerations",
         lambda: drive(2),
-        ValueError,
         "'two drives' contradict one another at t = 0: row.s. .2. depend on the others .row 2 = 1 row 1",
         "correct one of the rows named",
     ),
@@ -197,21 +180,18 @@ ROWS = [
     case(
         "a coordinate without mass that no row holds",
         lambda: drift((1.0, 1.0, 0.0)),
-        ValueError,
         r"mass of 'drifter'.*coordinate\(?s?\)? .*2.*inertia|mass of 'drifter'.*inertia.*coordinate\(?s?\)? .*2",
         "give the coordinate a mass, or a row that holds it",
     ),
     case(
         "no mass in the only direction that the rows allow",
         lambda: drift((1.0, 0.0, 1.0)),
-        ValueError,
         r"mass of 'drifter'.*coordinate\(?s?\)? .*1.*inertia|mass of 'drifter'.*inertia.*coordinate\(?s?\)? .*1",
         "give the coordinate a mass, or a row that holds it",
     ),
     case(
         "a negative mass where the rows allow motion",
         lambda: drift((1.0, 1.0, -1.0)),
-        ValueError,
         "mass of 'drifter' must be positive definite",
         "correct the mass matrix",
     ),
@@ -219,8 +199,8 @@ ROWS = [
     case(
         "non-holonomic rows with `variables='momenta'`",
         lambda: slide(method=CANONICAL),
-        WRONG,
         "(momenta.*non-?holonomic|non-?holonomic.*momenta)",
         "take variables='velocities'",
+        WRONG,
     ),
 ]

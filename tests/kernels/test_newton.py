@@ -1,13 +1,23 @@
 """The outer loop by Newton's method: the same steps as sweeps make, and stiff problems that sweeps cannot make."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.problems import G, moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, violations, worst
-from twoloop import ConstrainedSystem, RungeKutta, solve_dae
+from tests.problems import (
+    SPRUNG_START,
+    G,
+    moving_pivot,
+    moving_pivot_state,
+    oblique_pendulum,
+    oblique_start,
+    sprung_pair,
+    violations,
+    worst,
+)
+from twoloop import RungeKutta, solve_dae
 from twoloop.mechanisms import four_bar, moderately_stiff_beam
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
@@ -18,30 +28,7 @@ TABLEAUX = {
 }
 
 
-@cache
-def stiff_spring(stiffness, damping=0.0):
-    """A mass on a rigid rod, and a second one on a stiff spring from the first: n_q = 4, one constraint."""
-
-    def force(t, q, v):
-        d, u = q[2:] - q[:2], v[2:] - v[:2]
-        length = np.sqrt(d[0] * d[0] + d[1] * d[1])
-        pull = (stiffness * (length - 1.0) + damping * (d[0] * u[0] + d[1] * u[1]) / length) / length
-        return np.array([pull * d[0], pull * d[1] - 9.81, -pull * d[0], -pull * d[1] - 9.81])
-
-    return ConstrainedSystem.from_python(
-        n_q=4,
-        n_c=1,
-        mass=np.eye(4),
-        force=force,
-        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
-        gamma=lambda t, q, v: np.array([-(v[0] * v[0] + v[1] * v[1])]),
-        compile=True,
-        name="stiff spring",
-    )
-
-
-SPRING_START = (np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4))
+stiff_spring = cache(partial(sprung_pair, compile=True))
 SPRING_TIMES = np.linspace(0.0, 1.0, 5)
 
 
@@ -83,7 +70,7 @@ def test_a_stiff_spring(name):
     errors, evaluations = [], []
     for tol in (1e-4, 1e-6, 1e-8):
         method = RungeKutta(TABLEAUX[name], outer="newton")
-        result = solve_dae(stiff_spring(1e6), (0.0, 1.0), *SPRING_START, method, tol, tol, t_eval=SPRING_TIMES)
+        result = solve_dae(stiff_spring(1e6), (0.0, 1.0), *SPRUNG_START, method, tol, tol, t_eval=SPRING_TIMES)
         assert result.success, result.message
         assert max(violations(stiff_spring(1e6), result)) < 1e-12
         errors.append(worst(result.q, truth))
@@ -96,7 +83,7 @@ def test_stiffness_does_not_hold_radau_back():
     # 1000 times the frequency, and not ten times the steps
     counts = {}
     for stiffness in (1e2, 1e8):
-        result = solve_dae(stiff_spring(stiffness), (0.0, 1.0), *SPRING_START, "RadauIIA5", 1e-4, 1e-4)
+        result = solve_dae(stiff_spring(stiffness), (0.0, 1.0), *SPRUNG_START, "RadauIIA5", 1e-4, 1e-4)
         assert result.success
         counts[stiffness] = result.stats.n_accepted
     assert counts[1e8] < 20 * counts[1e2]
@@ -104,9 +91,9 @@ def test_stiffness_does_not_hold_radau_back():
 
 def test_damping_enters_the_derivatives():
     # overdamped: without J_v Newton's method could not converge at these steps
-    system = stiff_spring(1e4, 1e4)
-    result = solve_dae(system, (0.0, 1.0), *SPRING_START, RungeKutta(radau_iia(3), outer="newton"), step_size=0.005)
-    fine = solve_dae(system, (0.0, 1.0), *SPRING_START, RungeKutta(radau_iia(3), outer="newton"), step_size=0.001)
+    system = stiff_spring(1e4, 1.0)
+    result = solve_dae(system, (0.0, 1.0), *SPRUNG_START, RungeKutta(radau_iia(3), outer="newton"), step_size=0.005)
+    fine = solve_dae(system, (0.0, 1.0), *SPRUNG_START, RungeKutta(radau_iia(3), outer="newton"), step_size=0.001)
     assert result.success and fine.success
     assert worst(result.q[:, -1], fine.q[:, -1]) < 1e-4
     assert result.stats.n_outer < 10 * result.stats.n_accepted
@@ -160,6 +147,6 @@ def test_auto_does_not_crawl_on_the_stiff_beam():
 
 def test_auto_takes_newton_where_a_fixed_step_does_not_converge_by_sweeps():
     method = {outer: RungeKutta(radau_iia(3), outer=outer) for outer in ("fixed-point", "auto")}
-    run = {o: solve_dae(stiff_spring(1e8), (0.0, 0.1), *SPRING_START, m, step_size=1e-3) for o, m in method.items()}
+    run = {o: solve_dae(stiff_spring(1e8), (0.0, 0.1), *SPRUNG_START, m, step_size=1e-3) for o, m in method.items()}
     assert not run["fixed-point"].success
     assert run["auto"].success, run["auto"].message

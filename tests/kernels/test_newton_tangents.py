@@ -199,26 +199,6 @@ def test_tangent_saves_evaluations_on_the_stiff_beam():
     assert spent[0].n_evaluations < 0.7 * spent[1].n_evaluations
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({**TANGENTS, "force_by_q": lambda t, q, v: -spring_by_q(t, q, v)}, r"force_by_q of 'spring' is not the deri"),
-        ({**TANGENTS, "force_by_v": lambda t, q, v: 2.0 * spring_by_v(t, q, v)}, "force_by_v of 'spring' is not the d"),
-        ({"force_by_q": spring_by_q}, "force_by_v of 'spring' is not.*give force_by_v: beside force_by_q the force"),
-        ({**TANGENTS, "reaction_by_q": lambda t, q, lam: -rod_by_q(t, q, lam)}, "reaction_by_q of 'spring' is not"),
-        ({"force_by_v": spring_by_v}, "force_by_v and reaction_by_q go with force_by_q, which is not given"),
-        (
-            {**TANGENTS, "force_by_q": lambda t, q, v: np.eye(3)},
-            r"force_by_q .* shape \(20, 20\).*returned shape \(15, 15\)",
-        ),
-    ],
-    ids=["sign", "twice", "forgotten", "sign of the reaction", "alone", "shape"],
-)
-def test_wrong_tangents_are_refused(given, words):
-    with pytest.raises(ValueError, match=words):
-        solve_dae(spring(**given), (0.0, 0.1), *START, NEWTON)
-
-
 def test_the_trend_saves_rejections(monkeypatch):
     problem = very_flexible_beam()
     rejected = {}

@@ -88,28 +88,12 @@ def test_the_beam_is_drawn_as_long_as_it_is():
     ("arguments", "error", "words"),
     [
         ((np.zeros(3), [(0, 1)]), TypeError, "points must be a function of q"),
-        ((np.zeros_like, [0, 1]), TypeError, "bars must be pairs of points"),
         ((np.zeros_like, [(0, 1)], ["tip"]), TypeError, "traces points, by their numbers"),
     ],
 )
 def test_wrong_drawings(arguments, error, words):
     with pytest.raises(error, match=words):
         Drawing(*arguments)
-
-
-def test_a_drawing_is_checked_with_its_problem():
-    def problem(drawing, coordinates=()):
-        given = mechanisms.pendulum()
-        return mechanisms.Problem(
-            "x", given.system, given.q0, given.v0, (0.0, 1.0), given.energy, coordinates=coordinates, drawing=drawing
-        )
-
-    with pytest.raises(ValueError, match=r"shape \(n_points, 2 or 3\) for q of shape \(2,\); .* of shape \(2,\)"):
-        problem(Drawing(lambda q: q, [(0, 1)]))
-    with pytest.raises(ValueError, match="must name points from 0 to 0; they name 1"):
-        problem(Drawing(lambda q: q[None], [(0, 1)]))
-    with pytest.raises(ValueError, match=r"coordinates must be n_q = 2 different names, or none; given \('x', 'x'\)"):
-        problem(None, ("x", "x"))
 
 
 def test_names_and_units():

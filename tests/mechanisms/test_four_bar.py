@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from references.paper.four_bar_minimal import MinimalFourBar
-from tests.problems import one_angle, slope, violations, worst
+from tests.problems import one_angle, run, slope, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -122,37 +122,21 @@ def test_reference_is_the_motion_of_an_equation_in_one_angle(default_four_bar):
     assert worst(v[:, 1], reference.v) < 1e-11
 
 
-def test_reference_period_is_the_one_at_which_the_linkage_rests_again(default_four_bar):
-    period = default_four_bar.reference.period
-    q, v = one_angle((1.0, 2.0, 1.5), 3.0, 0.0, -1)([0.5 * period, period])
-    assert np.abs(v).max() < 1e-10
-    assert worst(q[:, 1], default_four_bar.q0) < 1e-11
-    assert worst(q[:, 0], default_four_bar.q0) > 0.1
-    assert abs(MinimalFourBar.from_parameters(default_four_bar.parameters).period - period) < 1e-12
-
-
 # the embedded estimate of RadauIIA5 is of order 3, and its steps continue unextrapolated
 TIGHT = {"SunRadau5": 1e-10, "Gauss6": 1e-10, "Gauss12": 1e-10, "RadauIIA5": 1e-11}
 
 
+@pytest.mark.parametrize("linkage", ["default_four_bar", "collinear_four_bar"])
 @pytest.mark.parametrize("method", TIGHT)
-def test_default_linkage_agrees_with_its_reference_to_nine_digits(default_four_bar, method):
-    problem, tol = default_four_bar, TIGHT[method]
-    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method=method, rtol=tol, atol=tol)
+def test_linkages_agree_with_the_minimal_form_to_nine_digits(linkage, method, request):
+    problem, times = request.getfixturevalue(linkage), np.linspace(0.0, 10.0, 41)
+    result = run(problem, method=method, rtol=TIGHT[method], atol=TIGHT[method], t_eval=times)
     assert result.success
-    assert worst(result.q[:, -1], problem.reference.q) < 5e-10
-    assert worst(result.v[:, -1], problem.reference.v) < 1e-9
-
-
-@pytest.mark.parametrize("method", TIGHT)
-def test_second_geometry_agrees_with_the_minimal_form_to_nine_digits(collinear_four_bar, method):
-    problem = collinear_four_bar
-    times = np.linspace(0.0, 10.0, 41)
-    tol = TIGHT[method]
-    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, method, tol, tol, t_eval=times)
     q, v = MinimalFourBar.from_parameters(problem.parameters).states(times)
-    assert worst(result.q, q) < 1e-9
-    assert worst(result.v, v) < 5e-9
+    assert worst(result.q, q) < 1e-9 and worst(result.v, v) < 5e-9
+    if problem.reference is not None:
+        assert worst(result.q[:, -1], problem.reference.q) < 5e-10
+        assert worst(result.v[:, -1], problem.reference.v) < 1e-9
 
 
 def test_default_linkage_for_100_s(default_four_bar):
@@ -172,13 +156,6 @@ def test_default_linkage_for_100_s(default_four_bar):
         ({"lengths": (1.0, 1.0, 0.5), "ground": 5.0}, ValueError, "cannot be assembled.*4.5 m.*between 0 and 2"),
         ({"lengths": (3.0, 1.0, 0.5), "ground": 1.0}, ValueError, "cannot be assembled.*0.5 m.*between 2 and 4"),
         ({"lengths": (1.0, 1.0, 1.0), "ground": 3.0}, ValueError, "cannot be assembled.*ends excluded"),
-        ({"lengths": (1.0, -1.0, 1.0)}, ValueError, "lengths must be positive.*-1"),
-        ({"lengths": (1.0, 2.0)}, ValueError, r"lengths must have shape \(3,\)"),
-        ({"lengths": "long"}, TypeError, "lengths must be"),
-        ({"ground": 0.0}, ValueError, "ground must be positive"),
-        ({"ground": math.nan}, ValueError, "ground must be finite"),
-        ({"theta3": math.inf}, ValueError, "theta3 must be finite"),
-        ({"branch": 0}, ValueError, r"branch must be 1 .*above.*-1 .*below.*given 0"),
     ],
 )
 def test_impossible_linkages_say_why(arguments, error, words):

@@ -13,6 +13,7 @@ from references.equations.ode import ode_result
 from references.equations.straight_line import Program, Value, program_of, straight_line
 from references.sundials.cvode_c import solve_cvode_c
 from studies.validation.study import MAKE
+from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, Statistics, Status
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import double_pendulum, four_bar, heavy_top, n_four_bar, very_flexible_beam
@@ -117,11 +118,6 @@ def test_a_number_of_steps_that_is_none_is_named():
         solve_collocation(*start, 0)
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = 1.0
-
-
 @callback("force")
 def endless(t, q, v, p, Q):
     Q[1] = -9.81 / (1.0 - t) ** 2
@@ -132,29 +128,11 @@ def branching(t, q, v, p, Q):
     Q[1] = -9.81 if t < 1.0 else -4.9
 
 
-@callback("constraint")
-def constraint(t, q, p, C):
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
-
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
-
-
-@callback("gamma")
-def gamma(t, q, v, p, Qd):
-    Qd[0] = -v[0] * v[0] - v[1] * v[1]
-
-
-def pendulum(force):
-    functions = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian, "gamma": gamma}
-    return ConstrainedSystem(n_q=2, n_c=1, name="pendulum", **functions)
-
-
 def test_a_failure_of_cvode_is_a_result_with_what_came_before_it():
     pytest.importorskip("sksundae")
-    result = solve_cvode_c(pendulum(endless), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], t_eval=[0.0, 0.5, 1.5])
+    result = solve_cvode_c(
+        ConstrainedSystem(**{**PENDULUM, "force": endless}), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], t_eval=[0.0, 0.5, 1.5]
+    )
     assert result.status is Status.SOLVER_FAILED and "CVODE failed after t = " in result.message
     assert result.t.tolist() == [0.0, 0.5] and np.isfinite(result.q).all()
 
@@ -162,4 +140,4 @@ def test_a_failure_of_cvode_is_a_result_with_what_came_before_it():
 def test_callbacks_that_branch_are_refused():
     pytest.importorskip("sksundae")
     with pytest.raises(ValueError, match="force of 'pendulum': it branches on"):
-        solve_cvode_c(pendulum(branching), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0])
+        solve_cvode_c(ConstrainedSystem(**{**PENDULUM, "force": branching}), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0])

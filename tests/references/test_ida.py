@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from references.sundials.ida import FORMS, solve_ida
-from tests.problems import pendulum, violations
+from tests.problems import violations
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -40,11 +40,3 @@ def test_result_has_our_shapes_and_signs(form):
     ours = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "Gauss6", 1e-10, 1e-10)
     for mine, theirs in ((ours.q, result.q), (ours.v, result.v), (ours.a, result.a), (ours.lam, result.lam)):
         assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-3
-
-
-def test_differenced_gamma_gives_the_same_motion():
-    given, differenced = (
-        solve_ida(pendulum(**kwargs), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], rtol=1e-9, atol=1e-9)
-        for kwargs in ({}, {"gamma": False})
-    )
-    assert np.abs(given.q[:, -1] - differenced.q[:, -1]).max() < 1e-6
