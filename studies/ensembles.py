@@ -234,7 +234,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             line = own.groupby("tol")[["error_worst", "run_s"]].median()
             axes.plot(line["error_worst"], 1e6 * line["run_s"], "o-", color=colors[way], label=way, ms=3.5)
         axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
-        axes.invert_xaxis()
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of a run (µs)")
     shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}

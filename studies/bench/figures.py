@@ -51,7 +51,7 @@ YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7
 VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default, and of Taylor and others
 
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
-    "DOP853 (two-loop)": (RED, "o"),
+    "DOP853 (twoloop)": (RED, "o"),
     "Adams": (BLACK, "o"),
     "auto": (VIOLET, "s"),
     "Taylor": (MAGENTA, "D"),

@@ -38,7 +38,7 @@ class ReferenceMotion:
 def make_reference(problem: Problem, t_end: float, time_limit: float | None = None) -> ReferenceMotion:
     """Integrate by two unlike methods; their largest difference over the run, positions, is the floor.
 
-    Tried first is Gauss16 (two-loop) beside SciPy's DOP853 on the projected index-1 equations, at 1e-13, or, where the
+    Tried first is Gauss16 (twoloop) beside SciPy's DOP853 on the projected index-1 equations, at 1e-13, or, where the
     mass matrix is singular, as with Euler parameters, which these do not take, beside DOP853 of two-loop; where either
     fails, RadauIIA5 (two-loop, Newton's method) beside IDA on the stabilised index-1 form, at 1e-11. The first of a
     pair is stored at four instants in each step of the second, between which the quintic in q, v and a is used.
@@ -59,9 +59,9 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
     span, start = (0.0, t_end), (problem.q0, problem.v0)
     said, smooth = [], False
     for name, second, method, tolerance in (
-        ("Gauss16 (two-loop) and SciPy's DOP853, projected", _explicit, "Gauss16", TIGHT),
+        ("Gauss16 (twoloop) and SciPy's DOP853, projected", _explicit, "Gauss16", TIGHT),
         ("Gauss16 and DOP853 (both two-loop)", _own_explicit, "Gauss16", TIGHT),
-        ("RadauIIA5 (two-loop) and IDA, stabilised", _ida, "RadauIIA5", STIFF),
+        ("RadauIIA5 (twoloop) and IDA, stabilised", _ida, "RadauIIA5", STIFF),
     ):
         if second is _own_explicit and smooth:
             continue

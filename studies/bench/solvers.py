@@ -44,7 +44,7 @@ IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions
 IDA_C_STATES = "IDA from C, q and v tested"
 CANONICAL = "Gauss6, momenta, symmetric"
 ADAMS, TAYLOR = "Adams", "Taylor"
-OWN_EXPLICIT, OWN_BDF = "DOP853 (two-loop)", "BDF"  # presets; the other lines of the first name are SciPy's
+OWN_EXPLICIT, OWN_BDF = "DOP853 (twoloop)", "BDF"  # presets; the other lines of the first name are SciPy's
 DEFAULT = "auto"  # of solve_dae
 # with code made for the mechanism, and the method of each
 COMPILED = {f"{method}, compiled": method for method in (DEFAULT, TAYLOR, ADAMS, "DOP853")}

@@ -9,7 +9,7 @@ from studies.bench.solvers import DEFAULT
 from twoloop.methods.presets import PRESETS
 
 _UNDECIDED = "the default: no solver is told apart from the others"
-SUFFIX = " (two-loop)"  # of our solvers, in the findings of honesty
+SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
 KINDS = {  # tags of mechanisms, and what a user calls them
     "redundant": "redundant constraints",
     "spatial": "spatial",
@@ -103,7 +103,7 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
     parts = [f"{call(line['solver'])}, which pays {_from_run(line)}" for line in best if line is not None]
     if len(parts) > 1:
         parts[1] = f"of ours {parts[1]}"
-    return ["; ".join(parts) + " (at one tolerance)"] if parts else []
+    return ["; ".join(parts) + " (at an error of 1e-8)"] if parts else []
 
 
 def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:

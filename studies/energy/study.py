@@ -36,7 +36,7 @@ from studies.energy.runs import (
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
-DRAWN = (DEFAULT, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
+DRAWN = (DEFAULT, OWN_CODE, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:

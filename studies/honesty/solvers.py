@@ -22,7 +22,7 @@ OF_FORCES = (  # further ones of ours under sharp forces: all presets but the pa
     *("auto, compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14", "Gauss16", "SunRadau5"),
     *("RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
 )
-OURS = " (two-loop)"
+OURS = " (twoloop)"
 DEFAULT, DEFAULT_COMPILED = f"auto{OURS}", f"auto, compiled{OURS}"
 QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
 LIMITED = ", max_step"  # of others that take no step longer than ours do by default

@@ -199,7 +199,14 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
     theirs = [line for line in found["held_out"]["solvers"] if not line["solver"].endswith((OURS, LIMITED))]
-    counted = [{"solver": line["solver"], "n": line["n"], "wrong": line[SILENT] + line[HANG]} for line in theirs]
+    gross = held[held["outcome"].isin((SILENT, HANG)) & ~(held["error"].astype(float) <= EXACT)][
+        "solver"
+    ].value_counts()
+    counted = [
+        {"solver": name, "n": line["n"], "wrong": line[SILENT] + line[HANG], "gross": int(gross.get(name, 0))}
+        for line in theirs
+        for name in [line["solver"]]
+    ]
     found["held_out"]["by_solver"] = sorted(counted, key=lambda line: -line["wrong"])
     return found | {"exact": EXACT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
 

@@ -265,12 +265,12 @@ def in_options() -> Iterator[Fault]:
     plant = _changed(methods.Newmark, "plan", swapped)
     yield Fault("beta and gamma of Newmark swapped", "options", plant, (orders,))
     for name, owner, solver, change in (
-        ("exponent of the error 1 in place of 1/8", DOP853, "DOP853 (two-loop)", {"exponent": 1.0}),
-        ("exponent of the error with the other sign", DOP853, "DOP853 (two-loop)", {"exponent": -0.125}),
+        ("exponent of the error 1 in place of 1/8", DOP853, "DOP853 (twoloop)", {"exponent": 1.0}),
+        ("exponent of the error with the other sign", DOP853, "DOP853 (twoloop)", {"exponent": -0.125}),
         ("exponent of the error 1 in place of 1/6", methods.RungeKutta, "RadauIIA9", {"exponent": 1.0}),
         ("steps that never grow", methods.RungeKutta, "Gauss12", {"factor_max": 1.0}),
-        ("a safety factor of 9", DOP853, "DOP853 (two-loop)", {"safety": 9.0}),
-        ("a safety factor of 0.09", DOP853, "DOP853 (two-loop)", {"safety": 0.09}),
+        ("a safety factor of 9", DOP853, "DOP853 (twoloop)", {"safety": 9.0}),
+        ("a safety factor of 0.09", DOP853, "DOP853 (twoloop)", {"safety": 0.09}),
     ):
         yield Fault(name, "options", planned(owner, **change), problem=sound, solver=solver)
     original = solvers.solve_dae

@@ -34,7 +34,7 @@ DRIFT = 1e-7  # of the energy, over the largest kinetic energy
 KEPT = 1e-8  # largest residual of a constraint that is kept, in position and velocity; of accelerations 1e-5
 MOST_EVALUATIONS = {  # about 1.4 times what sound runs take: too many are a fault of the step-size control
     "A01 pendulum": {TRACING: 2500},
-    "Andrews' squeezing mechanism": {"Gauss12": 7900, "RadauIIA9": 4700, "DOP853 (two-loop)": 3100},
+    "Andrews' squeezing mechanism": {"Gauss12": 7900, "RadauIIA9": 4700, "DOP853 (twoloop)": 3100},
     "double pendulum": {"Gauss12": 9300, "BDF": 7400, SCIPY: 2200},
     "driven crank": {"Gauss12": 3800},
     "projection pendulum": {"Gauss12": 96_000},

@@ -21,6 +21,7 @@ OF_FEATURES = (  # the methods that the grid of features is made of
     "ESDIRK4",
 )
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+LARGE = 1e-2  # m or rad: an error that a user would not expect at the loosest tolerance, though it counts as right
 SEED, N_MECHANISMS = 25, 144  # every other one with friction: about 3,000 runs
 TIME_LIMIT = 10.0  # s
 SHARP = "sharp"  # group of these rows
@@ -85,6 +86,9 @@ def counts(rows: pd.DataFrame) -> dict[str, Any]:
 
     found: dict[str, Any] = of(rows) | {"n_mechanisms": len(rows.groupby(["what", "name", "value"], dropna=False))}
     found["methods"] = [{"method": str(name)} | of(own) for name, own in rows.groupby("method", sort=False)]
+    loose = rows[(rows["tol"] == max(TOLERANCES)) & (rows["outcome"] == RIGHT)]
+    n_loose = int((loose["error"].astype(float) > LARGE).sum())
+    found["loose"] = {"tolerance": max(TOLERANCES), "error": LARGE, "n": n_loose}
     found["families"] = {str(family): len(own) for family, own in silent.groupby("what")}
     return found
 

@@ -284,6 +284,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found[f"n_{name}"] = {"ours": int((which & ours).sum()), "others": int((which & ~ours).sum())}
     given = [line for line in wrong if line["family"] != "two-loop" and line["solver"] != IDA_C]
     found["n_singular"] = sum(line["case"] in singular for line in given)
+    elsewhere = [line["tol"] for line in wrong if line["family"] != "two-loop" and line["case"] not in singular]
+    found["wrong_elsewhere"] = {"n": len(elsewhere), "tightest": min(elsewhere, default=None)}
     stopped, sides = rows["status"].eq("TIME_LIMIT"), {"ours": ours, "python": rows["called_from"] == "Python"}
     found["n_stopped"] = {side: [int(stopped[which].sum()), int(which.sum())] for side, which in sides.items()}
     return found | {"time_limit": TIME_LIMIT}
@@ -321,7 +323,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     axes.grid(False)
     n_own = sum(CATALOGUE[name].family == "two-loop" for name in solvers)
     axes.axvline(n_own - 0.5, color="white", linewidth=3.0)
-    axes.set_title(f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: two-loop, right: others")
+    axes.set_title(f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: ours, right: others")
     figure.colorbar(image, ax=axes, label="decimals")
     return {"validation": figure}
 

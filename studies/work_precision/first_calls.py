@@ -27,6 +27,7 @@ import numpy as np
 import pandas as pd
 
 from references.driver import cpu_time, user_call
+from studies.bench import tables
 from studies.bench.cli import ROOT
 from studies.bench.collector import REPEATS, Run, attempt, timed
 from studies.bench.end_states import case_of
@@ -45,7 +46,7 @@ MECHANISMS = {  # and how each is made
     "heavy top": "heavy_top",
 }
 QUICK = (DEFAULT, "auto, compiled")
-TOLERANCE = 1e-8
+TOLERANCE = ERROR = 1e-8  # of the calls in processes of their own; of the calls that are laid side by side, m or rad
 TIMES = ("first_call_s", "call_s", "call_q1", "call_q3")
 LIMIT = 120.0  # s of CPU of a call
 EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a folder of caches
@@ -123,10 +124,20 @@ def pays_from(line: Any, default: Any) -> float | None:
     It pays only where later calls are cheaper: three quarters of their repetitions below three quarters of the
     default's. A first call is measured once, so that a shorter one alone says nothing.
     """
-    if line["call_q3"] >= default["call_q1"]:
+    if not line["call_q3"] < default["call_q1"]:  # NaN: the error was not reached
         return None
     saved, built = default["call_s"] - line["call_s"], line["first_call_s"] - default["first_call_s"]
     return 1.0 if built < 0.0 else 2.0 + math.floor(built / saved)
+
+
+def at_error(rows: pd.DataFrame, everywhere: pd.DataFrame) -> pd.DataFrame:
+    """These rows with the later calls that have an error of ERROR, by the medians of every mechanism; NaN: none has."""
+    costs = ["call_s", "call_q1", "call_q3"]
+    ranked = [tables.ranking(own, ERROR).assign(case=case) for case, own in everywhere.groupby("case", sort=False)]
+    if not ranked:
+        return rows
+    known = pd.concat(ranked)[["case", "solver", *costs]]
+    return rows.drop(columns=costs).merge(known, how="left", on=["case", "solver"])
 
 
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -138,8 +149,9 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     found = []
     for solver, own in told.groupby("solver", sort=False):
         tol = float(own["tol"].iloc[0])
-        line: dict[str, Any] = {"solver": solver, "tol": tol, "n": len(own), "pays": [], "never": 0}
-        line |= {what: float(own[what].median()) for what in ("first_call_s", "call_s")}
+        line: dict[str, Any] = {"solver": solver, "tol": tol, "error": ERROR, "n": len(own), "pays": [], "never": 0}
+        line["first_call_s"] = float(own["first_call_s"].median())
+        line["call_s"] = float(own["call_s"].median()) if own["call_s"].notna().any() else None
         for _, row in own[own["case"].isin(default.index)].iterrows():
             pays = None if solver == DEFAULT else pays_from(row, default.loc[row["case"]])
             line["pays"] += [] if pays is None else [pays]

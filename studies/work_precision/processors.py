@@ -38,7 +38,8 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
     """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
-    made_on = rows.groupby("case")["processor"].first()  # a mechanism is measured on one
+    made_on = rows.groupby("case")["processor"].first()  # a mechanism is measured on one, at one commit
+    made_at = rows.groupby("case")["commit"].first() if "commit" in rows else pd.Series(dtype=str)
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
@@ -47,7 +48,8 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
         for case, error, standing in found:
             for who, at in standing.items():
                 if at["verdict"] in ("ahead", "behind", "undecided"):
-                    line = {"processor": made_on[case], "commit": commit[1] if commit else ""}
+                    at_commit = made_at.get(case) or (commit[1] if commit else "")
+                    line = {"processor": made_on[case], "commit": at_commit}
                     line |= {"time": time, "case": case, "error": error}
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
     return pd.DataFrame(lines, columns=["processor", "commit", "time", *PLACE, "ratio", "verdict"])
@@ -90,14 +92,23 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
                 continue
             turned = both[both[["verdict_one", "verdict_other"]].apply(lambda x: set(x) == {"ahead", "behind"}, axis=1)]
             apart = np.exp(np.abs(np.log(both["ratio_one"] / both["ratio_other"])))
+            furthest = both.loc[apart.idxmax()]
             line = {
                 "processors": [one, other],
-                "commits": [str(side["commit"].iloc[0]) for side in sides],
+                "same_code": bool((both["commit_one"] == both["commit_other"]).all()),
                 "time": time,
                 "n": len(both),
                 "turned": turned[PLACE].to_dict("records"),
             }
-            found.append(line | {"apart": float(apart.median()), "most": float(apart.max())})
+            found.append(
+                line
+                | {
+                    "apart": float(apart.median()),
+                    "nine_tenths": float(apart.quantile(0.9)),
+                    "most": float(apart.max()),
+                }
+                | {"most_at": {"case": str(furthest["case"]), "error": float(furthest["error"])}}
+            )
             break
     return found
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, row_of
@@ -151,7 +152,8 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
     findings |= {"fitted": scaling.FITTED, "rigid": scaling.RIGID}
-    findings |= {"first_calls": first_calls.findings_of(part(rows, first_calls.GROUP))}
+    findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
+    findings["unrolled"] = LARGEST_UNROLLED
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
     findings["measured"] = measured_on(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}

@@ -116,3 +116,18 @@ def test_other_mechanisms_are_refused():
 def test_a_four_bar_all_of_whose_angles_come_to_dead_centres_is_refused():
     with pytest.raises(NoMinimalCoordinates, match="dead centre"):
         minimal(mechanisms.four_bar((0.894, 1.13, 0.659), 2.08, -0.717))
+
+
+@pytest.mark.parametrize(("beside", "right"), [(0.0, False), (0.01, True)])
+def test_heyoka_at_order_8_has_no_last_terms_of_a_pendulum_released_horizontally(beside, right):
+    """There the angle has powers 2, 6, 10, ... of t alone, and its rate 1, 5, 9, ...: reports/work_precision.md."""
+    heyoka = pytest.importorskip("heyoka")
+    angle, rate = heyoka.make_vars("angle", "rate")
+    start = [0.5 * math.pi + beside, 0.0]
+    equations = [(angle, rate), (rate, -9.81 * heyoka.sin(angle))]
+    integrator = heyoka.taylor_adaptive(equations, start, tol=1e-6)
+    integrator.propagate_until(10.0)
+    known = solve_ivp(lambda t, y: (y[1], -9.81 * math.sin(y[0])), (0.0, 10.0), start, "DOP853", rtol=1e-12, atol=1e-12)
+    assert integrator.order == 8
+    off = float(np.abs(integrator.state - known.y[:, -1]).max())
+    assert (off < 1e-4) is right

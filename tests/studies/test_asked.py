@@ -124,7 +124,9 @@ def test_how_many_rivals_could_be_put_is_counted():
     assert rivals.put(every)["least"] == 5
     text = render("against", {}, {}, put=found, names="heyoka")
     assert text.startswith("the rivals that our adapters can run on each mechanism (heyoka; ")
-    assert "all 5 on 1 of 3 mechanisms, at least 0 on the others." in text and text.endswith("by at least 5 %\n")
+    assert "of 5, all on 1 of the 3 mechanisms and at least 0 on each of the others." in text and text.endswith(
+        "by at least 5 %\n"
+    )
     assert render("against", {}, {}, put=rivals.put(every), names="heyoka").startswith("all 5 rivals")
 
 

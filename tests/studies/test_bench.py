@@ -323,7 +323,7 @@ def test_the_quintic_is_exact_on_polynomials_of_degree_5():
 
 
 def test_foreign_solvers_run_any_mechanism_or_say_why_not(kept):
-    names = ("Exudyn, GeneralizedAlpha", "IDA from C, stabilised", "DOP853 (two-loop)")
+    names = ("Exudyn, GeneralizedAlpha", "IDA from C, stabilised", "DOP853 (twoloop)")
     with kept:
         rows = collect(
             [Run(case(), CATALOGUE[name], CATALOGUE[name].grid(case())[1], repeats=1) for name in names], kept

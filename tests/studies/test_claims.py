@@ -93,7 +93,7 @@ def beam():
                 for name in (NEWMARK, QUARTER)
                 for tol, error, cpu in ((1e-5, 1e-2, 0.2), (1e-9, 1e-5, 1.6))
             ),
-            *((name, 1e-1, 1e-6, 0.05) for name in ("DOP853, projected", "DOP853 (two-loop)", "SunRadau5")),
+            *((name, 1e-1, 1e-6, 0.05) for name in ("DOP853, projected", "DOP853 (twoloop)", "SunRadau5")),
             ("TRBDF2", 1e-1, 5e-3, 0.03 if slow > 1.0 else 0.06),
         ):
             row = {"group": "run", "case": case, "solver": solver, "tol": tol, "error_tip": error, "call_s": cpu * slow}

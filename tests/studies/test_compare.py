@@ -14,7 +14,7 @@ from twoloop.mechanisms import Problem
 
 CODE = (ROOT / "docs" / "compare.md").read_text().split("```python\n")[1].split("```")[0]
 PLAIN = CODE.replace("compile=True", "compile=False")  # machine code takes longer to make than all else here
-SOLVERS = ("DOP853 (two-loop)", "DOP853, projected", "Exudyn, GeneralizedAlpha")
+SOLVERS = ("DOP853 (twoloop)", "DOP853, projected", "Exudyn, GeneralizedAlpha")
 
 
 @pytest.fixture

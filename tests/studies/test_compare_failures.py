@@ -57,13 +57,13 @@ def compared(path, name, *words):
 
 
 def test_euler_parameters(mechanisms, capsys):
-    solvers = ["DOP853 (two-loop)", "DOP853, projected", "LSODA, index 1"]
+    solvers = ["DOP853 (twoloop)", "DOP853, projected", "LSODA, index 1"]
     text, rows = compared(mechanisms, "top", "--t-end", "0.02", "--solvers", *solvers)
     own = rows[rows["solver"] == solvers[0]]
     assert set(own["status"]) == {"REACHED_END"} and own["error_q"].max() < 1e-2 and own["energy"].abs().max() > 0.0
     others = rows[rows["solver"] != solvers[0]]
     assert set(others["status"]) == {"REACHED_END"} and others["error_q"].max() < 1e-2
-    assert "DOP853, projected" in text and "both two-loop" not in text and "| DOP853 (two-loop) |" in text
+    assert "DOP853, projected" in text and "both two-loop" not in text and "| DOP853 (twoloop) |" in text
     said = capsys.readouterr().out
     assert "making the reference of 'heavy top' to 0.02 s, at most 300 s a run" in said and "it holds to" in said
 
@@ -72,7 +72,7 @@ def test_called_from_python_is_said_of_what_is():
     names = {}
     exec(MECHANISMS, names)
     case = Case("case", names["plain"](), 0.1)
-    expected = {"DOP853, compiled": "compiled", "DOP853 (two-loop)": "Python", "LSODA, index 1": "Python"}
+    expected = {"DOP853, compiled": "compiled", "DOP853 (twoloop)": "Python", "LSODA, index 1": "Python"}
     expected |= {"CVODE from C, Adams": "compiled", "IDA, stabilised": "Python"}
     assert {name: called_from(Run(case, CATALOGUE[name], 1e-3)) for name in expected} == expected
 
@@ -110,10 +110,10 @@ def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
 
     real = metrics.measure
     monkeypatch.setattr(metrics, "measure", measure)
-    _, rows = compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "DOP853 (two-loop)", "Gauss12")
+    _, rows = compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "DOP853 (twoloop)", "Gauss12")
     found = dict(zip(rows["solver"], zip(rows["status"], rows["message"], strict=True), strict=True))
-    assert found["Gauss12"][0] == "REACHED_END" and found["DOP853 (two-loop)"][0] == "NOT_MEASURED"
-    assert found["DOP853 (two-loop)"][1] == "REACHED_END, but it cannot be measured: LinAlgError: Singular matrix"
+    assert found["Gauss12"][0] == "REACHED_END" and found["DOP853 (twoloop)"][0] == "NOT_MEASURED"
+    assert found["DOP853 (twoloop)"][1] == "REACHED_END, but it cannot be measured: LinAlgError: Singular matrix"
 
 
 @pytest.mark.parametrize(

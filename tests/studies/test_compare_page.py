@@ -170,7 +170,7 @@ def test_each_solver_has_a_look_of_its_own_that_of_the_figures_where_there_is_on
     names = [*figures.STYLES, "of nobody", "of nobody else", "another"]
     looks = compare_page.looks(reversed(names))
     assert len({tuple(look.values()) for look in looks.values()}) == len(names)
-    for name in ("auto", "DOP853 (two-loop)", "IDA from C, stabilised"):
+    for name in ("auto", "DOP853 (twoloop)", "IDA from C, stabilised"):
         assert looks[name]["color"] == figures.style(name)["color"]
     assert looks["BDF"] == {"color": figures.style("BDF")["color"], "point": "cross", "rotation": 0}
 

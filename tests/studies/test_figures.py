@@ -169,10 +169,10 @@ def test_the_motion_is_drawn_with_both_two_loop_procedures():
 
 def test_the_bars_of_honesty_are_the_shares_of_the_outcomes():
     outcomes = {"LSODA, index 1": [honesty.SILENT, honesty.HANG, honesty.SAID, honesty.NOT_RUN]}
-    outcomes |= {"auto (two-loop)": [honesty.RIGHT] * 3 + [honesty.SAID]}
+    outcomes |= {"auto (twoloop)": [honesty.RIGHT] * 3 + [honesty.SAID]}
     made = pd.DataFrame([{"solver": name, "outcome": what} for name, each in outcomes.items() for what in each])
     totals = honesty.totals(made)
-    assert [(line["solver"], line["n"]) for line in totals] == [("auto (two-loop)", 4), ("LSODA, index 1", 3)]
+    assert [(line["solver"], line["n"]) for line in totals] == [("auto (twoloop)", 4), ("LSODA, index 1", 3)]
     (axes,) = honesty.picture(totals).axes
     shares = [[bar.get_width() for bar in bars] for bars in axes.containers]
     assert np.allclose(shares, [[75.0, 0.0], [25.0, 100.0 / 3.0], [0.0, 200.0 / 3.0]])

@@ -69,7 +69,7 @@ def test_the_first_call_builds_where_the_next_finds_all_built():
 @pytest.mark.parametrize(("marks", "spent"), [(True, 7.0), (False, 107.0)])
 def test_the_first_call_ends_where_that_of_a_user_ends(marks, spent, monkeypatch):
     """A second run for the output, which builds once more, is ours; an adapter that marks nothing is timed whole."""
-    ours, clock = CATALOGUE["DOP853 (two-loop)"], [0.0]
+    ours, clock = CATALOGUE["DOP853 (twoloop)"], [0.0]
 
     def run(case, value, repeat):
         clock[0] += 5.0  # builds

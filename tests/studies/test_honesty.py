@@ -96,7 +96,7 @@ def test_traps_in_the_motion_have_a_known_end():
 def test_a_solver_of_compiled_functions_is_not_asked_for_python():
     trap = TRAPS["exception in a Python callback after 1 s"]
     assert why_not(IDA_C, trap)
-    assert not why_not("BDF (two-loop)", trap)
+    assert not why_not("BDF (twoloop)", trap)
     assert why_not("LSODA, index 1", TRAPS["first step of 1 s"])
 
 
@@ -128,7 +128,7 @@ def test_sentences_turn_with_the_rows():
             "error": 1e-9,
         }
         for trap in ("a", "b")
-        for solver in ("BDF (two-loop)", "LSODA, index 1")
+        for solver in ("BDF (twoloop)", "LSODA, index 1")
     ]
     rows = pd.DataFrame(lines)
 
@@ -146,7 +146,7 @@ def test_sentences_turn_with_the_rows():
     assert "No solver notices: b" in told
 
 
-OURS, COMPILED, OTHER, THEIRS = honesty.DEFAULT, honesty.DEFAULT_COMPILED, "BDF (two-loop)", "LSODA, index 1"
+OURS, COMPILED, OTHER, THEIRS = honesty.DEFAULT, honesty.DEFAULT_COMPILED, "BDF (twoloop)", "LSODA, index 1"
 BOUND = THEIRS + LIMITED
 
 
@@ -275,7 +275,7 @@ def test_a_force_has_a_known_end_and_all_presets_are_asked():
     assert trap.mechanism == "pendulum"
     assert row_of(trap)["outcome"] == honesty.RIGHT
     assert row_of(replace(trap, system=TRAPS["drag"].system))["outcome"] == honesty.SILENT
-    asked = {name.removesuffix(" (two-loop)").split(",")[0] for name in solvers(False, FORCE)}
+    asked = {name.removesuffix(" (twoloop)").split(",")[0] for name in solvers(False, FORCE)}
     assert set(PRESETS) - asked == {"PaperIRK", "PaperNewmark"}
 
 

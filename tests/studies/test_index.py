@@ -174,11 +174,11 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
         "forces": {"n_families": 15, "mechanisms": ["pendulum", "four-bar"]},
         "trust": trust,
         "held_out": {"trust": held_out},
-        "forces_only": ["auto, compiled (two-loop)", "Gauss4 (two-loop)"],
+        "forces_only": ["auto, compiled (twoloop)", "Gauss4 (twoloop)"],
     }
     text = front(tmp_path, [case()], honesty=honesty)
     assert "under 15 kinds of sharp everyday forces" in text and "on 20 other traps" in text
-    assert "on 2 mechanisms, with parameters drawn after our last repair, in 1 of 30 runs of the default" in text
+    assert "on 2 mechanisms, with parameters on which no method was repaired, in 1 of 30 runs of the default" in text
     theirs = "8 of 30 of other projects' solvers (1 of these off by over 1e-3). With the parameters on which ours"
     assert f"6 of 30 of our other methods and {theirs}" in text
     assert "traps, it is so in 0 of 50, 3 of 50 (the forces alone), 5 of 50 and 7 of 50 ([honesty]" in text

@@ -113,7 +113,7 @@ class Kept(dict):
 
 
 def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
-    todo = [run for run in rivals.runs(True) if run.solver.name in ("DOP853 (two-loop)", "CVODE from C, Adams")]
+    todo = [run for run in rivals.runs(True) if run.solver.name in ("DOP853 (twoloop)", "CVODE from C, Adams")]
     pytest.importorskip("sksundae")
     pytest.importorskip("solve_dae")  # whose adapter has no rows A v + b = 0
     like = (run for run in todo if run.case.name == "knife edge" and run.solver.name == "CVODE from C, Adams")

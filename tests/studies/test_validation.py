@@ -139,18 +139,18 @@ def test_steps_that_keep_their_tolerance_and_steps_that_do_not():
 
 
 def test_a_run_without_an_exact_motion_has_no_deceived_steps(monkeypatch):
-    assert deceived_row(mechanisms.knife_edge(), "DOP853 (two-loop)", 1e-6)["n_sampled"] > 0
+    assert deceived_row(mechanisms.knife_edge(), "DOP853 (twoloop)", 1e-6)["n_sampled"] > 0
 
     def refuse(*arguments, **options):
         raise ValueError("none here")
 
     monkeypatch.setattr(deceived, "solve_index1", refuse)
-    row = deceived_row(mechanisms.knife_edge(), "DOP853 (two-loop)", 1e-6)
+    row = deceived_row(mechanisms.knife_edge(), "DOP853 (twoloop)", 1e-6)
     assert row["n_sampled"] == 0 and row["message"] == "no exact motion on index 1: none here"
 
 
 def test_the_share_of_deceived_steps():
-    problem, solver = mechanisms.double_pendulum(), "DOP853 (two-loop)"
+    problem, solver = mechanisms.double_pendulum(), "DOP853 (twoloop)"
     rows = pd.DataFrame([deceived_row(problem, solver, tolerance) for tolerance in (1e-6, 1e-8)])
     sound = validation.of_steps(solver, rows)
     assert (sound["n"], sound["deceived"], sound["first"]) == (50, 0.0, 0.0)

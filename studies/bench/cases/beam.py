@@ -26,7 +26,7 @@ NOTE = (
 
 
 def _known(problem: Problem, t_end: float) -> ReferenceMotion:
-    """DOP853 (two-loop), its own steps joined by quintics; the floor is its distance from two other ways.
+    """DOP853 (twoloop), its own steps joined by quintics; the floor is its distance from two other ways.
 
     Gauss12 shares the equations and not the method; SciPy's DOP853 on the equations without constraints shares the
     forces and the tableau, and nothing of the two-loop procedure.
@@ -42,7 +42,7 @@ def _known(problem: Problem, t_end: float) -> ReferenceMotion:
     times = np.linspace(0.0, t_end, 101)[1:]
     apart = np.abs(motion(times)[0] - reduced_motion(problem, times, CHECK)[0]).max()
     source = (
-        f"DOP853 (two-loop) at {TIGHT:.0e}, from which Gauss12 differs by {differ:.1e} and SciPy's DOP853 on the "
+        f"DOP853 (twoloop) at {TIGHT:.0e}, from which Gauss12 differs by {differ:.1e} and SciPy's DOP853 on the "
         f"equations without constraints by {apart:.1e}"
     )
     return ReferenceMotion(motion, float(max(differ, apart, motion.uncertainty(), 1e-13)), source)
