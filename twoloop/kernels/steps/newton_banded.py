@@ -56,7 +56,7 @@ from twoloop.kernels.steps.newton_memory import (
     system_space,
     vector,
 )
-from twoloop.kernels.steps.newton_tangents import DIFFERENCE, tangent_by_q, tangent_by_v
+from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all, tangent_by_q, tangent_by_v
 
 
 @inlined
@@ -159,7 +159,7 @@ def derivatives(f, w, memory, s, t, q, v):
         return code
     # one displacement of all velocities tells whether there is anything to difference
     for j in range(n):
-        moved[j] = v[j] + DIFFERENCE * max(1.0, abs(v[j])) * (1.0 + 0.37 * (j % 7))
+        moved[j] = displaced_with_all(v[j], j)
     _unbalanced(f, w, t, q, moved)
     memory[DAMPED] = 0.0
     for i in range(n):

@@ -39,7 +39,7 @@ from twoloop.kernels.steps.newton_memory import (
     system_space,
     vector,
 )
-from twoloop.kernels.steps.newton_tangents import DIFFERENCE, tangent_by_q, tangent_by_v
+from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all, tangent_by_q, tangent_by_v
 from twoloop.kernels.steps.stages import INNER_TOL
 
 
@@ -128,7 +128,7 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
-        v_moved[j] = v[j] + DIFFERENCE * max(1.0, abs(v[j])) * (1.0 + 0.37 * (column % 7))
+        v_moved[j] = displaced_with_all(v[j], column)
     code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
     if code != DONE:
         return code

@@ -3,10 +3,17 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.data.common import DONE, FORCE_BY_V_GIVEN, NOT_FINITE, REACTION_BY_Q_GIVEN, compiled
+from twoloop.kernels.data.common import DONE, FORCE_BY_V_GIVEN, NOT_FINITE, REACTION_BY_Q_GIVEN, compiled, inlined
 from twoloop.kernels.evaluation.constraints import constraint_rows
 
 DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
+STEP, KINDS = 0.37, 7  # by which displacements that are made at a time differ, and how many kinds of them there are
+
+
+@inlined
+def displaced_with_all(value, place):
+    """A coordinate or velocity where all are displaced at a time, unlike its neighbours: so that nothing cancels."""
+    return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + STEP * (place % KINDS))
 
 
 @compiled
@@ -42,7 +49,7 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
     """K -= d(Cq^T lam)/dq, by displacing coordinates j, j + 2 b + 1, ... at a time."""
     n = q.size
     for j in range(n):
-        moved[j] = q[j] + DIFFERENCE * max(1.0, abs(q[j])) * (1.0 + 0.37 * (j % 7))
+        moved[j] = displaced_with_all(q[j], j)
     if not _bent(f, w, t, moved):
         return
     width = min(n, 2 * b + 1)
