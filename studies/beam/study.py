@@ -1,7 +1,6 @@
 """The beam study from its runs to its report."""
 
 import itertools
-from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
@@ -11,7 +10,7 @@ import studies.beam as package
 from studies.beam.findings import findings_of
 from studies.beam.limits import along_rows, limit_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
-from studies.beam.sensitivity import CHANGES, sensitivity_rows
+from studies.beam.sensitivity import sensitivity_rows
 from studies.bench import figures, tables
 from studies.bench.render import number, table
 from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
@@ -39,8 +38,9 @@ def drawn(runs_: pd.DataFrame) -> list[str]:
     return figures.lines_of(runs_[~runs_["solver"].isin((EXUDYN, DIFFERENCES))], TARGETS)
 
 
-def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """CPU time of each solver for each target, the beams side by side."""
+    runs_, names = by_tip(rows), [case["name"] for case in found["cases"]]
     costs = [
         {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
         for name in names
@@ -49,7 +49,7 @@ def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
     nothing = ["", *["–"] * len(TARGETS)]
     lines = [[solver, *(cell for cost in costs for cell in cost.get(solver, nothing)[1:])] for solver in shown]
     errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
-    return table(["solver", *errors], lines)
+    return {"cost": table(["solver", *errors], lines)}
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
@@ -63,14 +63,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             axes.axvline(target, color="0.6", linestyle=":", linewidth=1.0, zorder=0)
         made[case["figure"].removesuffix(".png")] = plot
     return made
-
-
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """What each solver takes, and how far changed beams are away."""
-    names = [case["name"] for case in found["cases"]]
-    changes = [[change, *(1e3 * case["changes"][change] for case in found["cases"])] for change in CHANGES]
-    ready = {"changes": table(["change", *(f"{name} (mm)" for name in names)], changes)}
-    return ready | {"cost": cost_table(by_tip(rows), names)}
 
 
 STUDY = Study("beam", package.__doc__, make, findings_of, figures_of, tables_of, medians=True)

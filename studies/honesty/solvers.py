@@ -35,7 +35,7 @@ def own(method: str, trap: Trap) -> Result:
     name, _, code = method.partition(", ")
     options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
     start = trap.system, (0.0, trap.t_end), trap.q0, trap.v0
-    return solve_dae(*start, method=name, compiled=bool(code), **options, **trap.steps)
+    return solve_dae(*start, method=name, compiled=bool(code), **options | dict(trap.steps))
 
 
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:

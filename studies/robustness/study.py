@@ -181,10 +181,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         {"method": name, "kind": kind, **counts_of(own)}
         for (name, kind), own in drawn.groupby(["method", "what"], sort=False)
     ]
-    found["silent"] = [
-        {key: row[key] for key in ("group", "what", "value", "method", "error", "allowed")}
-        for _, row in silent.iterrows()
-    ]
+    found["silent"] = silent[["group", "what", "value", "method", "error", "allowed"]].to_dict("records")
     found["scales"] = [
         {"method": name, "group": group, **limits_of(own)}
         for group in ("size", "density", "ratio")
