@@ -303,19 +303,14 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Problem x solver: digits of q with TIGHT."""
     tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin(APART)]
     cases, solvers = list(dict.fromkeys(tight["case"])), list(dict.fromkeys(tight["solver"]))
-    shown, texts = np.full((len(cases), len(solvers)), np.nan), {}
-    for _, row in tight.iterrows():
-        place = cases.index(row["case"]), solvers.index(row["solver"])
-        if pd.notna(row["digits_q"]):
-            shown[place], texts[place] = row["digits_q"], f"{max(0.0, float(row['digits_q'])):.1f}"
-        else:
-            texts[place] = SHORT.get(row["status"], "failed")
+    shown = tight.pivot(index="case", columns="solver", values="digits_q").reindex(index=cases, columns=solvers)
     figure, axes = plt.subplots(figsize=(8.4, 0.3 * len(cases) + 1.6), layout="constrained")
     colours = plt.get_cmap("viridis").with_extremes(bad="#e6e6e6")
-    image = axes.imshow(shown, vmin=0.0, vmax=14.0, cmap=colours, aspect="auto")
-    for (i, j), text in texts.items():
-        dark = shown[i, j] < 8.0
-        axes.text(j, i, text, ha="center", va="center", fontsize=7, color="white" if dark else "black")
+    image = axes.imshow(shown.astype(float), vmin=0.0, vmax=14.0, cmap=colours, aspect="auto")
+    for _, row in tight.iterrows():
+        place, digits = (solvers.index(row["solver"]), cases.index(row["case"])), row["digits_q"]
+        text = SHORT.get(row["status"], "failed") if pd.isna(digits) else f"{max(0.0, digits):.1f}"
+        axes.text(*place, text, ha="center", va="center", fontsize=7, color="white" if digits < 8.0 else "black")
     axes.set_xticks(range(len(solvers)), solvers, rotation=35, ha="right", rotation_mode="anchor")
     axes.set_yticks(range(len(cases)), cases)
     axes.grid(False)
