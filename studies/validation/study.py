@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -210,24 +210,18 @@ def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
 def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """By problem, the methods aimed at that stop with TIGHT, and those that have fewer digits than wanted."""
     found: dict[str, dict[str, Any]] = {}
+    references = {problem.name: problem.reference for problem in (make() for make in MAKE)}
     for _, row in rows[(rows["tol"] == TIGHT) & rows["solver"].isin(AIMED)].iterrows():
         about = {"case": row["case"], "solver": row["solver"]}
-        got = {level: row[f"digits_{level}"] for level in REACH}
-        short = [level for level, wanted in REACH.items() if got[level] < wanted < _holds(row["case"], level)]
+        got, known = {level: row[f"digits_{level}"] for level in REACH}, references[row["case"]]
+        assert known is not None
+        short = [level for level, wanted in REACH.items() if got[level] < wanted < known.digits.get(level, 0.0)]
         stopped = [row["solver"]] if pd.isna(got["q"]) else []
         if short or stopped:
             of = found.setdefault(row["case"], {"case": row["case"], "stopped": [], "short": []})
             of["stopped"] += stopped
             of["short"] += [about | {"level": level, "digits": float(got[level])} for level in short]
     return list(found.values())
-
-
-@cache
-def _holds(name: str, level: str) -> float:
-    """Digits that the reference of a problem holds."""
-    known = next(problem for problem in (make() for make in MAKE) if problem.name == name).reference
-    assert known is not None
-    return float(known.digits.get(level, 0.0))
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
