@@ -79,7 +79,9 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
     columns = [*COSTS, *MEASURES]
     runs = []
     for _, row in rows.iterrows():
-        values = [_rounded(abs(row[name])) if name in row and pd.notna(row[name]) else None for name in columns]
+        values = [
+            float(f"{abs(row[name]):.{DIGITS}g}") if name in row and pd.notna(row[name]) else None for name in columns
+        ]
         done = row["status"] == "REACHED_END"
         said = "" if done else f"{row['status']}: {str(row['message']).split('. ')[0]}"
         if done and row.get("astray") in (True, "True"):
@@ -113,10 +115,6 @@ def looks(solvers: Iterable[str]) -> dict[str, dict[str, Any]]:
         point, rotation = POINTS[pair[1]]
         made[name] = {"color": pair[0], "point": point, "rotation": rotation}
     return made
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
 
 
 def page(data: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from references.sundials.ida import solve_ida
@@ -114,7 +113,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """Steps of the paper's procedures: the whole run, two periods, and the motion below."""
+    """Steps of the paper's procedures: the whole run, two periods with what was rejected, and the motion below."""
     figure, axes = plt.subplots(3, 1, figsize=(9.2, 7.2), layout="constrained", height_ratios=(3, 4, 1.4))
     whole, zoom, motion = axes
     paper = rows[rows["group"] == "paper"].set_index("solver", drop=False).loc[list(PAPER)]
@@ -124,7 +123,12 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             panel.plot(*row["series"][name], drawstyle="steps-post", **look)
         panel.axhline(LONG, color=figures.RED, lw=1.0, ls=":", label=f"{LONG:g} s, of the paper")
         panel.set(ylabel="step size (s)", yscale="log")
-    _mark(zoom, paper.loc[IRK, "series"])
+    places = paper.loc[IRK, "series"]
+    for (name, (marker, what)), color in zip(MARKS.items(), (figures.RED, figures.BLUE), strict=True):
+        if places[name].size:
+            zoom.plot(*places[name], marker, color=color, ms=4.5, label=what, zorder=4)
+    for moment in places["switch"][0] if places["switch"].size else ():
+        zoom.axvline(moment, color="black", alpha=0.25, lw=1.0, label="new independent coordinates")
     zoom.set_title(f"the first {PERIODS:g} periods, with rejected attempts of {IRK}", fontsize=9)
     whole.set(title="", xlabel="t (s)")
     grid = np.linspace(0.0, PERIODS * four_bar.period(), 400)
@@ -132,15 +136,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     motion.set(xlabel="t (s)", ylabel="y3 (m)", xlim=zoom.get_xlim())
     figures.legend(figure, [zoom])
     return {"step_size": figure}
-
-
-def _mark(panel: Axes, places: dict[str, Array]) -> None:
-    """Mark steps before which attempts were rejected; lines where the coordinates changed."""
-    for (name, (marker, what)), color in zip(MARKS.items(), (figures.RED, figures.BLUE), strict=True):
-        if places[name].size:
-            panel.plot(*places[name], marker, color=color, ms=4.5, label=what, zorder=4)
-    for moment in places["switch"][0] if places["switch"].size else ():
-        panel.axvline(moment, color="black", alpha=0.25, lw=1.0, label="new independent coordinates")
 
 
 STUDY = Study("step_size", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)

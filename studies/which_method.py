@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.bench import index
-from studies.bench.render import render
-from studies.bench.takes import SUFFIX, takes
+from studies.bench.takes import SUFFIX
 
 OURS = "two-loop"  # family of our solvers, in the findings of validation
 
@@ -13,22 +12,14 @@ OURS = "two-loop"  # family of our solvers, in the findings of validation
 def page(folder: Path) -> str:
     """The text of the page; what has not been run is said to be missing."""
     found = index.findings(folder)
-    advice = index.advice(index.classes(found))
-    more = {"advice": advice, "cases": index.cases_of(found), "reliable": reliability(found)}
     links = {"docs": "../", "reports": "reports", "every": True}
-    return render("which_method", found, {}, default=_default(found), takes=takes(found, advice), **links, **more)
+    return index.rendered("which_method", found, reliable=reliability(found), **links)
 
 
 def table(folder: Path) -> str:
     """The table "your mechanism, take" alone, for a page in docs/ that includes it."""
-    found = index.findings(folder)
     links = {"docs": "", "reports": "generated/reports", "every": True}
-    rows = takes(found, index.advice(index.classes(found)))
-    return render("takes", found, {}, default=_default(found), takes=rows, **links)
-
-
-def _default(found: dict[str, dict[str, Any]]) -> str:
-    return str(found["work_precision"]["default"]) if "work_precision" in found else ""
+    return index.rendered("takes", index.findings(folder), **links)
 
 
 def reliability(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:

@@ -1,27 +1,29 @@
 """The beam study from its runs to its report."""
 
 import itertools
-from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 import studies.beam as package
-from studies.beam.findings import findings_of
-from studies.beam.limits import along_rows, limit_rows
+from studies.beam.limits import GAUSS_SEIDEL, JACOBI, along_rows, limit_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
-from studies.beam.sensitivity import CHANGES, sensitivity_rows
+from studies.beam.sensitivity import MESH, sensitivity_rows
 from studies.bench import figures, tables
+from studies.bench.cases.beam import SOFT, STIFF
+from studies.bench.cli import StudyError
 from studies.bench.render import number, table
-from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, QUARTER
+from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
 from studies.bench.store import Output
 from studies.bench.study import Study
 
+PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
+PAPER_STEPS = {SOFT: 1e-3, STIFF: 1e-5}  # s, its step sizes by order of magnitude
+STEPS_OVER = 10.0  # h w_max from which a step does not follow the fastest vibration: more than one and a half periods
 ERROR = "largest error of the tip's height over the run (m)"
-LISTED = (  # the CSV has all
-    *(PAPER, NEWMARK, QUARTER, NEWTON, DIFFERENCES, OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2),
-)
+LISTED = (PAPER, NEWMARK, QUARTER, NEWTON, DIFFERENCES, OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2)  # the CSV has all
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -34,13 +36,112 @@ def make(output: Output) -> pd.DataFrame:
     return pd.concat([rows, pd.DataFrame(more)], ignore_index=True)
 
 
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """All findings; `rows` are medians."""
+    runs = by_tip(rows)
+    w_max = {case: float(part["straight"].iloc[0]) for case, part in _of(rows, "along").groupby("case")}
+    cases = [_case(rows, runs[runs["case"] == case], case, w_max[case]) for case in (SOFT, STIFF)]
+    found: dict[str, Any] = {"targets": list(TARGETS), "t_end": float(runs["t_end"].iloc[0]), "cases": cases}
+    soft, stiff = (case["paper"] for case in cases)
+    found |= {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "call_s", "printed_s")}
+    found["growth_w_max"] = w_max[STIFF] / w_max[SOFT]
+    found["growth_as_frequency"] = bool(0.5 < found["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
+    own = runs[(runs["solver"] == EXUDYN) & runs["error_tip"].notna()]
+    found["exudyn"] = [number(1e3 * float(floor)) for floor in own.groupby("case", sort=False)["floor"].first()]
+    return found | _limits(rows)
+
+
+def _of(rows: pd.DataFrame, group: str, **equal: Any) -> pd.DataFrame:
+    found = tables.where(rows, group=group, **equal)
+    if found.empty:
+        raise StudyError(f"the rows lack those of group {group!r}; make them again by python -m studies.beam")
+    return found
+
+
+def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> dict[str, Any]:
+    paper = _of(runs, "run", solver=PAPER, tol=PAPER_TOL).iloc[0]
+    ours: dict[str, Any] = {key: float(paper[key]) for key in ("n_steps", "n_evaluations", "call_s", "h_median")}
+    ours |= {"error": paper["error_tip"], "floor": float(paper["floor"]), "printed_s": PAPER_SECONDS[name]}
+    ours["given_up"] = float(paper["n_rejected_convergence"] / (paper["n_steps"] + paper["n_rejected"]))
+    ours["printed_h"] = PAPER_STEPS[name]
+    ours["steps_as_printed"] = bool(10**-0.5 < ours["h_median"] / PAPER_STEPS[name] < 10**0.5)
+    found: dict[str, Any] = {"name": name, "w_max": w_max, "t_end": float(paper["t_end"]), "paper": ours}
+    found["figure"] = f"beam_{name.replace(' ', '_')}.png"
+    found["failed"] = tables.unfinished(runs)
+    ranked = runs[runs["solver"] != EXUDYN]
+    found["at"] = [at(ranked, error) for error in TARGETS]
+    largest = runs[runs["error_tip"].notna()].groupby("solver")[["error_tip", "floor"]].max()
+    found["unresolved"] = sorted(str(solver) for solver in largest.index[largest["error_tip"] <= largest["floor"]])
+    found |= _longest_step(ranked, w_max)
+    best = [None if line["best"] is None else line["best"]["solver"] for line in found["at"]]
+    found["one_best"] = best[0] is not None and len(set(best)) == 1
+    known = [line for line in found["at"] if line["newmark_over_paper"] is not None]
+    found["newmark"] = [{"error": line["error"], "over": line["newmark_over_paper"]} for line in known]
+    changes = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
+    below_mesh = [error for error in TARGETS if error < changes[MESH]]
+    return found | {"changes": changes.to_dict(), "below_mesh": below_mesh}
+
+
+def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
+    """Who is cheapest at one error on one beam: of all, of ours, of others; and the paper's."""
+    ranked = tables.ranking(runs, error)
+    seconds = dict(zip(ranked["solver"], ranked["call_s"], strict=True))
+    found: dict[str, Any] = {"error": error, "best": tables.best(ranked)}
+    found |= tables.of_both(ranked)
+    found |= dict.fromkeys(("ida_over_ours", "paper_over_best", "newmark_over_paper"))
+    ida, newmark = (
+        min((seconds[name] for name in names if name in seconds), default=None)
+        for names in ((IDA_C, IDA_C_ORDER_2), (NEWMARK, QUARTER))
+    )
+    if ida is not None and found["ours"] is not None:
+        found["ida_over_ours"] = ida / found["ours"]["call_s"]
+    if PAPER in seconds:
+        found["paper_over_best"] = seconds[PAPER] / min(seconds.values())
+        found["newmark_over_paper"] = None if newmark is None else newmark / seconds[PAPER]
+    return found
+
+
+def _longest_step(runs: pd.DataFrame, w_max: float) -> dict[str, Any]:
+    """The longest median step, times w_max, of a run within 1 mm, and whether it steps over the fastest vibrations."""
+    good = runs[(runs["error_tip"] <= TARGETS[1]) & runs["h_median"].notna()]
+    if good.empty:
+        return {"longest": None, "steps_over": False}
+    run = good.loc[good["h_median"].astype(float).idxmax()]
+    x = float(run["h_median"]) * w_max
+    return {"longest": {"solver": run["solver"], "x": x}, "steps_over": x > STEPS_OVER}
+
+
+def _limits(rows: pd.DataFrame) -> dict[str, Any]:
+    """The limits of fixed-point iteration, and what accepted steps have to do with them."""
+    theory = _of(rows, "limit").set_index("solver")["theory"].astype(float)
+    tests = _of(rows, "growth test").set_index("tol")["measured"].astype(float).sort_index(ascending=False)
+    found: dict[str, Any] = {"jacobi": theory[JACOBI], "gauss_seidel": theory[GAUSS_SEIDEL]}
+    found["gauss_seidel_shorter"] = bool(theory[GAUSS_SEIDEL] < theory[JACOBI])
+    found |= {"test_tols": tests.index.tolist(), "test_limits": tests.tolist()}
+    found["test_no_limit"] = bool(tests.min() < 0.5 * tests.max())
+    found["along"] = []
+    for case in (SOFT, STIFF):
+        part = _of(rows, "along", case=case)
+        limit = part["measured"].to_numpy(float)
+        paper = _of(rows, "run", case=case, solver=PAPER, tol=PAPER_TOL).iloc[0]
+        low, middle, high = (float(x) for x in np.percentile(limit[1:], (25, 50, 75)))
+        line: dict[str, Any] = {"case": case, "start": float(limit[0]), "low": low, "median": middle, "high": high}
+        line["n"] = len(limit) - 1
+        line["accepted"] = float(paper["h_median"] * part["straight"].iloc[0])
+        line["explains"] = bool(max(line["accepted"], tests.median()) <= middle)
+        found["along"].append(line)
+    found["reconciled"] = found["test_no_limit"] and all(line["explains"] for line in found["along"])
+    return found
+
+
 def drawn(runs_: pd.DataFrame) -> list[str]:
     """The lines of the figure: not Exudyn's, whose cable is another, nor those by differences."""
     return figures.lines_of(runs_[~runs_["solver"].isin((EXUDYN, DIFFERENCES))], TARGETS)
 
 
-def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """CPU time of each solver for each target, the beams side by side."""
+    runs_, names = by_tip(rows), [case["name"] for case in found["cases"]]
     costs = [
         {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
         for name in names
@@ -49,7 +150,7 @@ def cost_table(runs_: pd.DataFrame, names: Sequence[str]) -> str:
     nothing = ["", *["–"] * len(TARGETS)]
     lines = [[solver, *(cell for cost in costs for cell in cost.get(solver, nothing)[1:])] for solver in shown]
     errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
-    return table(["solver", *errors], lines)
+    return {"cost": table(["solver", *errors], lines)}
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
@@ -63,14 +164,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             axes.axvline(target, color="0.6", linestyle=":", linewidth=1.0, zorder=0)
         made[case["figure"].removesuffix(".png")] = plot
     return made
-
-
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """What each solver takes, and how far changed beams are away."""
-    names = [case["name"] for case in found["cases"]]
-    changes = [[change, *(1e3 * case["changes"][change] for case in found["cases"])] for change in CHANGES]
-    ready = {"changes": table(["change", *(f"{name} (mm)" for name in names)], changes)}
-    return ready | {"cost": cost_table(by_tip(rows), names)}
 
 
 STUDY = Study("beam", package.__doc__, make, findings_of, figures_of, tables_of, medians=True)

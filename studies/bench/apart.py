@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 
-def apart(work: Callable[[], Any], limit: float) -> Any:
-    """What work() returns in a fork of this process, which is ended after `limit` s.
+def apart(work: Callable[[], Any], limit: float | None = None) -> Any:
+    """What work() returns in a fork of this process, which is ended after `limit` s, where there is one.
 
     Raises
     ------

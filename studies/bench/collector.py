@@ -8,8 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -251,21 +250,15 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
         _ = case.scale  # makes the reference, which is not to be timed with anything
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, disable=not sys.stdout.isatty())
-    with closing(_rows_of(left, kept, measure)) as made, bar as progress:
+    warm: set[tuple[int, str, float]] = set()
+    with bar as progress:
         task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
-        for run, k, row in made:
-            kept.add(run.key(k), row)
+        for run, k in left:
+            if k > 0 and kept[run.key(0)]["status"] in ONCE:
+                continue
+            kept.add(run.key(k), row_of(run, k, measure, warm))
             progress.update(task, advance=1, description=f"{run.case.name}: {run.solver.name}"[:50].ljust(50))
     return pd.DataFrame([kept[key] for key in order if key in kept])
-
-
-def _rows_of(
-    left: list[tuple[Run, int]], kept: KeptRows, measure: Measure | None
-) -> Generator[tuple[Run, int, Row], None, None]:
-    warm: set[tuple[int, str, float]] = set()
-    for run, k in left:
-        if k == 0 or kept[run.key(0)]["status"] not in ONCE:
-            yield run, k, row_of(run, k, measure, warm)
 
 
 def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:

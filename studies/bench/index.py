@@ -148,12 +148,12 @@ def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     return list(groups.values())
 
 
-def _render(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
-    default = found["work_precision"]["default"] if "work_precision" in found else ""
+def rendered(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
+    """A template of what all studies found, with the classes of problems, what to take, and further names."""
     entries = classes(found)
     groups = advice(entries)
-    more |= {"classes": entries, "cases": cases_of(found), "default": default, "takes": takes(found, groups)}
-    return render(template, found, {}, **more)
+    more |= {"classes": entries, "advice": groups, "cases": cases_of(found), "takes": takes(found, groups)}
+    return render(template, found, {}, default=found.get("work_precision", {}).get("default", ""), **more)
 
 
 def first_screen(folder: Path, quick: bool) -> str:
@@ -171,7 +171,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     more["drifting"] = any(best["drifts"] for best in told)
     more["from_python"] = any(best["called_from"] == "Python" for best in told)
     more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
-    return _render("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
+    return rendered("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
 
 
 def write_index(output: Output) -> None:
@@ -181,7 +181,7 @@ def write_index(output: Output) -> None:
 
 def readme_block(found: dict[str, dict[str, Any]]) -> str:
     """The generated piece of the project's README."""
-    return _render("readme", found, docs="docs/", reports="reports", every=False)
+    return rendered("readme", found, docs="docs/", reports="reports", every=False)
 
 
 def put_in_readme(folder: Path, readme: Path) -> None:

@@ -108,9 +108,3 @@ def render(name: str, findings: Mapping[str, Any], tables: Mapping[str, str], **
     while "\n\n\n" in text:  # left by conditions that did not hold
         text = text.replace("\n\n\n", "\n\n")
     return text.strip("\n") + "\n"
-
-
-def number_of_words(text: str) -> int:
-    """Words of a report outside its tables and figures."""
-    lines = [line for line in text.splitlines() if not line.startswith(("|", "!["))]
-    return sum(len(line.split()) for line in lines)

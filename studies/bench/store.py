@@ -261,7 +261,8 @@ class KeptRows:
             try:
                 self._rows = self._read(lines)
             except ValueError as error:
-                lines, aside = [], next(path for k in count(1) if not (path := self._aside(k)).exists())
+                asides = (self.path.with_suffix(f".aside-{k}") for k in count(1))
+                lines, aside = [], next(path for path in asides if not path.exists())
                 self.path.rename(aside)
                 print(f"{self.path.name}: {error}; set aside as {aside.name}")
             self.n_resumed = len(self._rows)
@@ -272,9 +273,6 @@ class KeptRows:
         new.write_text("".join(f"{line}\n" for line in lines or [self._header]))
         os.replace(new, self.path)
         return self
-
-    def _aside(self, k: int) -> Path:
-        return self.path.with_suffix(f".aside-{k}")
 
     def _read(self, lines: list[str]) -> dict[str, Row]:
         if lines[:1] != [self._header] and self.path.stat().st_size > 0:

@@ -76,16 +76,6 @@ CONTROLLED: dict[str, dict[str, Variant]] = {
 TOL = 1e-5  # Rtol = Atol
 LSODA, PROJECTED = "LSODA, index 1", "DOP853, projected"
 ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
-OTHERS: dict[str, tuple[float, ...]] = {  # settings on SWITCHING, loose to tight; quick: the first
-    **dict.fromkeys((DEFAULT, OWN_CODE, OWN_EXPLICIT), (1e-6, 1e-8, 1e-10, 1e-12)),
-    "Gauss12": (1e-5, 1e-7),
-    **dict.fromkeys((IDA_C, CVODE_C, DIFFRAX, CVODES), (1e-6, 1e-8, 1e-10, 1e-12)),
-    HEYOKA: (1e-6, 1e-8, 1e-10, 1e-12, 1e-14),
-    LSODA: (1e-8, 1e-10, 1e-12),
-    PROJECTED: (1e-7, 1e-9, 1e-11),
-    ALPHA: (0.01,),
-    TRAPEZOIDAL: (0.02, 0.01, 0.005),
-}
 
 
 @cache
@@ -148,18 +138,22 @@ def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
     return solve_exudyn(case.problem, case.t_end, n_steps, solver, store_every=every)
 
 
-ADAPTERS: dict[str, Callable[[Case, float, int], Result]] = {  # that store states at the case's instants
-    DEFAULT: partial(_controlled, "auto"),
-    OWN_CODE: partial(_controlled, "auto", compiled=True),
-    OWN_EXPLICIT: partial(_controlled, "DOP853"),
-    "Gauss12": partial(_controlled, "Gauss12"),
-    **{name: CATALOGUE[name].run for name in (IDA_C, HEYOKA, CVODE_C)},
-    DIFFRAX: partial(_long, solve_diffrax),
-    CVODES: partial(_long, solve_cvodes),
-    LSODA: partial(_index1, "LSODA", "none"),
-    PROJECTED: partial(_index1, "DOP853", "projection"),
-    ALPHA: partial(_exudyn, "GeneralizedAlpha"),
-    TRAPEZOIDAL: partial(_exudyn, "TrapezoidalIndex2"),
+FINE = (1e-6, 1e-8, 1e-10, 1e-12)
+# on SWITCHING: settings, loose to tight (quick: the first), and how each stores states at the case's instants
+OTHERS: dict[str, tuple[tuple[float, ...], Callable[[Case, float, int], Result]]] = {
+    DEFAULT: (FINE, partial(_controlled, "auto")),
+    OWN_CODE: (FINE, partial(_controlled, "auto", compiled=True)),
+    OWN_EXPLICIT: (FINE, partial(_controlled, "DOP853")),
+    "Gauss12": ((1e-5, 1e-7), partial(_controlled, "Gauss12")),
+    IDA_C: (FINE, CATALOGUE[IDA_C].run),
+    CVODE_C: (FINE, CATALOGUE[CVODE_C].run),
+    DIFFRAX: (FINE, partial(_long, solve_diffrax)),
+    CVODES: (FINE, partial(_long, solve_cvodes)),
+    HEYOKA: ((*FINE, 1e-14), CATALOGUE[HEYOKA].run),
+    LSODA: ((1e-8, 1e-10, 1e-12), partial(_index1, "LSODA", "none")),
+    PROJECTED: ((1e-7, 1e-9, 1e-11), partial(_index1, "DOP853", "projection")),
+    ALPHA: ((0.01,), partial(_exudyn, "GeneralizedAlpha")),
+    TRAPEZOIDAL: ((0.02, 0.01, 0.005), partial(_exudyn, "TrapezoidalIndex2")),
 }
 
 
@@ -175,12 +169,9 @@ def _two_loop(name: str, setting: str, variant: Variant) -> Solver:
 def runs(quick: bool) -> Iterator[Run]:
     """All runs, the longest first so that no core waits at the end."""
     cases = {name: case_of(name, QUICK if quick else LONG) for name in GEOMETRIES}
-    for name, values in OTHERS.items():
-        if quick and name in NOT_QUICK:
-            continue
-        solver = replace(CATALOGUE[name], run=ADAPTERS[name])
-        for value in reversed(values[:1] if quick else values):
-            yield Run(cases[SWITCHING], solver, value, "other", 1)
+    for name, (values, run) in OTHERS.items():
+        for value in () if quick and name in NOT_QUICK else reversed(values[:1] if quick else values):
+            yield Run(cases[SWITCHING], replace(CATALOGUE[name], run=run), value, "other", 1)
     for geometry, controlled in CONTROLLED.items():
         for name, variant in controlled.items():
             yield Run(cases[geometry], _two_loop(name, "tol", variant), TOL, "controlled", 1)

@@ -34,8 +34,8 @@ def own(method: str, trap: Trap) -> Result:
     """One of ours, as a user calls it."""
     name, _, code = method.partition(", ")
     options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
-    options |= ({"compiled": True} if code else {}) | dict(trap.steps)
-    return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, method=name, **options)
+    start = trap.system, (0.0, trap.t_end), trap.q0, trap.v0
+    return solve_dae(*start, method=name, compiled=bool(code), **options | dict(trap.steps))
 
 
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:

@@ -18,7 +18,6 @@ from studies.bench import figures
 from studies.bench.apart import apart
 from studies.bench.cli import StudyError
 from studies.bench.end_states import EXACT
-from studies.bench.render import table
 from studies.bench.sharp_forces import T_END
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
@@ -280,19 +279,6 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
 
 
-def table_of(found: Sequence[dict[str, Any]], what: str, named: bool = False) -> str:
-    """Outcomes of ours and of others on each trap; `named`: and which of them were silent."""
-
-    def told(counts: dict[str, int]) -> str:
-        return f"{counts[SILENT] + counts[HANG]}/{counts[SAID]}/{counts[RIGHT]}" if counts["n"] else "–"
-
-    lines = [[line["trap"], told(line["ours"]), told(line["others"])] for line in found]
-    if named:
-        names = ("; ".join(line["silent"]).replace(OURS, "") for line in found)
-        lines = [[*line, each or "–"] for line, each in zip(lines, names, strict=True)]
-    return table([what, "ours", "others", *(["silent"] if named else [])], lines)
-
-
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """The bars of the forces held out."""
     return {"honesty": picture(found["held_out"]["solvers"])}
@@ -321,12 +307,5 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
-def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """Outcomes under the forces held out, and of the mistakes that are not all seen or all right."""
-    alike = {*found["all_say_so"], *found["all_right"]}
-    mistakes = table_of([line for line in found["traps"] if line["trap"] not in alike], "trap", True)
-    return {"forces": table_of(found["held_out"]["families"], "force"), "mistakes": mistakes}
-
-
-STUDY = Study("honesty", __doc__, make, findings_of, figures_of, tables_of)
+STUDY = Study("honesty", __doc__, make, findings_of, figures_of)
 main = STUDY.main

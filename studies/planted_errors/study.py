@@ -172,17 +172,11 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     mutants = output.path / "mutants.json"
     found["mutants"] = json.loads(mutants.read_text()) if mutants.is_file() else None
     output.save_findings(found)
-    cells = [
-        [str(place), "; ".join(own["fault"]), str(by)]
-        for (place, by), own in rows.groupby(["place", rows["caught_by"].map(_file)], sort=False)
-    ]
+    by_file = rows["caught_by"].str.removeprefix("tests/").str.split("::").str[0]  # the rows have the test, too
+    caught = rows.groupby(["place", by_file], sort=False)["fault"]
+    cells = [[str(place), "; ".join(names), str(by)] for (place, by), names in caught]
     ready = {"faults": table(["in", "faults", "caught by"], cells)}
     output.write("planted_errors.md", render("planted_errors", found, ready, stamp=line, quick=output.call.quick))
-
-
-def _file(check: str) -> str:
-    """A check as the table names it: of a test the file alone; the rows have its name."""
-    return check.removeprefix("tests/").split("::")[0]
 
 
 def main(words: Sequence[str] | None = None) -> None:

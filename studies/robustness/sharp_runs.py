@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -32,14 +33,8 @@ Part = tuple[str, Callable[[], list[Row]]]
 def run(mechanism: Mechanism, known: Motion, method: str, tolerance: float) -> Row:
     """One run, with code of its own where the name says so."""
     name, _, code = method.partition(", ")
-    row: Row = {
-        "group": SHARP,
-        "what": mechanism.sharp.family,
-        "name": mechanism.name,
-        "method": method,
-        "tol": tolerance,
-    }
-    return row | judged(mechanism, known, name, tolerance, TIME_LIMIT, **({"compiled": True} if code else {}))
+    row: Row = {"group": SHARP, "what": mechanism.sharp.family, "name": mechanism.name, "method": method}
+    return row | {"tol": tolerance} | judged(mechanism, known, name, tolerance, TIME_LIMIT, compiled=bool(code))
 
 
 def random_mechanisms(quick: bool) -> Iterator[Part]:
@@ -59,7 +54,7 @@ def random_mechanisms(quick: bool) -> Iterator[Part]:
     for k in range(4 if quick else N_MECHANISMS):
         kinds = others if k % 2 else rubbing
         family = kinds[k // 2 % len(kinds)]
-        yield f"sharp {k} {family}", lambda k=k, family=family: rows(k, family)  # type: ignore[misc]
+        yield f"sharp {k} {family}", partial(rows, k, family)
 
 
 def features(quick: bool) -> Iterator[Part]:
@@ -71,7 +66,7 @@ def features(quick: bool) -> Iterator[Part]:
         return [run(mechanism, known, method, each) for method in methods for each in tolerances]
 
     for place, family in enumerate(list(families())[:: 8 if quick else 1]):
-        yield f"feature {family}", lambda place=place, family=family: rows(place, family)  # type: ignore[misc]
+        yield f"feature {family}", partial(rows, place, family)
 
 
 def counts(rows: pd.DataFrame) -> dict[str, Any]:
@@ -98,9 +93,8 @@ def main(quick: bool) -> None:
     rows: list[Row] = []
     for key, part in features(quick):
         rows += part()
-        print(
-            f"{key}: {sum(row['outcome'] == SILENT for row in rows)} wrong and silent of {len(rows)} so far", flush=True
-        )
+        silent = sum(row["outcome"] == SILENT for row in rows)
+        print(f"{key}: {silent} wrong and silent of {len(rows)} so far", flush=True)
     frame = pd.DataFrame(rows).assign(value=0.0)
     print(pd.crosstab(frame["method"], frame["outcome"]).to_string())
     wrong = frame[frame["outcome"] == SILENT]

@@ -1,16 +1,16 @@
 """Random linkages, sizes, masses and long runs: no answer of ours may be wrong and silent."""
 
-import multiprocessing
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from studies.bench.apart import apart
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
 from studies.bench.sharp_motion import RIGHT, SAID, SILENT
 from studies.bench.store import Array, Output, Row
@@ -69,7 +69,7 @@ def linkages(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
 
     for k in range(N_QUICK if quick else N_LINKAGES):
         for place, kind in enumerate(KINDS):
-            yield f"linkage {kind} {k}", lambda kind=kind, seed=[SEED, place, k]: rows(kind, seed)  # type: ignore[misc]
+            yield f"linkage {kind} {k}", partial(rows, kind, [SEED, place, k])
 
 
 def scales(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
@@ -90,7 +90,7 @@ def scales(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
 
     for group, values in (("size", SIZES), ("density", DENSITIES), ("ratio", RATIOS)):
         for value in values[:: 5 if quick else 1]:
-            yield f"{group} {value:g}", lambda group=group, value=value: rows(group, value)  # type: ignore[misc]
+            yield f"{group} {value:g}", partial(rows, group, value)
 
 
 def resident() -> int:
@@ -126,17 +126,15 @@ def long_run(method: str, n_steps: int) -> Row:
     return row | {"energy": float(energy.max())}
 
 
-def alone(method: str, n_steps: int) -> Row:
-    """`long_run` in a process of its own."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool:
-        return pool.submit(long_run, method, n_steps).result()
-
-
 def long_runs(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
-    """Key and row of every long run."""
+    """Key and row of every long run, each made in a process of its own."""
+
+    def rows(method: str, n_steps: int) -> list[Row]:
+        return [apart(partial(long_run, method, n_steps))]
+
     for method in QUICK_METHODS if quick else METHODS:
         for n in LONG_QUICK if quick else LONG_STEPS:
-            yield f"long {method} {n}", lambda method=method, n=n: [alone(method, n)]  # type: ignore[misc]
+            yield f"long {method} {n}", partial(rows, method, n)
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -183,10 +181,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         {"method": name, "kind": kind, **counts_of(own)}
         for (name, kind), own in drawn.groupby(["method", "what"], sort=False)
     ]
-    found["silent"] = [
-        {key: row[key] for key in ("group", "what", "value", "method", "error", "allowed")}
-        for _, row in silent.iterrows()
-    ]
+    found["silent"] = silent[["group", "what", "value", "method", "error", "allowed"]].to_dict("records")
     found["scales"] = [
         {"method": name, "group": group, **limits_of(own)}
         for group in ("size", "density", "ratio")

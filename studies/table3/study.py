@@ -190,7 +190,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             bad = cells[cells[what].astype(bool)]["err_out"].unique()
             found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
     found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
-    found["newmark_growth"] = _last_decades(first)
+    # of Newmark's evaluations, and of the printed times, from the tolerance before the last to the last
+    last = [machine(first, "Table 3: Newmark", ERR_IN, err_out) for err_out in TOLERANCES[-2:]]
+    counts = [np.nan if cell is None else float(cell["n_evaluations"]) for cell in last]
+    paper = [float(PAPER_NEWMARK[-1][k] or np.nan) for k in (-2, -1)]
+    found["newmark_growth"] = {"ours": counts[1] / counts[0], "paper": paper[1] / paper[0]}
     found["ratio_s"] = newmark["call_s"] / irk["call_s"]
     found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
     ratios = _newmark_over_irk(first)
@@ -203,14 +207,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
     return found | causes(first)
-
-
-def _last_decades(first: pd.DataFrame) -> dict[str, float]:
-    """Growth of Newmark's evaluations, and of the printed times, from the tolerance before the last to the last."""
-    ours = [machine(first, "Table 3: Newmark", ERR_IN, err_out) for err_out in TOLERANCES[-2:]]
-    counts = [np.nan if cell is None else float(cell["n_evaluations"]) for cell in ours]
-    paper = [float(PAPER_NEWMARK[-1][k] or np.nan) for k in (-2, -1)]
-    return {"ours": counts[1] / counts[0], "paper": paper[1] / paper[0]}
 
 
 def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:

@@ -43,14 +43,8 @@ def row_of(run: Run) -> Row:
     """A run and how many of its steps after the first were deceived; none where there is no run or no exact motion."""
     case: Case = run.case
     row: Row = {"group": DECEIVED, "case": case.name, "solver": run.solver.name, "family": run.solver.family}
-    row |= {
-        **run.settings,
-        "t_end": case.t_end,
-        "n_sampled": 0,
-        "n_deceived": 0,
-        "worst_step": None,
-        "first_step": None,
-    }
+    row |= {**run.settings, "t_end": case.t_end, "n_sampled": 0, "n_deceived": 0}
+    row |= {"worst_step": None, "first_step": None}
     result, row["status"], row["message"], _ = attempt(run, 0)
     if result is None or result.t.size < 3:
         return row

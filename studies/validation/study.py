@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -210,24 +210,18 @@ def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
 def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """By problem, the methods aimed at that stop with TIGHT, and those that have fewer digits than wanted."""
     found: dict[str, dict[str, Any]] = {}
+    references = {problem.name: problem.reference for problem in (make() for make in MAKE)}
     for _, row in rows[(rows["tol"] == TIGHT) & rows["solver"].isin(AIMED)].iterrows():
         about = {"case": row["case"], "solver": row["solver"]}
-        got = {level: row[f"digits_{level}"] for level in REACH}
-        short = [level for level, wanted in REACH.items() if got[level] < wanted < _holds(row["case"], level)]
+        got, known = {level: row[f"digits_{level}"] for level in REACH}, references[row["case"]]
+        assert known is not None
+        short = [level for level, wanted in REACH.items() if got[level] < wanted < known.digits.get(level, 0.0)]
         stopped = [row["solver"]] if pd.isna(got["q"]) else []
         if short or stopped:
             of = found.setdefault(row["case"], {"case": row["case"], "stopped": [], "short": []})
             of["stopped"] += stopped
             of["short"] += [about | {"level": level, "digits": float(got[level])} for level in short]
     return list(found.values())
-
-
-@cache
-def _holds(name: str, level: str) -> float:
-    """Digits that the reference of a problem holds."""
-    known = next(problem for problem in (make() for make in MAKE) if problem.name == name).reference
-    assert known is not None
-    return float(known.digits.get(level, 0.0))
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -305,19 +299,14 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Problem x solver: digits of q with TIGHT."""
     tight = rows[(rows["tol"] == TIGHT) & ~rows["group"].isin(APART)]
     cases, solvers = list(dict.fromkeys(tight["case"])), list(dict.fromkeys(tight["solver"]))
-    shown, texts = np.full((len(cases), len(solvers)), np.nan), {}
-    for _, row in tight.iterrows():
-        place = cases.index(row["case"]), solvers.index(row["solver"])
-        if pd.notna(row["digits_q"]):
-            shown[place], texts[place] = row["digits_q"], f"{max(0.0, float(row['digits_q'])):.1f}"
-        else:
-            texts[place] = SHORT.get(row["status"], "failed")
+    shown = tight.pivot(index="case", columns="solver", values="digits_q").reindex(index=cases, columns=solvers)
     figure, axes = plt.subplots(figsize=(8.4, 0.3 * len(cases) + 1.6), layout="constrained")
     colours = plt.get_cmap("viridis").with_extremes(bad="#e6e6e6")
-    image = axes.imshow(shown, vmin=0.0, vmax=14.0, cmap=colours, aspect="auto")
-    for (i, j), text in texts.items():
-        dark = shown[i, j] < 8.0
-        axes.text(j, i, text, ha="center", va="center", fontsize=7, color="white" if dark else "black")
+    image = axes.imshow(shown.astype(float), vmin=0.0, vmax=14.0, cmap=colours, aspect="auto")
+    for _, row in tight.iterrows():
+        place, digits = (solvers.index(row["solver"]), cases.index(row["case"])), row["digits_q"]
+        text = SHORT.get(row["status"], "failed") if pd.isna(digits) else f"{max(0.0, digits):.1f}"
+        axes.text(*place, text, ha="center", va="center", fontsize=7, color="white" if digits < 8.0 else "black")
     axes.set_xticks(range(len(solvers)), solvers, rotation=35, ha="right", rotation_mode="anchor")
     axes.set_yticks(range(len(cases)), cases)
     axes.grid(False)

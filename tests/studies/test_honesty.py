@@ -133,8 +133,7 @@ def test_sentences_turn_with_the_rows():
     rows = pd.DataFrame(lines)
 
     def text(rows):
-        tables = dict.fromkeys(("mistakes", "forces"), "")
-        return render("honesty", honesty.findings_of(rows), tables, stamp="stamp", quick=False)
+        return render("honesty", honesty.findings_of(rows), {}, stamp="stamp", quick=False)
 
     assert "None of ours is silent" in text(rows) and "All runs are right: a; b." in text(rows)
     rows.loc[3, "outcome"] = honesty.SAID
@@ -172,8 +171,7 @@ def rows_of_forces(wrong=()):
 
 def told_of_forces(rows):
     found = honesty.findings_of(rows)
-    tables = dict.fromkeys(("mistakes", "forces"), "")
-    return found, render("honesty", found, tables, stamp="stamp", quick=False)
+    return found, render("honesty", found, {}, stamp="stamp", quick=False)
 
 
 def test_trust_is_counted_over_mistakes_and_forces():
@@ -197,7 +195,7 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["traps"][0]["silent"] == [OURS, THEIRS]
-    assert "| a | 1/0/2 | 1/0/0 | auto; LSODA, index 1 |" in honesty.table_of(found["traps"], "trap", True)
+    assert "| a | 1/0/2 | 1/0/0 | auto; LSODA, index 1 |" in text
     assert "- Of ours 1 run is silent or hangs: a." in text and "None of ours is silent, and" not in text
 
 

@@ -58,7 +58,3 @@ def test_a_template_that_uses_what_is_not_there_fails(tmp_path, monkeypatch):
     assert render.render("x", {"a": 0.5}, {}, stamp="s") == "0.50\n\ns\n"
     with pytest.raises(jinja2.UndefinedError, match="a"):
         render.render("x", {}, {}, stamp="s")
-
-
-def test_words_are_counted_outside_tables_and_figures():
-    assert render.number_of_words("two words\n| a | b |\n![a figure](x.png)\nthree") == 3

@@ -1,12 +1,14 @@
 """The robustness study: its truth, its rule, its sentences, and short and long forms of its runs."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench.apart import apart
 from studies.bench.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, end_of_scaled, four_lengths, scaled
 from studies.bench.render import render
 from studies.robustness import study as robustness
@@ -95,7 +97,7 @@ def test_a_run_of_ten_thousand_steps():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", robustness.METHODS)
 def test_a_run_of_a_million_steps(method):
-    row = robustness.alone(method, 1_000_000)
+    row = apart(partial(robustness.long_run, method, 1_000_000))
     check_long(row, 1_000_000)
     assert row["bytes_a_step"] < 200  # sizes and counts of the steps; a state would take 280
 
