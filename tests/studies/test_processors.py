@@ -27,7 +27,7 @@ def test_a_verdict_that_turns_between_two_processors_is_told():
         processors.verdicts(rows(name, *times), STAMP) for name, times in (("A", (1.0, 2.0)), ("B", (2.0, 1.0)))
     )
     (found,) = processors.findings_of(pd.concat([one, other]))
-    assert found["processors"] == ["A", "B"] and found["commits"] == 2 * ["0123456789"]
+    assert found["processors"] == ["A", "B"] and found["same_code"]
     assert found["time"] == "whole call"
     assert {"case": "A01 pendulum", "error": 1e-6, "who": "auto"} in found["turned"]
     assert found["apart"] == pytest.approx(4.0, rel=0.01)

@@ -114,7 +114,7 @@ def rows_of(outcome, last=1e-16):
     long = {"group": "long", "what": "long", "method": "BDF", "outcome": "right", "n_steps": 10, "bytes_a_step": 50.0}
     long |= {"first_q": 1e-16, "last_q": last, "first_v": 1e-16, "last_v": 1e-16, "energy": 1e-9}
     sharp = {"group": "sharp", "what": "drag", "name": "pendulum", "method": "auto", "outcome": outcome, "value": 0.0}
-    sharp["message"] = "REACHED_END"
+    sharp |= {"message": "REACHED_END", "tol": 1e-4, "error": 0.02}
     return pd.DataFrame([*lines, long | {"value": 1.0}, long | {"value": 10.0}, sharp])
 
 
@@ -126,11 +126,15 @@ def text_of(rows):
 def test_sentences_turn_with_the_rows():
     good = text_of(rows_of("right"))
     assert "No run of the linkages, of any size and mass" in good
-    assert "None of 1 runs of 1 random mechanisms under sharp forces, half of them friction." in good
+    assert "None of 1 runs, of 1 random mechanisms under sharp forces (half of them drags and frictions)." in good
+    assert "1 runs that count as right there are off by more than 1e-2." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
     assert "Of linkages, sizes and masses: 2 runs" in bad
-    assert "Yes: 1 of 1 runs of 1 random mechanisms under sharp forces, half of them friction: drag 1." in bad
+    assert (
+        "Yes: 1 of 1 runs, of 1 random mechanisms under sharp forces (half of them drags and frictions): drag in 1 run."
+        in bad
+    )
     assert "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
