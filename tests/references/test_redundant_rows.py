@@ -53,7 +53,7 @@ def pendulum(constraint, rate=None):
     )
 
 
-@pytest.mark.parametrize("name", ["DOP853, projected", "IDA, stabilised"])
+@pytest.mark.parametrize("name", [pytest.param("DOP853, projected", marks=pytest.mark.slow), "IDA, stabilised"])
 def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
     start = (0.0, 1.0), [1.0, 0.0], [0.0, 0.0]
     now = pendulum(lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.1)]))
