@@ -8,9 +8,12 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, Kit
+from twoloop.kernels.compile.caches import compile_kept
+from twoloop.kernels.compile.linking import KernelCompiler
+from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, OPTIONS, Kit, stamp
 from twoloop.kernels.evaluation.calls import inner_loop
 from twoloop.kernels.steps.explicit_step import EXPLICIT
+from twoloop.mechanisms import four_bar
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -70,6 +73,12 @@ def entry(helper):
 def called(helper, *arguments):
     """Call a helper of the kernels once."""
     return entry(helper)(*arguments)
+
+
+def kept(signature):
+    """Compile a function that calls helpers of an evaluation, and keep it until a file changes that these need."""
+    watched = (stamp("evaluation.calls"), "")
+    return lambda function: compile_kept(function, signature, watched, pipeline_class=KernelCompiler, **OPTIONS)
 
 
 def pendulum_state(t, angle=-0.5 * np.pi):
@@ -322,7 +331,10 @@ def oblique_to_point(result):
     return x, u
 
 
-# --- the four-bar linkage by one angle
+# --- the four-bar linkage: the default one, and one whose bars 1 and 2 come into line, where theta_3 alone does not
+# determine the rest; by one angle
+
+LINKAGES = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 
 
 def one_angle(lengths, ground, theta3, branch):

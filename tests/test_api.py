@@ -38,14 +38,6 @@ result = solve_dae(system, (0.0, 10.0), q0, v0, method="SunRadau5", rtol=1e-8, a
 """  # noqa: E501
 
 
-BETWEEN = """
-def hit(t, q, v): return q[0] - 0.5
-result = solve_dae(system, t_span, q0, v0, dense_output=True, events=[hit])   # def hit(t, q, v): return q[0] - 0.5;  hit.terminal = True or a count;  hit.direction = 0, 1, -1 (scipy's rules)
-state = result.sol(t)                             # t a number or (n,): state.q, state.v (n_q[, n]), on the constraints to rounding; state.a, state.lam
-result.t_events, result.q_events, result.v_events # lists, one array an event function
-"""  # noqa: E501
-
-
 def check_result(result, n_q, n_c):
     n_t = result.t.size
     assert result.q.shape == result.v.shape == result.a.shape == (n_q, n_t)
@@ -90,19 +82,6 @@ def test_ones_own_mechanism_as_printed():
     q, v, _ = pendulum_state(10.0)
     assert worst(result.q[:, -1], q) < 1e-6
     assert worst(result.v[:, -1], v) < 1e-6
-
-
-@pytest.mark.parametrize("t", [0.3, np.linspace(0.0, 2.0, 5)])
-def test_between_the_steps_as_printed(t):
-    names = {"q0": np.array([-1.0, 0.0]), "v0": np.zeros(2), "t_span": (0.0, 2.0), "t": t}
-    exec(IMPORTS + PENDULUM + BETWEEN, names)
-    state, result = names["state"], names["result"]
-    assert state.q.shape == state.v.shape == state.a.shape == (2, *np.shape(t))
-    assert state.lam.shape == (1, *np.shape(t))
-    assert worst(state.q, pendulum_state(t)[0]) < 1e-6
-    assert result.t_events[0].size > 0
-    assert worst(result.q_events[0][:, 0], 0.5) < 1e-14
-    assert result.v_events[0].shape == result.q_events[0].shape
 
 
 def test_all_that_is_promised_can_be_imported():

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -65,7 +66,7 @@ def user(tmp_path):
         value, hits = done.stdout.split()
         return float(value), int(hits), done.stderr
 
-    run.cache, run.planted = cache, tmp_path / "planted"
+    run.cache, run.home, run.planted = cache, home, tmp_path / "planted"
     run.file = lambda: next(cache.glob("*/mechanism.force-*.nbc"))
     return run
 
@@ -87,10 +88,13 @@ def test_a_file_that_others_can_write_is_not_loaded_and_mended(user):
     assert user() == (2.0, 1, "")
 
 
-def test_nothing_is_loaded_from_a_folder_that_others_can_write(user):
+def test_nothing_is_loaded_from_a_folder_that_others_can_write(user, monkeypatch):
     user()
     plant(user.file(), user.planted)
     user.cache.chmod(0o777)  # above the folder of the file
+    monkeypatch.setenv("XDG_CACHE_HOME", str(user.home))
+    for folder in set(user.cache.iterdir()) - {user.file().parent}:  # of the kernels, which would be compiled again
+        shutil.copytree(folder, own_folder(folder))
     value, hits, said = user()
     assert (value, hits) == (2.0, 0) and not user.planted.exists()
     assert said.count("twoloop: no code is loaded from") == 1 and "set NUMBA_CACHE_DIR to a folder of your own" in said

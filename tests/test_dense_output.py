@@ -112,18 +112,6 @@ def test_accelerations_and_multipliers_belong_to_the_state(default_four_bar):
     assert state.lam.shape == (8, state.t.size)
 
 
-@pytest.mark.parametrize("tol", [1e-4, 1e-10])
-def test_gamma_by_differences(tol):
-    """Accelerations between steps of a system without gamma are as good as with it."""
-    t = np.linspace(0.0, 1.0, 21)
-    with_it, without = (
-        swing(1.0, system=pendulum(gamma=given), rtol=tol, atol=tol, dense_output=True).sol(t)
-        for given in (True, False)
-    )
-    assert worst(without.a, with_it.a) < max(1e-8, 100.0 * tol)
-    assert force_residual(pendulum(), without) < 1e-9
-
-
 def test_a_run_has_the_same_steps_with_and_without(default_four_bar):
     with_it, without = run(default_four_bar, 2.0, dense_output=True), run(default_four_bar, 2.0)
     assert (with_it.q == without.q).all()

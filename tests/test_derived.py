@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from tests import problems
-from tests.problems import called, worst
+from tests.problems import kept, worst
 from twoloop import ConstrainedSystem, consistent_state, mechanisms, solve_dae
 from twoloop.generate.derived import standing_for
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
-from twoloop.kernels.data.common import DONE, compiled
+from twoloop.kernels.data.common import DONE, KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.evaluation.accelerations import acceleration_constraint
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.run.workspace import kit_of, workspace
@@ -40,7 +40,7 @@ def pendulum(**more):
     return problems.pendulum(constant_mass=True, **more)
 
 
-@compiled
+@kept(i8(KIT, WORK, f8, VECTOR, VECTOR))
 def rows_and_gamma(f, w, t, q, v):
     w.G[:, :] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -52,7 +52,7 @@ def in_kernels(system, t, q, v):
     system, traced = standing_for(system, unchecked)
     kit = kit_of(system, t, q)
     work = workspace(system, kit, np.ones((system.n_c + system.n_a, system.n_q)), q, 1e-8, 0.0)
-    assert called(rows_and_gamma, kit, work, t, q, v) == DONE
+    assert rows_and_gamma(kit, work, t, q, v) == DONE
     return work.G[:-1].copy(), work.Gamma.copy(), traced
 
 

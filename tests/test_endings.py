@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.problems import pendulum, pendulum_state, violations, worst
+from tests.problems import pendulum, violations
 from twoloop import ConstrainedSystem, Status, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import MEANINGS
@@ -23,22 +23,6 @@ def test_every_status_has_a_meaning():
 
 
 # --- Ctrl-C
-
-
-def test_ctrl_c_in_a_python_callback_returns_what_there_is():
-    calls = [0]
-
-    def force(t, q, v):
-        calls[0] += 1
-        if calls[0] == 2000:
-            raise KeyboardInterrupt
-        return np.array([0.0, -9.81])
-
-    result = solve_dae(pendulum(force=force), (0.0, 1e6), *START)
-    assert result.status is Status.INTERRUPTED and not result.success
-    assert "Interrupted" in result.message and f"t = {result.t[-1]:.10g}" in result.message
-    assert result.t.size == result.stats.n_accepted + 1 > 5
-    assert worst(result.q, pendulum_state(result.t)[0]) < 1e-6
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals to oneself")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.problems import worst
+from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, Status, consistent_state, solve_dae
 
 AMPLITUDE = 1e-3  # m
@@ -89,13 +89,10 @@ def test_what_cannot_reach_the_tolerance_is_a_status():
 
 def test_differences_where_all_coordinates_are_zero():
     """A bead on y = x^2 that passes the vertex."""
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
+    system = pendulum(
         constraint=lambda t, q: np.array([q[1] - q[0] ** 2]),
         jacobian=lambda t, q: opaque(np.array([[-2.0 * q[0], 1.0]])),
+        gamma=False,
     )
     run = solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
     assert worst(run.a[:, 0], [0.0, 18.0]) < 1e-6
@@ -104,14 +101,7 @@ def test_differences_where_all_coordinates_are_zero():
 
 
 def test_rest_and_a_turning_point_need_no_shorter_differences():
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: opaque(q[None, :]),
-    )
+    system = pendulum(jacobian=lambda t, q: opaque(q[None, :]), gamma=False)
     at_rest = solve_dae(system, (0.0, 1.0), [0.0, -1.0], [0.0, 0.0])
     assert at_rest.success and worst(at_rest.q[:, -1], [0.0, -1.0]) < 1e-12
     assert solve_dae(system, (0.0, 5.0), [1.0, 0.0], [0.0, 0.0], rtol=1e-10, atol=1e-10).success

@@ -7,39 +7,20 @@ import numpy as np
 import pytest
 
 from tests.problems import pendulum
-from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
+from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.mechanisms import andrews, bricard, four_bar, heavy_top, n_four_bar, spatial_four_bar, spatial_slider_crank
 
 STRETCHED = np.arccos(0.25)  # theta_3 at which bars 1 and 2 of the linkage of 0.8, 1.2, 1 and 2 m are in line
 CRANK = 8
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    for i in range(q.size):
-        M[i, i] = 1.0
+def links(t, q, p):
+    d = q[2:] - q[:2]
+    return 0.5 * np.array([q[0] ** 2 + q[1] ** 2 - p[0] ** 2, d[0] ** 2 + d[1] ** 2 - p[1] ** 2])
 
 
-@callback("force")
-def force(t, q, v, p, Q):
-    Q[1] = Q[3] = -9.81
-
-
-@callback("constraint")
-def constraint(t, q, p, C):
-    C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - p[0] ** 2)
-    C[1] = 0.5 * ((q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - p[1] ** 2)
-
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
-    Cq[1, 2], Cq[1, 3] = q[2] - q[0], q[3] - q[1]
-    Cq[1, 0], Cq[1, 1] = -Cq[1, 2], -Cq[1, 3]
-
-
-POINTS = ConstrainedSystem(
-    n_q=4, n_c=2, mass=mass, force=force, constraint=constraint, jacobian=jacobian, parameters=[1.0, 1.0], name="points"
+POINTS = ConstrainedSystem.from_python(
+    n_q=4, n_c=2, mass=np.eye(4), force=lambda t, q, v: np.zeros(4), constraint=links, parameters=[1.0, 1.0]
 )
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import twoloop
 from tests.problems import pendulum as bare_pendulum
 from twoloop import solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar, pendulum
@@ -212,7 +211,3 @@ def test_a_later_run_that_raises_is_a_row():
 def test_a_bar(capsys):
     sweep(linkage, ANGLES[:2], parallel="threads", t_span=(0.0, 0.01), progress=True)
     assert "2 runs" in capsys.readouterr().out
-
-
-def test_it_is_the_function():
-    assert callable(twoloop.sweep)

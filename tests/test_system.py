@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from tests.problems import (
     moving_pivot,
-    moving_pivot_state,
     oblique_pendulum,
-    oblique_start,
     pendulum,
     pendulum_state,
     slope,
@@ -76,13 +74,6 @@ def test_a_constant_mass_need_not_be_diagonal():
 # --- consistent_state
 
 
-def test_consistent_input_stays_as_it_is(default_four_bar):
-    problem = default_four_bar
-    q, v = consistent_state(problem.system, 0.0, problem.q0, problem.v0)
-    assert worst(q, problem.q0) < 1e-15
-    assert worst(v, problem.v0) < 1e-15
-
-
 @given(st.lists(st.floats(-0.1, 0.1), min_size=9, max_size=9), st.lists(st.floats(-3, 3), min_size=9, max_size=9))
 def test_a_guess_is_projected_and_can_be_started_from(shift, speeds):
     problem = four_bar()
@@ -107,13 +98,6 @@ def test_moving_constraints_are_projected_at_their_time():
     assert np.abs(system.constraint(0.0, q)).max() > 1e-2
     assert np.abs(system.velocity_constraint(0.7, q, v)).max() < 1e-13
     assert np.abs(v).max() > 0.1
-
-
-def test_shared_starts_are_consistent():
-    for system, start in ((moving_pivot(), moving_pivot_state(0.0)), (oblique_pendulum(), oblique_start())):
-        q, v = consistent_state(system, 0.0, *start)
-        assert worst(q, start[0]) < 1e-13
-        assert worst(v, start[1]) < 1e-13
 
 
 def test_what_cannot_be_projected_says_how_far_it_is():

@@ -7,6 +7,7 @@ import types
 import numpy as np
 import pytest
 
+from tests.compiled import unit_mass
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, Status, callback
 from twoloop.generate.calls_on_symbols import as_forms
@@ -212,13 +213,8 @@ def damped(t, q, v, p, Q):
     Q[1] = -9.81 - K * v[1]
 
 
-@callback("mass")
-def unit(t, q, p, M):
-    M[0, 0] = M[1, 1] = 1.0
-
-
 def free(force):
-    return ConstrainedSystem(n_q=2, n_c=0, mass=unit, force=force, name="free")
+    return ConstrainedSystem(n_q=2, n_c=0, mass=unit_mass, force=force, name="free")
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """Wrong arguments of the ready mechanisms."""
 
+from functools import partial
+
 import numpy as np
 
 from tests.bad_input.case import FEW_POSITIVES, INFINITE, Case, argument
@@ -12,10 +14,10 @@ def beam(n_elements=1, **options):
     return ancf_beam(n_elements, **{**usual, **options})
 
 
+of_linkage = partial(argument, "four_bar", four_bar)
+of_beam = partial(argument, "ancf_beam", beam)
 MECHANISMS = [
-    *argument(
-        "four_bar",
-        four_bar,
+    *of_linkage(
         "lengths",
         [
             ((1.0, 2.0), ValueError, r"must have shape \(3,\)", "give three lengths"),
@@ -25,15 +27,8 @@ MECHANISMS = [
             ((True, 2.0, 1.5), TypeError, "must be an array of real numbers", "give three numbers"),
         ],
     ),
-    *argument(
-        "four_bar",
-        four_bar,
-        "ground",
-        [*FEW_POSITIVES, (np.inf, ValueError, "must be finite; given inf", "give metres")],
-    ),
-    *argument(
-        "four_bar",
-        four_bar,
+    *of_linkage("ground", [*FEW_POSITIVES, (np.inf, ValueError, "must be finite; given inf", "give metres")]),
+    *of_linkage(
         "theta3",
         [
             (np.inf, ValueError, "must be finite; given inf", "give an angle, rad"),
@@ -41,9 +36,7 @@ MECHANISMS = [
             (None, TypeError, "must be a number; given None", "give an angle, rad"),
         ],
     ),
-    *argument(
-        "four_bar",
-        four_bar,
+    *of_linkage(
         "branch",
         [
             (0, ValueError, "must be 1 .*or -1 .*given 0", "give 1 or -1"),
@@ -59,21 +52,19 @@ MECHANISMS = [
         "the linkage cannot be assembled.*Change lengths, ground or theta3",
         "change lengths, ground or theta3",
     ),
-    *argument(
-        "ancf_beam",
-        beam,
+    *of_beam(
         "n_elements",
         [
             (0, ValueError, "must be at least 1; given 0", "give an int of at least 1"),
             (2.5, TypeError, "must be an int; given 2.5", "give an int of at least 1"),
         ],
     ),
-    *argument("ancf_beam", beam, "start", [("tip", ValueError, "must be 'node'.*given 'tip'", "take one of these")]),
-    *argument("ancf_beam", beam, "youngs_modulus", [*FEW_POSITIVES, INFINITE]),
-    *argument("ancf_beam", beam, "length", FEW_POSITIVES[:2]),
-    *argument("ancf_beam", beam, "amplitude", [(np.inf, ValueError, "must be finite; given inf", "give metres")]),
-    *argument("ancf_beam", beam, "poisson_ratio", [(0.5, ValueError, "must lie between -1 and 0.5", "give 0.3, say")]),
-    *argument("ancf_beam", beam, "gravity", [(-9.81, ValueError, "must be at least 0", "gravity acts along -y")]),
+    *of_beam("start", [("tip", ValueError, "must be 'node'.*given 'tip'", "take one of these")]),
+    *of_beam("youngs_modulus", [*FEW_POSITIVES, INFINITE]),
+    *of_beam("length", FEW_POSITIVES[:2]),
+    *of_beam("amplitude", [(np.inf, ValueError, "must be finite; given inf", "give metres")]),
+    *of_beam("poisson_ratio", [(0.5, ValueError, "must lie between -1 and 0.5", "give 0.3, say")]),
+    *of_beam("gravity", [(-9.81, ValueError, "must be at least 0", "gravity acts along -y")]),
     *argument(
         "very_flexible_beam", very_flexible_beam, "n_elements", [("4", TypeError, "must be an int", "give an int")]
     ),

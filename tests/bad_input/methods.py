@@ -1,5 +1,7 @@
 """Wrong options of methods and tableaux."""
 
+from functools import partial
+
 import numpy as np
 
 from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, argument, cases_of
@@ -23,6 +25,9 @@ def tableau(**changed):
 STAGES = "give the number of stages, an int"
 UNIT = "give a number from 0 to 1"
 of_runge_kutta = cases_of("RungeKutta")
+of_option = partial(argument, "RungeKutta", runge_kutta)
+of_tableau = partial(argument, "Tableau", tableau)
+of_newmark = partial(argument, "Newmark", Newmark)
 METHODS = [
     *argument(
         "RungeKutta",
@@ -40,21 +45,19 @@ METHODS = [
         "tableau must have an invertible A.*Heun.*fixed-point",
         "take outer='fixed-point'",
     ),
-    *argument(
-        "RungeKutta",
-        runge_kutta,
+    *of_option(
         "outer",
         [
             ("n", ValueError, "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'", "take one of these"),
             (None, TypeError, "must be .*given None", "leave it out"),
         ],
     ),
-    *argument("RungeKutta", runge_kutta, "error", [("none", ValueError, "must be 'richardson'", "take one of these")]),
-    *argument("RungeKutta", runge_kutta, "variables", [("q", ValueError, "must be 'velocities'", "take one of these")]),
-    *argument("RungeKutta", runge_kutta, "partition", [(1, TypeError, "must be 'lasting'", "take one of these")]),
-    *argument("RungeKutta", runge_kutta, "outer_test", [(1, TypeError, "must be 'all'", "take one of these")]),
-    *argument("RungeKutta", runge_kutta, "inner_tol", FEW_POSITIVES),
-    *argument("RungeKutta", runge_kutta, "outer_tol", [*FEW_POSITIVES, INFINITE]),
+    *of_option("error", [("none", ValueError, "must be 'richardson'", "take one of these")]),
+    *of_option("variables", [("q", ValueError, "must be 'velocities'", "take one of these")]),
+    *of_option("partition", [(1, TypeError, "must be 'lasting'", "take one of these")]),
+    *of_option("outer_test", [(1, TypeError, "must be 'all'", "take one of these")]),
+    *of_option("inner_tol", FEW_POSITIVES),
+    *of_option("outer_tol", [*FEW_POSITIVES, INFINITE]),
     of_runge_kutta(
         "`outer='newton', variables='momenta'`",
         lambda: runge_kutta(outer="newton", variables="momenta"),
@@ -67,9 +70,7 @@ METHODS = [
         "outer='paper' is the paper's procedure",
         "take outer='fixed-point' for symmetric partitions",
     ),
-    *argument(
-        "Newmark",
-        Newmark,
+    *of_newmark(
         "beta",
         [
             (2.0, ValueError, "must be between 0 and 1; given 2.0", UNIT),
@@ -79,8 +80,8 @@ METHODS = [
             (HUGE, ValueError, "must fit into a float", UNIT),
         ],
     ),
-    *argument("Newmark", Newmark, "gamma", [(-0.5, ValueError, "must be between 0 and 1; given -0.5", UNIT)]),
-    *argument("Newmark", Newmark, "error_tol", FEW_POSITIVES),
+    *of_newmark("gamma", [(-0.5, ValueError, "must be between 0 and 1; given -0.5", UNIT)]),
+    *of_newmark("error_tol", FEW_POSITIVES),
     *argument(
         "BDF",
         BDF,
@@ -113,15 +114,8 @@ METHODS = [
     *argument("gauss", gauss, "s", [(True, TypeError, "must be an int", STAGES), ("3", TypeError, "must be", STAGES)]),
     *argument("gauss", gauss, "s", [(HUGE, ValueError, "must be at most 100", "give a moderate number")]),
     *argument("lobatto_iiie", lobatto_iiie, "s", [(1, ValueError, "must be at least 2", STAGES)]),
-    *argument(
-        "Tableau",
-        tableau,
-        "name",
-        [(3, TypeError, "must be a string; given 3", "give a string")],
-    ),
-    *argument(
-        "Tableau",
-        tableau,
+    *of_tableau("name", [(3, TypeError, "must be a string; given 3", "give a string")]),
+    *of_tableau(
         "A",
         [
             ([[0.5, 0.0]], ValueError, r"must have shape \(1, 1\).*given shape \(1, 2\)", "give s rows and columns"),
@@ -131,9 +125,7 @@ METHODS = [
             ([[True]], TypeError, "must be an array of real numbers", "give numbers"),
         ],
     ),
-    *argument(
-        "Tableau",
-        tableau,
+    *of_tableau(
         "b",
         [
             ([], ValueError, "must be a vector with one weight for each stage", "give s weights"),
@@ -141,18 +133,14 @@ METHODS = [
             ([np.inf], ValueError, "must be finite", "give finite coefficients"),
         ],
     ),
-    *argument(
-        "Tableau",
-        tableau,
+    *of_tableau(
         "c",
         [
             ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"),
             ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A 1"),
         ],
     ),
-    *argument(
-        "Tableau",
-        tableau,
+    *of_tableau(
         "order",
         [
             (0, ValueError, "must be at least 1; given 0", "give the classical order"),

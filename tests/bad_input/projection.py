@@ -1,5 +1,7 @@
 """Wrong arguments and guesses of consistent_state."""
 
+from functools import partial
+
 import numpy as np
 
 from tests.bad_input.case import FEW_VECTORS, HUGE, argument, cases_of, linkage, swinging
@@ -13,6 +15,7 @@ def project(system=None, t=0.0, q=(0.6, -0.8), v=(0.0, 0.0), **options):
 
 FINITE = "give a finite time, s"
 of_projection = cases_of("consistent_state")
+of_argument = partial(argument, "consistent_state", project)
 PROJECTION = [
     of_projection(
         "a `Problem` as `system`",
@@ -21,9 +24,7 @@ PROJECTION = [
         "give problem.system",
         TypeError,
     ),
-    *argument(
-        "consistent_state",
-        project,
+    *of_argument(
         "t",
         [
             (np.nan, ValueError, "must be finite; given nan", FINITE),
@@ -34,11 +35,9 @@ PROJECTION = [
             (HUGE, ValueError, "must fit into a float", FINITE),
         ],
     ),
-    *argument("consistent_state", project, "q", FEW_VECTORS),
-    *argument("consistent_state", project, "v", FEW_VECTORS),
-    *argument(
-        "consistent_state",
-        project,
+    *of_argument("q", FEW_VECTORS),
+    *of_argument("v", FEW_VECTORS),
+    *of_argument(
         "keep",
         [
             ("0", TypeError, "must be a list of indices.*given '0'", "give a list: [0]"),

@@ -1,5 +1,7 @@
 """Wrong arguments of solve_dae."""
 
+from functools import partial
+
 import numpy as np
 
 from tests.bad_input.case import (
@@ -27,12 +29,11 @@ from twoloop import ConstrainedSystem, Newmark, solve_dae
 from twoloop.methods.tableaux import gauss
 
 of_solve = cases_of("solve_dae")
+of_argument = partial(argument, "solve_dae", solve)
 SOLVE = [
-    *argument("solve_dae", solve, "q0", VECTORS),
-    *argument("solve_dae", solve, "v0", FEW_VECTORS),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument("q0", VECTORS),
+    *of_argument("v0", FEW_VECTORS),
+    *of_argument(
         "t_span",
         [
             ((1.0, 0.0), ValueError, r"must be \(start, end\) with end > start; given \(1.0, 0.0\)", "swap them"),
@@ -48,9 +49,7 @@ SOLVE = [
             (DAYS, TypeError, "must be an array of real numbers", "give seconds"),
         ],
     ),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument(
         "t_eval",
         [
             ([0.5, 1.5], ValueError, r"must lie within t_span = \(0.0, 1.0\).*to 1.5", "keep within t_span"),
@@ -76,11 +75,9 @@ SOLVE = [
         r"t_eval must hold multiples of step_size = 0.1.*0.25",
         "give times on the fixed grid, or leave step_size out",
     ),
-    *argument("solve_dae", solve, "rtol", [*POSITIVES, INFINITE, LIST, NONE]),
-    *argument("solve_dae", solve, "atol", [*POSITIVES, INFINITE, SHORT_ATOL]),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument("rtol", [*POSITIVES, INFINITE, LIST, NONE]),
+    *of_argument("atol", [*POSITIVES, INFINITE, SHORT_ATOL]),
+    *of_argument(
         "atol",
         [
             ([1e-6, 0.0], WRONG, "must be", "give positive tolerances"),
@@ -95,11 +92,9 @@ SOLVE = [
         "rtol and atol must not both be below",
         "raise one of them to 1e-15 or more",
     ),
-    *argument("solve_dae", solve, "first_step", [*FEW_POSITIVES, INFINITE]),
-    *argument("solve_dae", solve, "max_step", [*FEW_POSITIVES, (None, TypeError, "must be a number", "leave it out")]),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument("first_step", [*FEW_POSITIVES, INFINITE]),
+    *of_argument("max_step", [*FEW_POSITIVES, (None, TypeError, "must be a number", "leave it out")]),
+    *of_argument(
         "step_size",
         [
             *FEW_POSITIVES,
@@ -119,9 +114,7 @@ SOLVE = [
         "step_size is a constant step.*max_step",
         "give step_size alone",
     ),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument(
         "max_steps",
         [
             (0, ValueError, "must be at least 1; given 0", "leave it out for no limit"),
@@ -132,9 +125,7 @@ SOLVE = [
             (HUGE, ValueError, "must fit into 64 bits", "leave it out for no limit"),
         ],
     ),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument(
         "method",
         [
             ("RK45", ValueError, "must be one of auto.*given 'RK45'", "take one of the names listed"),
@@ -156,9 +147,7 @@ SOLVE = [
         "write RungeKutta(gauss(2))",
         TypeError,
     ),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument(
         "compiled",
         [
             ("yes", TypeError, "must be True or False; given 'yes'", "give True or leave it out"),
@@ -206,18 +195,14 @@ SOLVE = [
         "make one with ConstrainedSystem.from_python",
         TypeError,
     ),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument(
         "progress",
         [
             ("yes", TypeError, "must be True or False; given 'yes'", "give True or leave it out"),
             (1, TypeError, "must be True or False; given 1", "give True or leave it out"),
         ],
     ),
-    *argument(
-        "solve_dae",
-        solve,
+    *of_argument(
         "dense_output",
         [
             ("yes", TypeError, "must be True or False; given 'yes'", "give True or False"),

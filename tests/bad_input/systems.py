@@ -1,5 +1,7 @@
 """Systems and callbacks that make no sense."""
 
+from functools import partial
+
 import numpy as np
 
 from tests.bad_input.case import HUGE, argument, cases_of, linkage
@@ -28,10 +30,10 @@ COUNT = "give the number of coordinates, an int"
 of_from_python = cases_of("ConstrainedSystem.from_python")
 of_compiled = cases_of("ConstrainedSystem")
 of_callback = cases_of("callback")
+of_compiled_argument = partial(argument, "ConstrainedSystem", compiled)
+of_argument = partial(argument, "ConstrainedSystem.from_python", make)
 SYSTEMS = [
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
+    *of_argument(
         "n_q",
         [
             (0, ValueError, "must be at least 1; given 0", COUNT),
@@ -43,18 +45,14 @@ SYSTEMS = [
             (HUGE, ValueError, "must fit into 64 bits", COUNT),
         ],
     ),
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
+    *of_argument(
         "n_c",
         [
             (-1, ValueError, "must be at least", "give the number of constraints"),
             (True, TypeError, "must be an int; given True", "give the number of constraints"),
         ],
     ),
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
+    *of_argument(
         "mass",
         [
             (np.eye(3), ValueError, r"must have shape \(2, 2\); given .*shape \(3, 3\)", "give an (n_q, n_q) array"),
@@ -65,30 +63,19 @@ SYSTEMS = [
             (1.0, ValueError, r"must have shape \(2, 2\)", "write 1.0 * np.eye(2)"),
         ],
     ),
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
+    *of_argument(
         "force",
         [
             (None, TypeError, "must be a function; given None", "give force(t, q, v)"),
             ([0.0, -9.81], TypeError, "must be a function; given", "give force(t, q, v)"),
         ],
     ),
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
-        "gamma",
-        [(0.0, TypeError, "must be a function; given 0.0", "give gamma(t, q, v), or leave it out")],
-    ),
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
+    *of_argument("gamma", [(0.0, TypeError, "must be a function; given 0.0", "give gamma(t, q, v), or leave it out")]),
+    *of_argument(
         "constraint_rate",
         [("linear", TypeError, "must be a function; given 'linear'", "give constraint_rate(t, q), or leave it out")],
     ),
-    *argument(
-        "ConstrainedSystem.from_python",
-        make,
+    *of_argument(
         "bandwidth",
         [
             (-1, ValueError, "must be at least 0; given -1", "give an int of at least 0, or leave it out"),
@@ -114,9 +101,7 @@ SYSTEMS = [
         "bandwidth needs a constant mass",
         "give the mass as an array",
     ),
-    *argument(
-        "ConstrainedSystem",
-        compiled,
+    *of_compiled_argument(
         "parameters",
         [
             (["long"], TypeError, "must be an array of real numbers", "give a vector of numbers"),
@@ -126,20 +111,15 @@ SYSTEMS = [
             ([HUGE, 2.0, 1.5, 3.0], ValueError, "must hold numbers that fit into a float", "give finite numbers"),
         ],
     ),
-    *argument(
-        "ConstrainedSystem",
-        compiled,
+    *of_compiled_argument(
         "constant_mass",
         [
             ("yes", TypeError, "must be True or False; given 'yes'", "give True or False"),
             (1, TypeError, "must be True or False; given 1", "give True or False"),
         ],
     ),
-    *argument(
-        "ConstrainedSystem",
-        compiled,
-        "bandwidth",
-        [(2, ValueError, "needs a constant mass matrix", "give constant_mass=True where that is so")],
+    *of_compiled_argument(
+        "bandwidth", [(2, ValueError, "needs a constant mass matrix", "give constant_mass=True where that is so")]
     ),
     of_compiled(
         "a plain function as `force`",

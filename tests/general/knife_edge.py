@@ -30,11 +30,6 @@ def state(t):
     return q, np.array([PULL / SPIN * s * c, PULL / SPIN * s * s, SPIN])
 
 
-def multiplier(t):
-    """Of A = (sin phi, -cos phi, 0)."""
-    return 2.0 * M * PULL * np.sin(SPIN * t)
-
-
 FUNCTIONS = {
     "mass": np.diag([M, M, INERTIA]),
     "force": lambda t, q, v: np.array([M * PULL, 0.0, 0.0]),

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tests.general.knife_edge import multiplier
 from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism
 from tests.general.runs import relative_error, run
 
@@ -73,9 +72,3 @@ def test_a_row_of_velocities_does_not_replace_one_of_positions():
     """The last non-holonomic row of the disc is the derivative of its holonomic one, which must be kept."""
     result, _ = run("wobbling disc, redundant", "DOP853")
     assert list(result.redundant) == [3]
-
-
-@both
-def test_multiplier_of_the_knife_edge(method):
-    result, _ = run("knife edge", method)
-    assert result.lam[0] == pytest.approx(multiplier(result.t), abs=1e-8)

@@ -39,24 +39,6 @@ def test_a_row_given_twice_shares_the_force(method, factor):
     assert result.lam[1] == pytest.approx(factor * result.lam[0], abs=1e-9)
 
 
-def test_a_system_of_full_rank_has_none():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", ConstraintWarning)
-        result = solve_dae(pendulum(), (0.0, 0.1), *START)
-    assert result.rank == 1
-    assert list(result.redundant) == []
-
-
-def test_the_warning_says_what_follows_from_what():
-    """The redundant row of the slider-crank follows from those of the rod and of the guide."""
-    m = mechanism("redundant slider-crank")
-    with pytest.warns(ConstraintWarning, match="redundant slider-crank") as caught:
-        result = solve_dae(m.system(), (0.0, 0.1), *m.start)
-    words, (row,) = str(caught[0].message), result.redundant
-    assert row in (2, 3, 4, 5, 6, 8)
-    assert str(row) in words
-
-
 @pytest.mark.parametrize("method", ["Gauss12", "DOP853"])
 def test_rows_that_part_later_end_the_run(method):
     """Both drives agree at the start, and only there: to go on with one of them would be wrong in silence."""

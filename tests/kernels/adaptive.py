@@ -7,6 +7,7 @@ import pytest
 
 from references.paper.four_bar_minimal import trajectory
 from tests.problems import (
+    LINKAGES,
     force_residual,
     moving_pivot,
     moving_pivot_state,
@@ -22,9 +23,7 @@ from tests.problems import (
     worst,
 )
 from twoloop import solve_dae
-from twoloop.mechanisms import four_bar
 
-LINKAGES = {"default": four_bar(), "collinear": four_bar((0.8, 1.2, 1.0), 2.0, theta3=0.0, branch=-1)}
 linkages = pytest.mark.parametrize("linkage", LINKAGES)
 PUSHED = np.array([20.0, -9.81])  # force from 1 s on, where it jumps
 

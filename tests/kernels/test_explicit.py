@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import trajectory
-from references.scipy.index1 import solve_index1
 from tests.kernels.adaptive import LINKAGES, AdaptiveMethod, four_bar_run, linkages, shared_run
 from tests.problems import run, violations, worst
 from twoloop import DOP853, ConstrainedSystem, solve_dae
@@ -129,23 +128,6 @@ def test_at_equal_error_it_costs_less_than_the_others():
         other, other_error = shared_run(method, tol)
         assert error < other_error
         assert own.stats.n_evaluations < 0.8 * other.stats.n_evaluations
-
-
-def test_at_equal_error_it_costs_what_scipys_projected_solver_does():
-    # the same tableau on q'' = a, projected after every step; cost over error on the log-log lines through the runs
-    problem, target, counts = FOUR_BAR, 1e-6, []
-    ours, theirs = [], []
-    for tol in (1e-5, 1e-7, 1e-9):
-        result, error = shared_run("DOP853", tol)
-        ours.append((error, result.stats.n_evaluations))
-        result = solve_index1(
-            problem.system, (0.0, 10.0), problem.q0, problem.v0, "DOP853", tol, tol, stabilisation="projection"
-        )
-        theirs.append((worst(result.q, trajectory(problem.parameters, result.t)[0]), result.stats.n_evaluations))
-    for line in (ours, theirs):
-        error, count = np.log(np.array(line)).T
-        counts.append(np.exp(np.polyval(np.polyfit(error, count, 1), np.log(target))))
-    assert 0.7 < counts[0] / counts[1] < 1.2
 
 
 # --- constraints

@@ -2,7 +2,6 @@
 
 import numba
 from numba import types
-from numba.core.types.functions import Function
 
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, compiled, merged
@@ -27,7 +26,3 @@ def test_what_a_merged_helper_calls_is_not_merged():
     assert kernel(1.0) == 8.0
     assert "alwaysinline" in _code(_short)
     assert "alwaysinline" not in _code(_long)
-
-
-def test_numba_is_left_as_it_is_for_others():
-    assert "get_call_type" not in vars(Function)

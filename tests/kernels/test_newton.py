@@ -106,14 +106,6 @@ def test_derivatives_are_reused_while_newton_converges(default_four_bar):
     assert 0 < result.stats.n_jacobians < 0.7 * result.stats.n_accepted
 
 
-def test_partitions_change_under_newton_too(collinear_four_bar):
-    problem = collinear_four_bar
-    truth = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11)
-    result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, RungeKutta(gauss(4), outer="newton"))
-    assert result.success and result.stats.n_partitions > 3
-    assert worst(result.q[:, -1], truth.q[:, -1]) < 1e-5
-
-
 # --- outer="auto"
 
 

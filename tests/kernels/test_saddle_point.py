@@ -5,9 +5,20 @@ import pytest
 
 from studies.work_precision.scaling import chain
 from tests.kernels.test_augmented import form, started
-from tests.problems import called
+from tests.problems import kept
 from twoloop.kernels.algebra.saddle_point import solve_both
-from twoloop.kernels.data.common import AUGMENTED, DONE, FORM, MULTIPLIERS, NULL_SPACE, compiled
+from twoloop.kernels.data.common import (
+    AUGMENTED,
+    DONE,
+    FORM,
+    KIT,
+    MULTIPLIERS,
+    NULL_SPACE,
+    VECTOR,
+    WORK,
+    f8,
+    i8,
+)
 from twoloop.kernels.evaluation.accelerations import factor_there
 from twoloop.kernels.evaluation.inner import factor_dependent, tangents
 from twoloop.mechanisms import andrews, four_bar, heavy_top, moderately_stiff_beam, n_four_bar
@@ -22,7 +33,7 @@ MECHANISMS = {
 }
 
 
-@compiled
+@kept(i8(KIT, WORK, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR))
 def solution(f, w, t, q, r, c, a, lam):
     """All of it at one state, as an evaluation does."""
     code = factor_dependent(f, w, t, q)
@@ -48,6 +59,6 @@ def test_solution_and_multipliers_are_those_of_the_whole_matrix(name):
     for _ in range(3):
         r, c = rng.standard_normal(n), rng.standard_normal(n_c)
         a, lam = np.zeros(n), np.zeros(n_c)
-        assert called(solution, run.functions, run.work, 0.0, problem.q0, r, c, a, lam) == DONE
+        assert solution(run.kit, run.work, 0.0, problem.q0, r, c, a, lam) == DONE
         known = np.linalg.solve(whole, np.concatenate([r, c]))
         assert np.allclose(np.concatenate([a, lam]), known, rtol=1e-8, atol=1e-8 * np.abs(known).max())

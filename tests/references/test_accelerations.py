@@ -7,9 +7,10 @@ from references.equations.accelerations import Equations, compiled_gamma, saddle
 from references.equations.linear import SINGULAR, cholesky
 from references.equations.ode import ode_result
 from references.paper.four_bar_minimal import MinimalFourBar
-from references.scipy.index1 import solve_index1
+from references.scipy.index1 import STABILISATIONS, solve_index1
+from tests.general.faulty import SPRING, massless_coordinate
 from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
-from twoloop import ConstrainedSystem, mechanisms, solve_dae
+from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import four_bar, governor, heavy_top, spatial_four_bar, spatial_slider_crank
 from twoloop.run.record import Statistics
 
@@ -123,25 +124,15 @@ def test_rounding_is_not_taken_for_mass():
 
 @pytest.mark.parametrize("constant", [True, False])
 def test_a_massless_coordinate_that_a_constraint_holds(constant):
-    """x and y on a unit circle, and z = x, without mass, driven by a force that the multiplier has to carry."""
-    mass = np.diag([1.0, 1.0, 0.0])
-    system = ConstrainedSystem.from_python(
-        n_q=3,
-        n_c=2,
-        mass=mass if constant else lambda t, q: mass,
-        force=lambda t, q, v: np.array([0.0, -9.81, 0.5]),
-        constraint=lambda t, q: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0), q[2] - q[0]]),
-        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0], [-1.0, 0.0, 1.0]]),
-        gamma=lambda t, q, v: np.array([-(v[0] ** 2) - v[1] ** 2, 0.0]),
-    )
-    start = np.array([1.0, 0.0, 1.0]), np.zeros(3)
-    for more in ({"stabilisation": "none"}, {"stabilisation": "baumgarte"}, {"stabilisation": "projection"}):
-        result = solve_index1(system, (0.0, 1.0), *start, rtol=1e-10, atol=1e-10, **more)
+    m = massless_coordinate()
+    system = m.system() if constant else m.system(mass=lambda t, q: np.diag([1.0, 1.0, 0.0]))
+    for stabilisation in STABILISATIONS:
+        result = solve_index1(system, (0.0, 1.0), *m.start, rtol=1e-10, atol=1e-10, stabilisation=stabilisation)
         assert result.success, result.message
-        q, v, lam = result.q[:, -1], result.v[:, -1], result.lam[:, -1]
-        assert abs(0.5 * (v[0] ** 2 + v[1] ** 2) + 9.81 * q[1] - 0.5 * (q[0] - 1.0)) < 1e-8
-        assert abs(lam[1] - 0.5) < 1e-12
-        if more["stabilisation"] == "projection":
+        q, v = result.q[:, -1], result.v[:, -1]
+        assert abs(m.energy(q, v) - m.energy(*m.start)) < 1e-8
+        assert abs(result.lam[1, -1] + SPRING * q[2]) < 1e-11
+        if stabilisation == "projection":
             assert worst(system.constraint(1.0, q), 0.0) < 1e-14
             assert worst(system.jacobian(1.0, q) @ v, 0.0) < 1e-13
 

@@ -5,6 +5,7 @@ import pytest
 from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import STABILISATIONS, solve_index1
 from tests.problems import (
+    LINKAGES,
     moving_pivot,
     moving_pivot_state,
     oblique_pendulum,
@@ -15,9 +16,7 @@ from tests.problems import (
     worst,
 )
 from tests.references.adapters import ADAPTERS, ANY_CALLBACK
-from twoloop.mechanisms import four_bar
 
-PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 # error of q at 10 s for each tolerance: three times the largest of 15 runs that differ in rounding, which alone moves
 # IDA's error by a factor of 2 to 24
 BOUNDS = {
@@ -51,7 +50,7 @@ def run(name, *start, tol, **options):
 
 @pytest.mark.parametrize(("problem", "name"), BOUNDS)
 def test_agrees_with_the_truth_and_follows_the_tolerance(problem, name):
-    made, times, errors = PROBLEMS[problem], [10.0], []
+    made, times, errors = LINKAGES[problem], [10.0], []
     q, v = trajectory(made.parameters, times)
     for tol, bound in BOUNDS[problem, name].items():
         result = run(name, made.system, (0.0, 10.0), made.q0, made.v0, tol=tol)

@@ -1,7 +1,5 @@
 """Exudyn's own models: the four-bar against the truth, published mechanisms against their states, options, failures."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 
@@ -13,10 +11,11 @@ from references.exudyn import run as exudyn_run
 from references.exudyn.mechanisms import MODELS, has_model, model_of, solve_exudyn
 from references.exudyn.model import frame
 from references.exudyn.run import SOLVERS
-from references.paper.four_bar_minimal import MinimalFourBar
+from references.paper.four_bar_minimal import trajectory
 from studies.bench.collector import Case
 from studies.bench.solvers import CATALOGUE, RADII, RIVALS
 from studies.validation import study as validation
+from tests.problems import LINKAGES
 from twoloop import mechanisms
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
@@ -30,16 +29,10 @@ BOUNDS = {
     ("collinear", "TrapezoidalIndex2"): 5e-4,
     ("collinear", "HHT"): 1e-3,
 }
-LINKAGES = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
-
-
-@cache
-def truth(name):
-    return MinimalFourBar.from_parameters(LINKAGES[name].parameters)
 
 
 def final_error(result, name):
-    q, v = truth(name).states(result.t[-1:])
+    q, v = trajectory(LINKAGES[name].parameters, result.t[-1:])
     return np.abs(result.q[:, -1] - q[:, 0]).max(), np.abs(result.v[:, -1] - v[:, 0]).max()
 
 

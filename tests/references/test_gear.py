@@ -1,14 +1,12 @@
 """Fixed-step BDF on the index-3 form: order, damping, constraints, the start, failures."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from numba import njit
 
 from references.equations.ode import accelerations
 from references.paper import gear
-from references.paper.four_bar_minimal import MinimalFourBar
+from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
 from tests.problems import (
     force_residual,
@@ -25,23 +23,18 @@ from twoloop.run.record import Status
 PROBLEM = four_bar()
 
 
-@cache
-def truth():
-    return MinimalFourBar.from_parameters(PROBLEM.parameters)
-
-
 def run(t_end, step, order, **options):
     return solve_gear(PROBLEM.system, (0.0, t_end), PROBLEM.q0, PROBLEM.v0, step, order, **options)
 
 
 def worst_errors(result):
-    q, v = truth().states(result.t)
+    q, v = trajectory(PROBLEM.parameters, result.t)
     return worst(result.q, q), worst(result.v, v)
 
 
 def slopes(order, steps, **options):
     """Observed orders of q and v at 0.6 s."""
-    q, v = truth().states([0.6])
+    q, v = trajectory(PROBLEM.parameters, [0.6])
     ends = [run(0.6, step, order, **options) for step in steps]
     errors = np.array([[worst(r.q[:, -1], q[:, 0]), worst(r.v[:, -1], v[:, 0])] for r in ends])
     return np.log(errors[0] / errors[-1]) / np.log(steps[0] / steps[-1])
@@ -95,7 +88,7 @@ def test_low_orders_damp_and_the_third_feeds(order, least, most):
 
 def test_accelerations_and_multipliers():
     result = run(1.0, 2e-3, 4, start="accurate")
-    q, v = truth().states(result.t)
+    q, v = trajectory(PROBLEM.parameters, result.t)
     a, lam = accelerations(PROBLEM.system, result.t, np.concatenate([q, v]))
     assert worst(result.a, a) < 1e-3 and worst(result.lam, lam) < 1e-3
     first = run(0.1, 0.01, 1)

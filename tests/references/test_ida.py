@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 
 from references.sundials.ida import FORMS, solve_ida
-from tests.problems import violations
+from tests.problems import LINKAGES, violations
 from twoloop import solve_dae
-from twoloop.mechanisms import four_bar
-
-PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 
 
 def test_stabilised_form_keeps_both_constraints_and_index_1_drifts():
-    problem = PROBLEMS["default"]
+    problem = LINKAGES["default"]
     kept, drifted = (
         violations(problem.system, solve_ida(problem.system, (0.0, 10.0), problem.q0, problem.v0, form, 1e-8, 1e-8))
         for form in ("stabilised", "index1")
@@ -23,7 +20,7 @@ def test_stabilised_form_keeps_both_constraints_and_index_1_drifts():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_result_has_our_shapes_and_signs(form):
-    problem = PROBLEMS["default"]
+    problem = LINKAGES["default"]
     result = solve_ida(problem.system, (0.0, 1.0), problem.q0, problem.v0, form, 1e-9, 1e-9)
     n = result.t.size
     assert result.q.shape == result.v.shape == result.a.shape == (9, n) and result.lam.shape == (8, n)

@@ -1,37 +1,29 @@
 """SciPy's solvers on the index-1 ODE: accuracy against the truth, drift and its two cures, output, failures."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from references.paper.four_bar_minimal import MinimalFourBar
+from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import ONE_STEP, STABILISATIONS, solve_index1
+from tests.kernels.adaptive import shared_run
 from tests.problems import (
+    LINKAGES,
     force_residual,
     pendulum,
     violations,
     worst,
 )
-from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
-
-PROBLEMS = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
-
-
-@cache
-def truth(name):
-    return MinimalFourBar.from_parameters(PROBLEMS[name].parameters)
 
 
 def run(name, t_end, *args, **options):
-    problem = PROBLEMS[name]
+    problem = LINKAGES[name]
     return solve_index1(problem.system, (0.0, t_end), problem.q0, problem.v0, *args, **options)
 
 
 def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
-    problem = PROBLEMS["default"]
+    problem = LINKAGES["default"]
     system = problem.system
 
     def rate(t, y):
@@ -52,7 +44,7 @@ def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
 
 def test_drift_and_its_cures():
     """Over 100 s: growth without bound, a bound that the tolerance sets, nothing but rounding."""
-    system = PROBLEMS["default"].system
+    system = LINKAGES["default"].system
     position, early, velocity = {}, {}, {}
     for stabilisation in STABILISATIONS:
         result = run("default", 100.0, "DOP853", 1e-6, 1e-6, stabilisation=stabilisation)
@@ -66,7 +58,7 @@ def test_drift_and_its_cures():
 
 
 def test_a_larger_alpha_holds_the_constraints_better_at_a_price():
-    system = PROBLEMS["default"].system
+    system = LINKAGES["default"].system
     weak, strong = (
         run("default", 5.0, rtol=1e-6, atol=1e-6, stabilisation="baumgarte", alpha=alpha) for alpha in (1.0, 50.0)
     )
@@ -76,7 +68,7 @@ def test_a_larger_alpha_holds_the_constraints_better_at_a_price():
 
 @pytest.mark.parametrize("stabilisation", STABILISATIONS)
 def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabilisation):
-    system = PROBLEMS["default"].system
+    system = LINKAGES["default"].system
     result = run("default", 2.0, rtol=1e-5, atol=1e-5, stabilisation=stabilisation)
     assert force_residual(system, result) < 1e-11
     alpha = 10.0 if stabilisation == "baumgarte" else 0.0
@@ -89,9 +81,9 @@ def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabili
 def test_interpolated_states_are_projected_too(method):
     times = np.linspace(0.0, 2.0, 101)
     result = run("default", 2.0, method, 1e-6, 1e-6, stabilisation="projection", t_eval=times)
-    position, velocity = violations(PROBLEMS["default"].system, result)
+    position, velocity = violations(LINKAGES["default"].system, result)
     assert np.array_equal(result.t, times) and position < 1e-14 and velocity < 1e-13
-    assert worst(result.q, truth("default").states(times)[0]) < 1e-4
+    assert worst(result.q, trajectory(LINKAGES["default"].parameters, times)[0]) < 1e-4
 
 
 def test_failure_of_a_projection_comes_back_as_a_row():
@@ -110,3 +102,20 @@ def test_lsoda_does_not_step_towards_a_singularity_without_end():
     result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "LSODA", 1e-4, 1e-4)
     assert result.status is Status.SOLVER_FAILED and "the step has shrunk" in result.message
     assert 0.69 < result.t[-1] <= 0.7 and result.stats.n_accepted < 20000
+
+
+def test_at_equal_error_the_projected_solver_costs_what_dop853_of_twoloop_does():
+    # the same tableau on q'' = a, projected after every step; cost over error on the log-log lines through the runs
+    target, counts = 1e-6, []
+    ours, theirs = [], []
+    for tol in (1e-5, 1e-7, 1e-9):
+        result, error = shared_run("DOP853", tol)
+        ours.append((error, result.stats.n_evaluations))
+        result = run("default", 10.0, "DOP853", tol, tol, stabilisation="projection")
+        theirs.append(
+            (worst(result.q, trajectory(LINKAGES["default"].parameters, result.t)[0]), result.stats.n_evaluations)
+        )
+    for line in (ours, theirs):
+        error, count = np.log(np.array(line)).T
+        counts.append(np.exp(np.polyval(np.polyfit(error, count, 1), np.log(target))))
+    assert 0.7 < counts[0] / counts[1] < 1.2

@@ -5,8 +5,8 @@ import pytest
 
 from references.equations.rows import independent_rows
 from references.scipy.index1 import solve_index1
+from tests.problems import pendulum
 from tests.references.adapters import ADAPTERS
-from twoloop import ConstrainedSystem
 from twoloop.mechanisms import bricard, redundant_slider_crank
 
 SLOW = ("CVODE", "IDA, stabilised", "Radau of solve_dae")
@@ -39,27 +39,25 @@ def test_the_rows_that_are_kept_span_all():
     assert independent_rows(rows) == (0, 2, 5)
 
 
-def pendulum(constraint, rate=None):
+def held_twice(constraint, rate=None):
     """A point on a circle, held by two rows of C with the same gradient."""
-    return ConstrainedSystem.from_python(
-        n_q=2,
+    return pendulum(
         n_c=2,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
         constraint=constraint,
         jacobian=lambda t, q: np.array([q, q]),
         constraint_rate=rate,
+        gamma=False,
         name="held twice",
     )
 
 
-@pytest.mark.parametrize("name", ["DOP853, projected", "IDA, stabilised"])
+@pytest.mark.parametrize("name", [pytest.param("DOP853, projected", marks=pytest.mark.slow), "IDA, stabilised"])
 def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
     start = (0.0, 1.0), [1.0, 0.0], [0.0, 0.0]
-    now = pendulum(lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.1)]))
+    now = held_twice(lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.1)]))
     with pytest.raises(ValueError, match=r"q0 must satisfy all constraints of 'held twice': row\(s\) \[1\]"):
         ADAPTERS[name](now, *start)
-    later = pendulum(
+    later = held_twice(
         lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.0 - 0.1 * t * t)]),
         lambda t, q: np.array([0.0, -0.1 * t]),
     )
@@ -70,14 +68,11 @@ def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
 
 def test_rows_that_part_at_a_position_where_rank_is_lost_only_for_a_moment_are_no_success():
     # the second row holds y at 0, where its gradient is that of the first
-    system = ConstrainedSystem.from_python(
-        n_q=2,
+    system = pendulum(
         n_c=2,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -1.0]),
         constraint=lambda t, q: np.array([q[0] - 1.0, (q[0] - 1.0) + q[1] ** 2]),
         jacobian=lambda t, q: np.array([[1.0, 0.0], [1.0, 2.0 * q[1]]]),
-        name="held at y = 0",
+        gamma=False,
     )
     result = solve_index1(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "DOP853", 1e-8, 1e-8)
     assert not result.success and "do not hold at the end" in result.message
