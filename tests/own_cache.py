@@ -5,17 +5,13 @@ from pathlib import Path
 
 from numba.core.caching import _CacheLocator
 
-from twoloop.kernels import lanes
 from twoloop.kernels.evaluation import calls
-
-IMPORTED = {lanes: lanes.advance_lanes, calls: calls.inner_loop}  # with twoloop, and compiled at once
 
 
 def with_kernels(cache):
-    """Fill a folder for NUMBA_CACHE_DIR with what this process has read or compiled."""
-    for module, kernel in IMPORTED.items():
-        folder = cache / _CacheLocator.get_suitable_cache_subpath(module.__file__)
-        folder.mkdir(parents=True)
-        for file in Path(kernel._cache.cache_path).glob(f"{module.__name__.rpartition('.')[2]}.{kernel.__name__}-*"):
-            shutil.copy(file, folder)
+    """Fill a folder for NUMBA_CACHE_DIR with the inner loop, which every run needs, as this process has it."""
+    folder = cache / _CacheLocator.get_suitable_cache_subpath(calls.__file__)
+    folder.mkdir(parents=True)
+    for file in Path(calls.inner_loop._cache.cache_path).glob("calls.inner_loop-*"):
+        shutil.copy(file, folder)
     return cache

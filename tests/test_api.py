@@ -1,6 +1,8 @@
 """The public face, run as the design prints it."""
 
 import pydoc
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -87,6 +89,12 @@ def test_ones_own_mechanism_as_printed():
 def test_all_that_is_promised_can_be_imported():
     for name in twoloop.__all__:
         assert getattr(twoloop, name).__doc__, name
+
+
+def test_an_import_compiles_no_kernels():
+    compiled = {"twoloop.kernels.lanes", "twoloop.kernels.evaluation.calls", "twoloop.kernels.advance"}
+    words = f"import sys, twoloop; sys.exit(len({compiled} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", words]).returncode == 0
 
 
 @pytest.mark.parametrize("name", twoloop.__all__)

@@ -23,7 +23,12 @@ from studies.bench.tables import DECADE, astray, setting_of, time_for, used
 
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
-MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA"), ("SciPy", ""))  # family, how names begin
+MAIN_RIVALS = (
+    ("heyoka", HEYOKA),
+    ("SUNDIALS", "CVODE"),
+    ("SUNDIALS", "IDA from C"),
+    ("SciPy", ""),
+)  # family, how names begin
 ERROR = "largest position error over the run (m, rad)"
 LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: failed, or > a decade"
 
@@ -92,7 +97,7 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "IDA from C, q and v tested": (BLACK, "<"),
     "IDA from C, order 2, positions tested": (BLUE, ">"),
     "IDA, stabilised": (GREY, "<"),
-    "IDA, index1": (SKY, "<"),
+    "IDA, index1": (BROWN, "<"),
     "LSODA, index 1": (BROWN, "p"),
     "DOP853, index 1": (PINK, "*"),
     "DOP853, projected": (ORANGE, "*"),

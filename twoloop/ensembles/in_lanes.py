@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
 from twoloop.generate.on_arrays import OnArrays
-from twoloop.generate.own_lanes import OwnLanes
 from twoloop.generate.straight_line import Choice
 from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
@@ -38,6 +37,8 @@ class LaneRuns:
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts):
+        from twoloop.generate.own_lanes import OwnLanes  # compiled, or read from the cache, at the first ensemble
+
         self.system, self.starts = system, starts
         generic, varying = generic_parameters(starts.parameters)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
