@@ -13,6 +13,7 @@ from twoloop.generate import (
     coefficients,
     lane_code,
     lane_emitter,
+    lane_series,
     llvm_code,
     llvm_trigonometry,
     series,
@@ -45,7 +46,8 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 BUILD_SECONDS = 1e-3  # for a quantity, about
-WRITERS = (series, straight_line, straight_code, coefficients, lane_code, lane_emitter, llvm_code, llvm_trigonometry)
+LANE_WRITERS = (lane_code, lane_series, lane_emitter)
+WRITERS = (series, straight_line, straight_code, coefficients, *LANE_WRITERS, llvm_code, llvm_trigonometry)
 
 i8 = types.int64
 

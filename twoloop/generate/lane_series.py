@@ -1,0 +1,320 @@
+"""The recurrences of a Taylor series as code for lanes: coefficients of one order from those of the orders below.
+
+Factors of products stand in rows, one for each order; a factor that several products share stands there once.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from twoloop.generate import llvm_trigonometry, straight_code
+from twoloop.generate.coefficients import Coefficients, Terms
+from twoloop.generate.lane_emitter import LaneEmitter
+from twoloop.generate.llvm_code import INTEGER, Quantities, Value
+from twoloop.generate.series import SeriesProgram, Sums, Table
+from twoloop.generate.straight_code import results_of
+from twoloop.generate.straight_line import Solution
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    EXPONENTIAL,
+    LOGARITHM,
+    PENDING,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+)
+
+AT_ONCE = 8  # sums in one loop, in registers
+
+
+class Operation(NamedTuple):
+    """One of a series' program; of sines and cosines both: two results."""
+
+    kind: int
+    results: tuple[int, ...]
+    first: tuple[Terms, float]
+    second: tuple[Terms, float]
+
+
+class LaneSeries:
+    """Writes the recurrences of a program.
+
+    `scratch` holds, lane vectors each: what the factors keep; r; the divisors of inverse functions; and rows of
+    factors of order 0, 1 and so on, behind sums that are carried to the next order.
+    """
+
+    def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
+        self.solution, self.numbers, self.n, self.n_rows = solution, numbers, n, n_rows
+        self.slots: dict[Any, int] = {}
+        self._divisors: dict[int, int] = {}
+        first = 1 + 3 * n + n_rows
+        self.early = self._operations(program.early, first)
+        self.late = self._operations(program.late, first + len(program.early.first.column))
+        self.rows = self._rows(program.rows, program.row_places)
+        self.balance = self._rows(program.balance, program.balance_places)
+        self._carried: dict[int, tuple[int, int]] = {}  # see _shared_sums
+        self._carried |= self._shared_sums()
+        self.sums_ahead = sorted(set(self._carried.values()))
+        for operation in (*self.early, *self.late):
+            self._factors(operation)
+            if operation.kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT):
+                self._divisors[operation.results[0]] = len(self._divisors)
+        self.r = solution.n_kept
+        self.divisors = self.r + n
+        self.carried = self.divisors + len(self._divisors)
+        self.table = self.carried + len(self.sums_ahead)
+        self.width = len(self.slots)
+
+    def scratch_size(self, order: int) -> int:
+        """Length of `scratch`, in vectors."""
+        return self.table + self.width * (order + 1)
+
+    @property
+    def structure(self) -> list[Any]:
+        """What the code depends on."""
+        return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.slots]
+
+    def _forms(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
+        more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
+        for row, i, c in zip(sums.row.tolist(), sums.more_column.tolist(), sums.more_coefficient.tolist(), strict=True):
+            more[row].append((i, c))
+        firsts = zip(rows, sums.column.tolist(), sums.coefficient.tolist(), sums.constant.tolist(), strict=True)
+        return [
+            self.numbers.of(tuple(term for term in ((i, c), *more[row]) if term[1] != 0.0), constant)
+            for row, i, c, constant in firsts
+        ]
+
+    def _rows(self, sums: Sums, places: Any) -> list[tuple[int, tuple[Terms, float]]]:
+        return list(zip(places.tolist(), self._forms(sums, places.tolist()), strict=True))
+
+    def _operations(self, table: Table, quantity: int) -> list[Operation]:
+        firsts, seconds = (self._forms(each, range(len(each.column))) for each in (table.first, table.second))
+        made = []
+        for kind, begin, end in table.groups[:, :3].tolist():
+            half = (end - begin) // 2 if kind == SINE else end - begin
+            for k in range(begin, begin + half):
+                results = (quantity + k, quantity + k + half) if kind == SINE else (quantity + k,)
+                made.append(Operation(kind, results, firsts[k], seconds[k]))
+        return made
+
+    def _slot(self, *key: Any) -> int:
+        """The place in a row of a factor: a form, or ("scaled", form), which is multiplied by its order."""
+        return self.slots.setdefault(key, len(self.slots))
+
+    def _shared_sums(self) -> dict[int, tuple[int, int]]:
+        """Pairs of factors of sines by the result of a product of a cosine, or a sine, and the rate of its angle.
+
+        (cos x) x' is the derivative of sin x, so that what is known of the product's coefficient of one order is the
+        sum for the sine of the next, over the unit of time.
+        """
+        pairs: dict[Any, tuple[int, int]] = {}
+        for operation in self.early:
+            terms, _ = operation.first
+            if operation.kind == SINE and all(1 <= i <= self.n for i, _ in terms):
+                rate = tuple((i + self.n, c) for i, c in terms)
+                for result, pair in zip(reversed(operation.results), self._factors(operation), strict=True):
+                    pairs[((result, 1.0),), rate] = pair
+        products = [each for each in self.early if each.kind == PENDING and not each.first[1] and not each.second[1]]
+        known = {each.results[0]: pairs.get((each.first[0], each.second[0])) for each in products}
+        return {result: pair for result, pair in known.items() if pair is not None}
+
+    def _factors(self, operation: Operation) -> list[tuple[int, int]]:
+        """Places of the factors X and Y of the products that are summed up for each result."""
+        kind, results, first, second = operation
+        if results[0] in self._carried:
+            return []
+        own = [self._slot(((result, 1.0),), 0.0) for result in results]
+        if kind in (PRODUCT, PENDING):
+            return [(self._slot(*first), self._slot(*second))]
+        if kind == RECIPROCAL:
+            return [(self._slot(*first), own[0])]
+        if kind == SQUARE_ROOT:
+            return [(own[0], own[0])]
+        if kind in (LOGARITHM, ARCTANGENT):
+            return [(self._slot("scaled", ((results[0], 1.0),), 0.0), self._slot(*second))]
+        x = self._slot("scaled", *first)
+        return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
+
+    def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
+        """Order 0, at t, q and v; what the factors keep is there."""
+        for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
+            emit.store(emit.constant(0.0), scratch, place)
+        row = _Row(self, emit, emit.pointer(scratch, self.table))
+        known = Quantities(emit, lambda i: inputs[i])
+        self._begin(emit, known, self.early, row, scratch)
+        self._begin(emit, known, self.late, row, scratch)
+        for place, form in self.balance:
+            emit.store(known.sum(*form), scratch, self.r + place)
+
+    def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
+        """From coefficients below an order to those of velocities of this order and of positions of the next."""
+        builder, n = emit.builder, self.n
+        following = builder.add(k, INTEGER(1))
+        q = emit.pointer(out, builder.mul(k, INTEGER(n)))
+        order, zero = emit.number(k), emit.constant(0.0)
+        time = builder.select(builder.icmp_signed("==", k, INTEGER(1)), unit, zero)
+        known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
+        row = _Row(self, emit, self._row(emit, scratch, k))
+        inverse = emit.divide(emit.constant(1.0), order)
+        self._operate(emit, known, self.early, row, scratch, k, order, inverse)
+        ahead = self._sums(emit, self.sums_ahead, scratch, following)
+        for place, pair in enumerate(self.sums_ahead):
+            emit.store(ahead[pair], scratch, self.carried + place)
+        per_unit = emit.divide(emit.constant(1.0), unit)
+        for result, pair in self._carried.items():
+            known.define(result, emit.multiply(per_unit, ahead[pair]))
+        scale = emit.negative(emit.divide(order, unit))
+        c = [zero] * self.n_rows
+        for place, (terms, _) in self.rows:
+            c[place] = emit.multiply(scale, known.sum(terms))
+        r = [emit.load(scratch, self.r + i) for i in range(n)]
+        kept = [emit.load(scratch, i) for i in range(self.solution.n_kept)]
+        solution = self.solution
+        _, (a, lam) = results_of(emit, solution.graph, solution.solved, [*r, *c, *kept], self.numbers)
+        per_v, per_q = emit.multiply(unit, inverse), emit.divide(unit, emit.number(following))
+        before = Quantities(emit, lambda i: zero)  # a and lam of the order before
+        for j in range(n):
+            v = emit.multiply(per_v, a[j])
+            known.define(1 + n + j, v)
+            emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(following, INTEGER(n))), j)
+            before.define(1 + 2 * n + j, a[j])
+        for i in range(self.n_rows):
+            before.define(1 + 3 * n + i, lam[i])
+        row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, INTEGER(1))))
+        for operations, values, into in ((self.early, known, row), (self.late, before, row_before)):
+            for operation in operations:
+                if operation.kind == PENDING and operation.results[0] not in self._carried:
+                    into.store(operation.second, values.sum(operation.second[0]))
+        self._operate(emit, known, self.late, row, scratch, k, order, inverse)
+        for place, (terms, _) in self.balance:
+            emit.store(known.sum(terms), scratch, self.r + place)
+
+    def _row(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
+        return emit.pointer(scratch, self.table, emit.builder.mul(order, INTEGER(self.width)))
+
+    def _begin(
+        self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
+    ) -> None:
+        """Order 0: the functions themselves; late factors that wait are stored when they are known."""
+        one, zero = emit.constant(1.0), emit.constant(0.0)
+        for operation in operations:
+            kind, results, first, second = operation
+            x = known.sum(*first)
+            row.store(first, x, "if used")
+            divisor = None
+            if kind == PENDING:
+                if operations is self.early and results[0] not in self._carried:
+                    row.store(second, known.sum(*second))
+                values = [zero]
+            elif kind == PRODUCT:
+                z = known.sum(*second)
+                row.store(second, z)
+                values = [emit.multiply(x, z)]
+            elif kind == SINE:
+                values = list(llvm_trigonometry.sine_and_cosine(emit, x))
+            elif kind == RECIPROCAL:
+                values = [emit.divide(one, x)]
+            else:
+                values = [emit.function(straight_code.FUNCTIONS[kind], x)]
+                if kind in (LOGARITHM, ARCTANGENT):
+                    divisor = known.sum(*second)
+                    row.store(second, divisor)
+                elif kind == SQUARE_ROOT:
+                    divisor = emit.add(values[0], values[0])
+            if kind in (SINE, EXPONENTIAL, LOGARITHM, ARCTANGENT):
+                scaled = (((results[0], 1.0),), 0.0) if kind in (LOGARITHM, ARCTANGENT) else first
+                row.store(("scaled", *scaled), zero)
+            if divisor is not None:
+                emit.store(emit.divide(one, divisor), scratch, self.divisors + self._divisors[results[0]])
+            for result, value in zip(results, values, strict=True):
+                known.define(result, value)
+                row.store((((result, 1.0),), 0.0), value, "if used")
+
+    def _sums(
+        self, emit: LaneEmitter, pairs: list[tuple[int, int]], scratch: Value, order: Value
+    ) -> dict[tuple[int, int], Value]:
+        """Of pairs of factors, the sum of X[j] Y[order - j] over 0 < j < order."""
+        builder = emit.builder
+        sums: dict[tuple[int, int], Value] = {}
+        for begin in range(0, len(pairs), AT_ONCE):
+            some = pairs[begin : begin + AT_ONCE]
+            with emit.loop(INTEGER(1), order, [emit.constant(0.0)] * len(some)) as (j, totals, new):
+                x, y = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(order, j))
+                loaded: dict[tuple[Value, int], Value] = {}
+                for (i, k), total in zip(some, totals, strict=True):
+                    for base, place in ((x, i), (y, k)):
+                        if (base, place) not in loaded:
+                            loaded[base, place] = emit.load(base, place)
+                    new.append(emit.add(total, emit.multiply(loaded[x, i], loaded[y, k])))
+            sums |= dict(zip(some, new, strict=True))
+        return sums
+
+    def _operate(
+        self,
+        emit: LaneEmitter,
+        known: Quantities,
+        operations: list[Operation],
+        row: "_Row",
+        scratch: Value,
+        k: Value,
+        order: Value,
+        inverse: Value,
+    ) -> None:
+        """An order that is not 0; of what waits, what is known before."""
+        pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
+        there = {pair: self.carried + place for place, pair in enumerate(self.sums_ahead) if pair in pairs}
+        sums = self._sums(emit, [pair for pair in pairs if pair not in there], scratch, k)
+        sums |= {pair: emit.load(scratch, place) for pair, place in there.items()}
+        begin = emit.pointer(scratch, self.table)
+        for operation in operations:
+            kind, results, (first, _), (second, _) = operation
+            if results[0] in self._carried:
+                continue
+            totals = [sums[pair] for pair in self._factors(operation)]
+            at = [(emit.load(begin, x), emit.load(begin, y)) for x, y in self._factors(operation)]
+            u = known.sum(first)
+            row.store(operation.first, u, "if used")
+            if kind == PENDING:
+                values = [emit.add(totals[0], emit.multiply(u, at[0][1]))]
+            elif kind == PRODUCT:
+                z = known.sum(second)
+                row.store(operation.second, z)
+                values = [emit.add(emit.add(totals[0], emit.multiply(u, at[0][1])), emit.multiply(at[0][0], z))]
+            elif kind == RECIPROCAL:
+                total = emit.add(totals[0], emit.multiply(u, at[0][1]))
+                values = [emit.negative(emit.multiply(total, at[0][1]))]
+            elif kind == SQUARE_ROOT:
+                divisor = emit.load(scratch, self.divisors + self._divisors[results[0]])
+                values = [emit.multiply(emit.subtract(u, totals[0]), divisor)]
+            elif kind in (LOGARITHM, ARCTANGENT):
+                divisor = emit.load(scratch, self.divisors + self._divisors[results[0]])
+                values = [emit.multiply(emit.subtract(u, emit.multiply(totals[0], inverse)), divisor)]
+                row.store(("scaled", ((results[0], 1.0),), 0.0), emit.multiply(order, values[0]))
+                row.store(operation.second, known.sum(second))
+            else:
+                x = emit.multiply(order, u)
+                row.store(("scaled", *operation.first), x)
+                values = [
+                    emit.multiply(emit.add(total, emit.multiply(x, y)), inverse)
+                    for total, (_, y) in zip(totals, at, strict=True)
+                ]
+                if kind == SINE:
+                    values[1] = emit.negative(values[1])
+            for result, value in zip(results, values, strict=True):
+                known.define(result, value)
+                row.store((((result, 1.0),), 0.0), value, "if used")
+
+
+class _Row:
+    """Factors of one order, stored where they are used."""
+
+    def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
+        self.code, self.emit, self.base = code, emit, base
+        self.stored: set[int] = set()
+
+    def store(self, key: Any, value: Value, when: str = "") -> None:
+        """Put a factor in its place; "if used": it may have none."""
+        place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
+        if place is not None and place not in self.stored:
+            self.stored.add(place)
+            self.emit.store(value, self.base, place)
