@@ -17,7 +17,7 @@ from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.layout import _free
 from twoloop.methods.plans_for import MOST, plans_for
 from twoloop.methods.presets import PRESETS
-from twoloop.run.run import Run
+from twoloop.run import comparison
 
 MANY, FEW = 700, 500  # calls of functions in a run that compares callbacks again, as the second, and in others
 
@@ -164,8 +164,8 @@ def test_a_plan_is_that_of_the_choice_of_its_code():
 
 
 def test_what_a_method_was_traced_to_is_compared_in_its_first_run(monkeypatch):
-    compared, look = [], Run._check_traces
-    monkeypatch.setattr(Run, "_check_traces", lambda self, *given: compared.append(1) or look(self, *given))
+    compared, look = [], comparison._traces
+    monkeypatch.setattr(comparison, "_traces", lambda *given: compared.append(1) or look(*given))
     problem = mechanisms.four_bar()
     for method in ("DOP853", "DOP853", "DOP853", "auto", "auto", "auto"):
         run(problem, method=method)

@@ -17,13 +17,12 @@ from twoloop.checks.consistency import (
     least_inertia,
     pattern_of,
 )
-from twoloop.checks.derivatives import unsymmetric_mass, wrong_derivative
-from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common, intervals
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.comparison import compared
 from twoloop.run.dense import Interpolator
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
@@ -55,7 +54,6 @@ CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go o
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
 _spare: dict[tuple[int, int, int], tuple[Array, Array, Array]] = {}  # buffers, by their sizes, for the next run
-LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
 
 
 class Run:
@@ -345,7 +343,7 @@ class Run:
                 status, message = outcome(self, code, t1, pace)
             if code != INTERRUPTED:
                 last = (float(self.clock[a.T]), self.state) if recorder.last is None else recorder.last
-                status, message = self._compared(t, table, last, sample, check_derivatives, status, message)
+                status, message = compared(self, t, table, last, sample, check_derivatives, status, message)
             if status in EXPLAINED_BY_STIFFNESS:
                 message += said_of_stiffness(looks, self.kit, self.work)
         except KeyboardInterrupt:
@@ -502,56 +500,3 @@ class Run:
             n_jacobians=c[common.N_JACOBIANS],
             cpu_time=cpu,
         )
-
-    def _compared(
-        self,
-        t: Array,
-        table: Array,
-        last: tuple[float, Array],
-        sample: Sample,
-        check_derivatives: bool,
-        status: Status,
-        message: str,
-    ) -> tuple[Status, str]:
-        """Status and message, unless callbacks are not what they should be where the run went.
-
-        Compiled ones are not compared again where they were: see Territory.
-        """
-        states = sample.up_to(last[0])
-        compared = (check_derivatives, *map(id, self.traced))  # the system keeps these
-        territory = self.system.remembered(("territory", compared), Territory)
-        if territory.covers(states) and not self.system.called_in_python:
-            return status, message
-        before = status
-        if check_derivatives:
-            status, message = self._check_again(t, table, last, status, message)
-        status, message = self._check_traces(states, status, message)
-        if status == before:
-            territory.add(states)
-        return status, message
-
-    def _check_again(
-        self, t: Array, table: Array, last: tuple[float, Array], status: Status, message: str
-    ) -> tuple[Status, str]:
-        """Status and message, unless a derivative is wrong where the run went."""
-        n = self.system.n_q
-        inner = np.arange(1, LATER_CHECKS + 1) * len(t) // (LATER_CHECKS + 1)
-        states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in np.unique(inner) if 0 < k < len(t)]
-        states.append((last[0], last[1][:n], last[1][n : 2 * n]))
-        exact = exact_derivatives(self.system)
-        fine = exact is not None and exact.wrong(self.system, generic_states(states)) is None
-        for instant, q, v in states:
-            wrong = None if fine else wrong_derivative(self.system, instant, q, v)
-            if fine and not self.system.constant_mass:
-                wrong = unsymmetric_mass(self.system, instant, q)
-            if wrong is not None:
-                return Status.WRONG_DERIVATIVE, f"At t = {instant:.10g} of the run {wrong} {message}"
-        return status, message
-
-    def _check_traces(self, states: Any, status: Status, message: str) -> tuple[Status, str]:
-        """Status and message, unless a callback gives other values than what was recorded of it."""
-        for traced in self.traced:
-            wrong = traced.wrong(self.system, states)
-            if wrong is not None:
-                return Status.WRONG_TRACE, f"In the run {wrong}. {message}"
-        return status, message
