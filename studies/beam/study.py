@@ -48,6 +48,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["growth_as_frequency"] = bool(0.5 < found["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
     own = runs[(runs["solver"] == EXUDYN) & runs["error_tip"].notna()]
     found["exudyn"] = [number(1e3 * float(floor)) for floor in own.groupby("case", sort=False)["floor"].first()]
+    ours = runs[runs["family"] == "two-loop"]
+    found["beside_steps"] = float((ours["call_s"] - ours["inside_s"]).median()) if "inside_s" in ours else None
     return found | _limits(rows)
 
 

@@ -100,7 +100,9 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
     paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
     sides = ([line for line in paying if line["solver"].endswith(", compiled") is ours] for ours in (False, True))
     best = [min(side, key=lambda line: (line["never"], max(line["pays"])), default=None) for side in sides]
-    parts = [f"{call(line['solver'])}, which pays {_from_run(line)}" for line in best if line is not None]
+    parts = [
+        f"{call(line['solver'])} pays soonest beside `auto`, {_from_run(line)}" for line in best if line is not None
+    ]
     if len(parts) > 1:
         parts[1] = f"of ours {parts[1]}"
     return ["; ".join(parts) + " (at an error of 1e-8)"] if parts else []

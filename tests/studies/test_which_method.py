@@ -87,14 +87,17 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
 
 @pytest.mark.parametrize(
     ("pays", "never", "said"),
-    [([3.0, 40.0], 1, "pays from run 3 to 40 on, on 1 of 5 mechanisms never"), ([], 5, None)],
+    [([3.0, 40.0], 1, "pays soonest beside `auto`, from run 3 to 40 on, on 1 of 5 mechanisms never"), ([], 5, None)],
 )
 def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pays(pays, never, said):
     line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
     theirs = {**line, "solver": "heyoka", "pays": [1.0], "never": 0}
     (row,) = takes({"work_precision": {"first_calls": [theirs, line]}}, [])
-    own = [f"of ours `compiled=True`, which {said}"] if said else []
-    assert row["take"] == "; ".join(["`heyoka`, which pays from run 1 on", *own]) + " (at an error of 1e-8)"
+    own = [f"of ours `compiled=True` {said}"] if said else []
+    assert (
+        row["take"]
+        == "; ".join(["`heyoka` pays soonest beside `auto`, from run 1 on", *own]) + " (at an error of 1e-8)"
+    )
     assert takes({"work_precision": {"first_calls": []}}, []) == []
 
 
