@@ -70,7 +70,7 @@ def make_work(
 
 def give_back(work: Work) -> None:
     """Let the next run of the same sizes have this workspace, of which nothing is used any more."""
-    if work.notes.base.size <= LARGEST_FREE and sum(map(len, _free.values())) < MOST_FREE:
+    if work.notes.base.size <= LARGEST_FREE and sum(map(len, list(_free.values()))) < MOST_FREE:
         _free.setdefault(_sizes(work), []).append(work)
 
 

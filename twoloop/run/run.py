@@ -53,6 +53,7 @@ CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go o
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
+MOST_SPARE, LARGEST_SPARE = 16, 100_000  # buffers that wait for their next run, and numbers of each of them
 _spare: dict[tuple[int, int, int], tuple[Array, Array, Array]] = {}  # buffers, by their sizes, for the next run
 
 
@@ -316,7 +317,7 @@ class Run:
                 plan, control, code = self._beyond(plan, control, code, n_steps)
                 kit = self.kit if plan is self.plan else kit
             report(self.clock[a.T])
-        if sparse:
+        if sparse and out_state.size <= LARGEST_SPARE and len(_spare) < MOST_SPARE:
             _spare[out_t.size, out_state.size, len(out_steps)] = buffers
         if wanted.between_steps:
             began = time.process_time()
