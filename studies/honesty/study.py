@@ -25,6 +25,7 @@ from studies.honesty.solvers import CVODE_C, DEFAULT, DEFAULT_COMPILED, HEYOKA, 
 from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
+from twoloop.kernels.compile.callbacks import KINDS
 
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
@@ -159,7 +160,8 @@ def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -
     """Compile in this process what the children call, on a harmless motion."""
     shared = name.removesuffix(LIMITED)
     sane, tolerance = trap.sane or trap.system, 1e-4
-    made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *sane.functions[:-2])
+    callbacks = (getattr(sane.functions, kind) for kind in KINDS)
+    made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *callbacks)
     if shared in BUILT:
         tolerance = trap.tolerance
         made_for += (trap.group, trap.name, trap.mechanism)

@@ -247,6 +247,13 @@ def test_an_impulse_is_asked_of_forms_that_hold_it():
         assert bool(why_not(name, kink)) == (not name.endswith(honesty.OURS) and not name.startswith("IDA"))
 
 
+def test_a_solver_is_warmed_up_once_for_the_same_callbacks():
+    traps_of, called, compiled = list(of_linkages())[:2], [], set()
+    for trap in traps_of:
+        honesty.warm_up("auto (twoloop)", called.append, trap, compiled)
+    assert len(called) == len(compiled) == 1 and called[0].t_end == 1e-6
+
+
 def test_forces_held_out_are_others_and_counted_apart():
     first, held = list(under_forces(quick=True)), list(held_out(quick=True))
     assert [(trap.name, trap.mechanism) for trap in first] == [(trap.name, trap.mechanism) for trap in held]
