@@ -248,8 +248,8 @@ def test_an_impulse_is_asked_of_forms_that_hold_it():
 
 
 def test_a_solver_is_warmed_up_once_for_the_same_callbacks():
-    traps_of, called, compiled = list(of_linkages())[:2], [], set()
-    for trap in traps_of:
+    dead_points, called, compiled = list(of_linkages())[2:4], [], set()
+    for trap in dead_points:
         honesty.warm_up("auto (twoloop)", called.append, trap, compiled)
     assert len(called) == len(compiled) == 1 and called[0].t_end == 1e-6
 
