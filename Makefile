@@ -64,7 +64,7 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 
 # the inner loop first, which all others need; then two processes, so that none compiles what another compiles
 compile: install ## compile the kernels, on two cores
-	@$(RUN) -c "import twoloop.kernels.evaluation.calls"
+	@$(RUN) -c "import twoloop.kernels.evaluation.own_inner"
 	@$(RUN) -c "import twoloop.kernels.steps.newton_step" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, lanes; \
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, diagonal_step, explicit_step, \

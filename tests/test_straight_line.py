@@ -1,5 +1,6 @@
 """Code made for the equations of one mechanism: against the general inner loop, dense linear algebra and references."""
 
+import ctypes
 import math
 import subprocess
 import sys
@@ -13,14 +14,16 @@ from numba import njit
 
 from tests.problems import worst
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
-from twoloop.generate import straight_code
+from twoloop.generate import stage_code, straight_code
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.derivative import Derivative
+from twoloop.generate.llvm_text import Module
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
-from twoloop.generate.straight_code import function_of, own_code
+from twoloop.generate.straight_code import own_code, write_function
 from twoloop.generate.straight_line import Choice, Factors, Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile import caches
+from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
 from twoloop.kernels.data.common import BY_GENERAL, DONE
 from twoloop.kernels.evaluation import calls
 from twoloop.mechanisms import (
@@ -73,7 +76,7 @@ def run_from(system, q0, v0, compiled):
     plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
     if compiled:
         own = own_code(system, 0.0, q0)
-        plan = replace(plan, inner=own.inner, numbers=own.numbers.values)
+        plan = replace(plan, inner=own.inner, own=(own.functions,), numbers=own.numbers.values)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
 
 
@@ -87,14 +90,22 @@ def read_by(graph, outputs):
 def compute(graph, outputs, inputs):
     """What code for some outputs gives: whether its conditions hold, and the arrays."""
     numbers = read_by(graph, outputs)
-    function = function_of(graph, outputs, numbers)
     filled = tuple(np.full(len(forms), np.nan) for forms in outputs.arrays.values())
+    return machine_code_of(graph, outputs, numbers)(*inputs, numbers.values, *filled), filled
 
-    @njit
-    def call(inputs, values, filled):
-        return function(inputs, values, filled)
 
-    return call(inputs, numbers.values, filled), filled
+def machine_code_of(graph, outputs, numbers):
+    """What Python calls, on arrays, for a function of LLVM."""
+    module, n = Module(), len(graph.sizes) + 1 + len(outputs.arrays)
+    write_function(module, "function", ("i1", ["double*"] * n), graph, outputs, numbers)
+    made = OwnFunctions(["function"], object_code(str(module)))
+    function = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_void_p] * n)(made.addresses["function"])
+
+    def call(*given, made=made):
+        arrays = [np.atleast_1d(each) for each in given]
+        return function(*(each.ctypes.data for each in arrays))
+
+    return call
 
 
 @ending_at_a_reference
@@ -236,19 +247,13 @@ def test_sine_and_cosine_are_right_to_rounding(size):
     (angle,) = graph.inputs(1, False)
     outputs = Outputs({"of": [angle.sine(), angle.cosine()]}, [])
     numbers = read_by(graph, outputs)
-    function, values = function_of(graph, outputs, numbers), numbers.values
-
-    @njit
-    def both(angles, sines, cosines):
-        out = np.zeros(2)
-        for k in range(angles.size):
-            function((angles[k],), values, (out,))
-            sines[k], cosines[k] = out
-
+    function, values = machine_code_of(graph, outputs, numbers), numbers.values
     rng = np.random.default_rng(6)
     angles = np.concatenate([size * rng.uniform(-1.0, 1.0, 20_000), np.arange(-50, 51) * np.pi / 4.0])
-    sines, cosines = np.zeros_like(angles), np.zeros_like(angles)
-    both(angles, sines, cosines)
+    found = np.zeros((angles.size, 2))
+    for angle, pair in zip(angles, found, strict=True):
+        function(np.array([angle]), values, pair)
+    sines, cosines = found.T
     assert worst(sines, np.sin(angles)) < 2.3e-16
     assert worst(cosines, np.cos(angles)) < 2.3e-16
 
@@ -362,9 +367,9 @@ def on_a_circle(radius, stiffness):
 
 @pytest.mark.parametrize("method", ["Taylor", "DOP853"])
 def test_one_code_serves_all_numbers(method, monkeypatch):
-    made, compile_inner = [], straight_code._inner
-    monkeypatch.setattr(straight_code, "_INNER", {})
-    monkeypatch.setattr(straight_code, "_inner", lambda *given: made.append(1) or compile_inner(*given))
+    made, own_functions = [], straight_code.own_functions
+    monkeypatch.setattr(straight_code, "_MADE", {})
+    monkeypatch.setattr(straight_code, "own_functions", lambda *given: made.append(1) or own_functions(*given))
     for radius, stiffness in ((1.3, 7.0), (0.7, 11.0), (2.1, 3.0)):
         start = ([radius, 0.0], [0.0, 0.0], method, 1e-9, 1e-9)
         ends = [
@@ -405,14 +410,16 @@ def test_a_second_process_compiles_nothing():
 
 def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(caches, "MOST_KEPT", 2)
-    monkeypatch.setattr(straight_code, "sources_folder", lambda: tmp_path)
-    monkeypatch.setattr(straight_code, "_INNER", {})
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions.sources_folder", lambda: tmp_path)
+    monkeypatch.setattr(straight_code, "_MADE", {})
+    monkeypatch.setattr(stage_code, "_MADE", {})
     for stiffness in (1.0, -1.0, 2.0):  # 1 and -1 stand in the code
         system = ConstrainedSystem(
             n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[stiffness]
         )
         assert solve_dae(system, (0.0, 0.1), [1.0], [0.0], "DOP853", compiled=True).success
-    assert len(list(tmp_path.glob("*.nbc"))) == 2
+    for kind in ("equations", "stages"):
+        assert len(list(tmp_path.glob(f"{kind}.*.nbc"))) == 2
 
 
 def test_the_derivative_of_every_operation():

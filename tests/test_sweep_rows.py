@@ -324,7 +324,7 @@ def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
     class Watched(made):
         def __init__(self, equations):
             super().__init__(equations)
-            held.append(weakref.ref(self.inner))
+            held.append(weakref.ref(self.functions))
             held.append(weakref.ref(self))
 
     monkeypatch.setattr(straight_code, "OwnCode", Watched)
@@ -335,4 +335,4 @@ def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
     assert len(held) == 8
     gc.collect()
     assert sum(each() is not None for each in held) <= 2
-    assert len(straight_code._INNER) == len(stage_code._COMPILED) == 1
+    assert len(straight_code._MADE) == len(stage_code._MADE) == 1

@@ -103,7 +103,7 @@ class LaneRuns:
         settings = np.array([n, n_rows, order, redundant], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[rows]), np.ascontiguousarray(starts.v[rows])
-        lanes.advance_lanes(self.own.function, settings, control, times, numbers, *given, *out, status, n_steps, room)
+        lanes.advance_lanes(self.own.kit, settings, control, times, numbers, *given, *out, status, n_steps, room)
 
     def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
         """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""

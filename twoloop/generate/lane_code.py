@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import AT_ONCE, LaneSeries
-from twoloop.generate.llvm_code import INTEGER, Value
+from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import conditions_hold, results_of
 from twoloop.generate.straight_line import Choice, Outputs, Solution, StraightLine
@@ -75,12 +75,12 @@ class LaneCode:
             emit.store(inputs[1 + j], out, j)
             emit.store(emit.multiply(unit, inputs[1 + n + j]), out, n + j)
         self.recurrences.begin(emit, inputs, scratch)
-        with emit.loop(INTEGER(1), order, []) as (k, _, _):
+        with emit.loop(integer(1), order, []) as (k, _, _):
             self.recurrences.order(emit, k, unit, out, scratch)
-        last, total = emit.pointer(out, builder.mul(order, INTEGER(n))), emit.constant(0.0)
+        last, total = emit.pointer(out, builder.mul(order, integer(n))), emit.constant(0.0)
         for j in range(n):
             total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last, j)))
-        holds = builder.and_(holds, builder.fcmp_ordered("==", total, emit.constant(0.0)))
+        holds = builder.both(holds, builder.compare("fcmp oeq", total, emit.constant(0.0)))
         _keep_fine(emit, room, holds)
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
@@ -95,8 +95,8 @@ class LaneCode:
             of_v = emit.divide(one, emit.add(emit.multiply(atol[j], unit), emit.multiply(rtol, v)))
             scales.append((of_q, of_v))
         for back in (0, 1):
-            power = builder.sub(order, INTEGER(back))
-            row, factor = emit.pointer(at.series, builder.mul(power, INTEGER(n))), emit.number(power)
+            power = builder.sub(order, integer(back))
+            row, factor = emit.pointer(at.series, builder.mul(power, integer(n))), emit.number(power)
             largest = emit.constant(0.0)
             for j, (of_q, of_v) in enumerate(scales):
                 size = emit.function("fabs", emit.load(row, j))
@@ -104,7 +104,7 @@ class LaneCode:
             found.append(largest)
         logarithms = [
             emit.divide(emit.logarithm(value), emit.number(power))
-            for value, power in zip(found, (order, builder.sub(order, INTEGER(1))), strict=True)
+            for value, power in zip(found, (order, builder.sub(order, integer(1))), strict=True)
         ]
         emit.store(emit.exponential(emit.negative(emit.larger(*logarithms))), room, lanes.LENGTH)
 
@@ -114,13 +114,13 @@ class LaneCode:
         x, unit, zero = emit.load(room, lanes.X), emit.load(room, lanes.UNIT), emit.constant(0.0)
         per_unit = emit.divide(emit.constant(1.0), unit)
         twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
-        last = emit.pointer(at.series, builder.mul(order, INTEGER(n)))
+        last = emit.pointer(at.series, builder.mul(order, integer(n)))
         for begin in range(0, n, AT_ONCE):
             some = range(begin, min(begin + AT_ONCE, n))
             initial = [value for j in some for value in (emit.load(last, j), zero, zero)]
-            with emit.loop(INTEGER(0), order, initial) as (m, carried, new):
-                power = builder.sub(builder.sub(order, INTEGER(1)), m)
-                row = emit.pointer(at.series, builder.mul(power, INTEGER(n)))
+            with emit.loop(integer(0), order, initial) as (m, carried, new):
+                power = builder.sub(builder.sub(order, integer(1)), m)
+                row = emit.pointer(at.series, builder.mul(power, integer(n)))
                 for place, j in enumerate(some):
                     q, v, a = carried[3 * place : 3 * place + 3]
                     new += [
@@ -170,23 +170,23 @@ class LaneCode:
     def take(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The end of an accepted step becomes the state."""
         at = self._at(emit, order, control, room)
-        accepted = emit.builder.fcmp_ordered("!=", emit.load(room, lanes.ACCEPTED), emit.constant(0.0))
+        accepted = emit.builder.compare("fcmp one", emit.load(room, lanes.ACCEPTED), emit.constant(0.0))
         for k in range(2 * self.n):
             emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
 
     def _tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
         def at(place: int) -> Value:
-            return emit.splat(emit.builder.load(emit.builder.gep(control, [INTEGER(place)], inbounds=True)))
+            return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
 
         return at(lanes.RTOL), [at(lanes.ATOL + j) for j in range(self.n)]
 
     def _at(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> "_Places":
         *fixed, series, _ = lanes.places(self.n, self.n_rows, self.n_numbers, 0)
         emit.numbers = emit.pointer(room, fixed.pop())
-        emit.constants = emit.builder.gep(control, [INTEGER(lanes.ATOL + self.n)], inbounds=True)
+        emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
         begin = emit.pointer(room, series)
-        following = emit.builder.add(order, INTEGER(1))
-        scratch = emit.pointer(begin, emit.builder.mul(following, INTEGER(self.n)))
+        following = emit.builder.add(order, integer(1))
+        scratch = emit.pointer(begin, emit.builder.mul(following, integer(self.n)))
         state, new, predicted, found, a, lam = (emit.pointer(room, place) for place in fixed)
         return _Places(state, new, predicted, found, a, lam, begin, scratch)
 
@@ -204,7 +204,7 @@ class LaneCode:
         inputs = self._new(emit, room, at)
         written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
         made = dict(zip(outputs.arrays, arrays, strict=True))
-        act = emit.builder.and_(_chosen(emit, room), conditions_hold(emit, written, outputs, arrays[0]))
+        act = emit.builder.both(_chosen(emit, room), conditions_hold(emit, written, outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in made["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
@@ -248,7 +248,7 @@ class _Places(NamedTuple):
 
 
 def _chosen(emit: LaneEmitter, room: Value) -> Value:
-    return emit.builder.fcmp_ordered("!=", emit.load(room, lanes.FINE), emit.constant(0.0))
+    return emit.builder.compare("fcmp one", emit.load(room, lanes.FINE), emit.constant(0.0))
 
 
 def _store_mask(emit: LaneEmitter, room: Value, mask: Value) -> None:
@@ -256,4 +256,4 @@ def _store_mask(emit: LaneEmitter, room: Value, mask: Value) -> None:
 
 
 def _keep_fine(emit: LaneEmitter, room: Value, holds: Value) -> None:
-    _store_mask(emit, room, emit.builder.and_(_chosen(emit, room), holds))
+    _store_mask(emit, room, emit.builder.both(_chosen(emit, room), holds))

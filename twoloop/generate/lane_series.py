@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from twoloop.generate import llvm_trigonometry, straight_code
 from twoloop.generate.coefficients import Coefficients, Terms
 from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.llvm_code import INTEGER, Quantities, Value
+from twoloop.generate.llvm_code import Quantities
+from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import SeriesProgram, Sums, Table
 from twoloop.generate.straight_code import results_of
 from twoloop.generate.straight_line import Solution
@@ -149,10 +150,10 @@ class LaneSeries:
     def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
         """From coefficients below an order to those of velocities of this order and of positions of the next."""
         builder, n = emit.builder, self.n
-        following = builder.add(k, INTEGER(1))
-        q = emit.pointer(out, builder.mul(k, INTEGER(n)))
+        following = builder.add(k, integer(1))
+        q = emit.pointer(out, builder.mul(k, integer(n)))
         order, zero = emit.number(k), emit.constant(0.0)
-        time = builder.select(builder.icmp_signed("==", k, INTEGER(1)), unit, zero)
+        time = builder.select(builder.compare("icmp eq", k, integer(1)), unit, zero)
         known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
         row = _Row(self, emit, self._row(emit, scratch, k))
         inverse = emit.divide(emit.constant(1.0), order)
@@ -176,11 +177,11 @@ class LaneSeries:
         for j in range(n):
             v = emit.multiply(per_v, a[j])
             known.define(1 + n + j, v)
-            emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(following, INTEGER(n))), j)
+            emit.store(emit.multiply(per_q, v), emit.pointer(out, builder.mul(following, integer(n))), j)
             before.define(1 + 2 * n + j, a[j])
         for i in range(self.n_rows):
             before.define(1 + 3 * n + i, lam[i])
-        row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, INTEGER(1))))
+        row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, integer(1))))
         for operations, values, into in ((self.early, known, row), (self.late, before, row_before)):
             for operation in operations:
                 if operation.kind == PENDING and operation.results[0] not in self._carried:
@@ -190,7 +191,7 @@ class LaneSeries:
             emit.store(known.sum(terms), scratch, self.r + place)
 
     def _row(self, emit: LaneEmitter, scratch: Value, order: Value) -> Value:
-        return emit.pointer(scratch, self.table, emit.builder.mul(order, INTEGER(self.width)))
+        return emit.pointer(scratch, self.table, emit.builder.mul(order, integer(self.width)))
 
     def _begin(
         self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
@@ -238,7 +239,7 @@ class LaneSeries:
         sums: dict[tuple[int, int], Value] = {}
         for begin in range(0, len(pairs), AT_ONCE):
             some = pairs[begin : begin + AT_ONCE]
-            with emit.loop(INTEGER(1), order, [emit.constant(0.0)] * len(some)) as (j, totals, new):
+            with emit.loop(integer(1), order, [emit.constant(0.0)] * len(some)) as (j, totals, new):
                 x, y = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(order, j))
                 loaded: dict[tuple[Value, int], Value] = {}
                 for (i, k), total in zip(some, totals, strict=True):

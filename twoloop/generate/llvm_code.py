@@ -1,28 +1,31 @@
 """Arithmetic on numbers in memory as LLVM code, for code made for one mechanism.
 
 Numba takes milliseconds for a line of source, and LLVM well below a millisecond for an operation. So a long list of
-operations goes to LLVM directly, by numba's `intrinsic`, and numba sees a single call.
+operations goes to LLVM directly, as functions that kernels call at their addresses.
 """
 
-import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
-from weakref import WeakMethod
-
-from llvmlite import ir
-from numba.extending import intrinsic
 
 from twoloop.generate.coefficients import Coefficient, Terms
-from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.private import make_array, signature
+from twoloop.generate.llvm_text import (
+    BIT,
+    DOUBLE,
+    INTEGER,
+    Builder,
+    Module,
+    Value,
+    constant,
+    integer,
+    undefined,
+    vector_of,
+    width_of,
+)
 from twoloop.kernels.data.common import OPTIONS
 
-Value = Any  # of LLVM: a double, a vector of doubles, an integer or a pointer to doubles
-
-FLAGS = tuple(sorted(OPTIONS["fastmath"]))
-DOUBLE, INTEGER, WORD = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
-ZERO, ONE = DOUBLE(0.0), DOUBLE(1.0)
+FLAGS = " ".join(sorted(OPTIONS["fastmath"]))
+ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 ALIGNMENT = 64  # bytes, of a line of the cache, in two of which no vector lies
 SLACK = ALIGNMENT // 8  # doubles that are lost where vectors begin at the next such place
 # functions of LLVM; others are those of libm
@@ -33,55 +36,53 @@ class Emitter:
     """Appends operations to a function of LLVM.
 
     Operations are on doubles or on vectors of them. Places in memory are counted in doubles. `numbers` points to those
-    that the code reads.
+    that the code reads: a function that reads any says where they are.
     """
 
-    double: ir.Type = DOUBLE
-    integer: ir.Type = INTEGER
-    bit: ir.Type = ir.IntType(1)
+    double, whole_number, bit = DOUBLE, INTEGER, BIT
+    suffix = "f64"  # of the names of LLVM's functions
 
-    def __init__(self, builder: ir.IRBuilder, numbers: Value = None):
-        self.builder, self.numbers = builder, numbers
+    def __init__(self, builder: Builder):
+        self.builder = builder
+        self.numbers: Any = None
 
     def constant(self, value: float) -> Value:
         """A number that stands in the code."""
-        return self.double(value)
+        return constant(self.double, value)
 
     def whole(self, value: int) -> Value:
         """An integer that stands in the code, of those that go with numbers."""
-        return self.integer(value)
+        return constant(self.whole_number, value)
 
     def known(self, number: float) -> Value:
         """A number that is known, or read, which never changes."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
-        value = self.load(self.numbers, number.place)
-        value.set_metadata("invariant.load", self.builder.module.add_metadata([]))
-        return value
+        return self.load(self.numbers, number.place, constant=True)
 
     def add(self, a: Value, b: Value) -> Value:
         """a + b."""
-        return self.builder.fadd(a, b, flags=FLAGS)
+        return self.builder.operation(f"fadd {FLAGS}", a, b)
 
     def subtract(self, a: Value, b: Value) -> Value:
         """a - b."""
-        return self.builder.fsub(a, b, flags=FLAGS)
+        return self.builder.operation(f"fsub {FLAGS}", a, b)
 
     def multiply(self, a: Value, b: Value) -> Value:
         """a b."""
-        return self.builder.fmul(a, b, flags=FLAGS)
+        return self.builder.operation(f"fmul {FLAGS}", a, b)
 
     def divide(self, a: Value, b: Value) -> Value:
         """a / b."""
-        return self.builder.fdiv(a, b, flags=FLAGS)
+        return self.builder.operation(f"fdiv {FLAGS}", a, b)
 
     def fused(self, a: Value, b: Value, c: Value) -> Value:
         """a b + c, rounded once."""
-        return self.builder.fma(a, b, c)
+        return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def negative(self, a: Value) -> Value:
         """-a."""
-        return self.builder.fneg(a, flags=FLAGS)
+        return self.builder.negative(FLAGS, a)
 
     def times(self, factor: float, a: Value) -> Value:
         """A multiple of a number by a known one."""
@@ -89,33 +90,29 @@ class Emitter:
             return a if factor == 1.0 else self.negative(a)
         return self.multiply(self.known(factor), a)
 
-    def number(self, integer: Value) -> Value:
+    def number(self, whole: Value) -> Value:
         """An integer as a double."""
-        return self.builder.sitofp(integer, DOUBLE)
+        return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
         """A function of libm, of a number."""
-        known, module = INTRINSICS.get(name), self.builder.module
-        if known:
-            function = module.declare_intrinsic(known, [DOUBLE])
-        else:
-            function = module.globals.get(name) or ir.Function(module, ir.FunctionType(DOUBLE, [DOUBLE]), name)
-        return self.builder.call(function, [x])
+        known = INTRINSICS.get(name)
+        return self.builder.call(f"{known}.{self.suffix}" if known else name, x.type, [x])
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """A pointer some doubles further on."""
         for place in places:
-            base = self.builder.gep(base, [INTEGER(place) if isinstance(place, int) else place], inbounds=True)
+            base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
         return base
 
     def aligned(self, pointer: Value) -> Value:
         """The next pointer at which vectors may begin."""
-        address = self.builder.add(self.builder.ptrtoint(pointer, INTEGER), INTEGER(ALIGNMENT - 1))
-        return self.builder.inttoptr(self.builder.and_(address, INTEGER(-ALIGNMENT)), pointer.type)
+        address = self.builder.add(self.builder.convert("ptrtoint", pointer, INTEGER), integer(ALIGNMENT - 1))
+        return self.builder.convert("inttoptr", self.builder.both(address, integer(-ALIGNMENT)), pointer.type)
 
-    def load(self, base: Value, place: int = 0) -> Value:
-        """The number at a place."""
-        return self.builder.load(self.pointer(base, place))
+    def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
+        """The number at a place; `constant`: it never changes."""
+        return self.builder.load(self.pointer(base, place), constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
         """Put a number at a place."""
@@ -126,28 +123,28 @@ class Emitter:
 
         Slow just after they were stored one by one, because the processor then waits until they are in its cache.
         """
-        pointer = self.builder.bitcast(self.pointer(base, place), vector_type(width).as_pointer())
-        return self.builder.load(pointer, align=8 * width)
+        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{vector_of(DOUBLE, width)}*")
+        return self.builder.load(pointer, 8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
         """Put numbers side by side; base + place is aligned to them."""
-        pointer = self.builder.bitcast(self.pointer(base, place), value.type.as_pointer())
-        self.builder.store(value, pointer, align=8 * getattr(value.type, "count", 1))
+        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{value.type}*")
+        self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
         """Coefficients side by side; one number as it is."""
         if len(values) == 1:
             return values[0]
-        vector = vector_type(len(values))(ir.Undefined)
+        vector = undefined(vector_of(DOUBLE, len(values)))
         for place, value in enumerate(values):
-            vector = self.builder.insert_element(vector, value, WORD(place))
+            vector = self.builder.insert(vector, value, place)
         return vector
 
     def elements(self, vector: Value) -> list[Value]:
         """The numbers of a vector."""
         if vector.type == DOUBLE:
             return [vector]
-        return [self.builder.extract_element(vector, WORD(place)) for place in range(vector.type.count)]
+        return [self.builder.extract(vector, place) for place in range(width_of(vector.type))]
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
@@ -157,17 +154,17 @@ class Emitter:
         its new values. After the loop that list has the last ones.
         """
         builder = self.builder
-        before, body, after = builder.block, builder.append_basic_block(), builder.append_basic_block()
-        builder.cbranch(builder.icmp_signed("<", first, end), body, after)
+        before, body, after = builder.block, builder.append_block(), builder.append_block()
+        builder.branch(builder.compare("icmp slt", first, end), body, after)
         builder.position_at_end(body)
         index = builder.phi(INTEGER)
         index.add_incoming(first, before)
         carried = [builder.phi(value.type) for value in initial]
         new: list[Any] = []
         yield index, carried, new
-        following, last = builder.add(index, INTEGER(1)), builder.block
+        following, last = builder.add(index, integer(1)), builder.block
         index.add_incoming(following, last)
-        builder.cbranch(builder.icmp_signed("<", following, end), body, after)
+        builder.branch(builder.compare("icmp slt", following, end), body, after)
         builder.position_at_end(after)
         for k, value in enumerate(initial):
             result = builder.phi(value.type)
@@ -206,7 +203,7 @@ class Quantities:
         """constant + the sum of coefficient * quantity."""
         key = terms, constant
         if key not in self._sums:
-            total = None if constant == 0.0 and terms else self._emit.known(constant)
+            total: Any = None if constant == 0.0 and terms else self._emit.known(constant)
             for quantity, coefficient in terms:
                 value = self.value(quantity)
                 if total is None:
@@ -219,39 +216,13 @@ class Quantities:
         return self._sums[key]
 
 
-def emitted(emit: Callable[..., Any], result: Any, emitter: Callable[..., Emitter] = Emitter, **arguments: Any) -> Any:
-    """What numba takes for a function, whose code is written by emit(emitter, *arguments), `numbers` apart.
-
-    Parameters
-    ----------
-    emit : method
-        Gets vectors as pointers to their first elements; returns the result, None for `types.none`. Numba keeps what
-        this returns permanently, so that it holds the method's object weakly: it must live until it is compiled.
-    result : numba type
-    emitter : callable
-    **arguments : numba types
-        Under their names.
-    """
-    written_by = WeakMethod(emit)
-
-    def typing(typingctx, *given):  # type: ignore[no-untyped-def]
-        def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-            plain = [
-                make_array(VECTOR)(context, builder, value).data if kind == VECTOR else value
-                for kind, value in zip(sig.args, values, strict=True)
-            ]
-            given = dict(zip(arguments, plain, strict=True))
-            made = written_by()(emitter(builder, given.pop("numbers", None)), *given.values())  # type: ignore[misc]
-            return context.get_dummy_value() if made is None else made
-
-        return signature(result, *arguments.values()), generate
-
-    names = ["typingctx", *arguments]
-    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
-    typing.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # where numba looks for names
-    return intrinsic(typing)
-
-
-def vector_type(width: int) -> ir.Type:
-    """Of so many doubles; one is a double."""
-    return DOUBLE if width == 1 else ir.VectorType(DOUBLE, width)
+def write(
+    module: Module,
+    name: str,
+    kind: tuple[str, list[str]],
+    emit: Callable[..., Any],
+    emitter: Callable[..., Emitter] = Emitter,
+) -> None:
+    """Put a function into a module: its result and arguments are of a kind, emit(emitter, *arguments) its code."""
+    builder = module.function(name, *kind)
+    builder.ret(emit(emitter(builder), *builder.arguments))

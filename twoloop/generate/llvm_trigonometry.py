@@ -1,6 +1,7 @@
 """Sine and cosine as LLVM code without a call, so that those of several angles are computed side by side."""
 
-from twoloop.generate.llvm_code import Emitter, Value
+from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.llvm_text import Value
 
 # sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
 # sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
@@ -27,21 +28,21 @@ COSINES = (
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     """Both, right to rounding for angles up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
-    turns = emit.function("rint", builder.fmul(x, emit.constant(1.0 / HALF_PI[0])))
+    turns = emit.function("rint", builder.operation("fmul", x, emit.constant(1.0 / HALF_PI[0])))
     rest = x
     for part in HALF_PI:
         rest = emit.fused(turns, emit.constant(-part), rest)
-    square = builder.fmul(rest, rest)
-    sine = emit.fused(builder.fmul(square, rest), _polynomial(emit, square, SINES), rest)
+    square = builder.operation("fmul", rest, rest)
+    sine = emit.fused(builder.operation("fmul", square, rest), _polynomial(emit, square, SINES), rest)
     cosine = emit.fused(square, emit.constant(-0.5), emit.constant(1.0))
-    cosine = emit.fused(builder.fmul(square, square), _polynomial(emit, square, COSINES), cosine)
-    quarter = builder.fptosi(turns, emit.integer)
-    odd, following = builder.trunc(quarter, emit.bit), builder.add(quarter, whole(1))
+    cosine = emit.fused(builder.operation("fmul", square, square), _polynomial(emit, square, COSINES), cosine)
+    quarter = builder.convert("fptosi", turns, emit.whole_number)
+    odd, following = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
     made = []
     for one, other, number in ((cosine, sine, quarter), (sine, cosine, following)):
-        sign = builder.shl(builder.and_(number, whole(2)), whole(62))
-        bits = builder.bitcast(builder.select(odd, one, other), emit.integer)
-        made.append(builder.bitcast(builder.xor(bits, sign), emit.double))
+        sign = builder.operation("shl", builder.both(number, whole(2)), whole(62))
+        bits = builder.convert("bitcast", builder.select(odd, one, other), emit.whole_number)
+        made.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))
     return made[0], made[1]
 
 

@@ -9,23 +9,23 @@ put together in registers, and the newest coefficients come last in the sums.
 """
 
 import hashlib
-from pathlib import Path
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
-from twoloop.generate import coefficients, llvm_code, series_groups
+from twoloop.generate import llvm_code, series_groups
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import INTEGER, ONE, SLACK, ZERO, Emitter, Quantities, Value, emitted
+from twoloop.generate.llvm_code import ONE, SLACK, ZERO, Emitter, Quantities
+from twoloop.generate.llvm_text import Module, Value, integer
 from twoloop.generate.series import SeriesProgram
 from twoloop.generate.series_groups import WIDTH, Group, Groups, rounded
-from twoloop.generate.straight_code import OwnCode, function_of
+from twoloop.generate.straight_code import OwnCode, write_own
 from twoloop.generate.straight_line import Solution
-from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
-from twoloop.kernels.compile.callbacks import VECTOR, f8
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.caches import Newest, digest_of
+from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -42,8 +42,6 @@ AT_ONCE = 8  # vectors that are summed in one loop, in registers
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
 Array = NDArray[np.float64]
-
-i8 = types.int64
 
 
 class SeriesCode:
@@ -77,9 +75,10 @@ class SeriesCode:
         t: Value,
         unit: Value,
         state: Value,
+        numbers: Value,
     ) -> None:
         """What is known of the orders 0 and 1, and the early operations of order 0; r, c and lam are zero."""
-        base = emit.aligned(scratch)
+        base, emit.numbers = emit.aligned(scratch), numbers
         zeros = emit.vector([ZERO] * WIDTH)
         for place in range(0, 2 * self.width, WIDTH):
             emit.store_vector(zeros, base, self.zeros + place)
@@ -99,13 +98,22 @@ class SeriesCode:
         self._keep(emit, base, known)
 
     def find_order(
-        self, emit: Emitter, scratch: Value, series: Value, r: Value, c: Value, t: Value, unit: Value, order: Value
+        self,
+        emit: Emitter,
+        scratch: Value,
+        series: Value,
+        r: Value,
+        c: Value,
+        t: Value,
+        unit: Value,
+        order: Value,
+        numbers: Value,
     ) -> None:
         """Late operations of the order before and early ones of this order, as far as they are known; r and c."""
-        base, before = emit.aligned(scratch), emit.builder.sub(order, INTEGER(1))
-        q = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
+        base, before, emit.numbers = emit.aligned(scratch), emit.builder.sub(order, integer(1)), numbers
+        q = emit.pointer(series, emit.builder.mul(order, integer(self.n)))
         sums = self._sums_of_products(emit, base, order)
-        is_first = emit.builder.icmp_signed("==", order, INTEGER(1))
+        is_first = emit.builder.compare("icmp eq", order, integer(1))
         with emit.builder.if_else(is_first) as (then, otherwise):
             with then:
                 known = self._quantities_before(emit, base, q, t)
@@ -127,11 +135,20 @@ class SeriesCode:
         self._keep(emit, base, known)
 
     def take_order(
-        self, emit: Emitter, scratch: Value, series: Value, a: Value, lam: Value, unit: Value, order: Value
+        self,
+        emit: Emitter,
+        scratch: Value,
+        series: Value,
+        a: Value,
+        lam: Value,
+        unit: Value,
+        order: Value,
+        numbers: Value,
     ) -> None:
         """Velocities of this order and positions of the next, from accelerations; the factors that waited for them."""
-        n, base, following = self.n, emit.aligned(scratch), emit.builder.add(order, INTEGER(1))
-        next_q = emit.pointer(series, emit.builder.mul(following, INTEGER(n)))
+        emit.numbers = numbers
+        n, base, following = self.n, emit.aligned(scratch), emit.builder.add(order, integer(1))
+        next_q = emit.pointer(series, emit.builder.mul(following, integer(n)))
         per_v, per_q = (emit.divide(unit, emit.number(each)) for each in (order, following))
 
         def load(i: int) -> Value:
@@ -144,26 +161,18 @@ class SeriesCode:
             if 1 + n + j in self.kept:
                 emit.store(v, base, self.velocities + j)
             emit.store(emit.multiply(per_q, v), next_q, j)
-        before = emit.builder.sub(order, INTEGER(1))
+        before = emit.builder.sub(order, integer(1))
         for groups, of in ((self.groups.early, order), (self.groups.late, before)):
             for group in groups:
                 if group.pending:
                     self._store_waiting(emit, known, group, self._row(emit, base, of))
 
-    def is_finite(self, emit: Emitter, series: Value, order: Value) -> Value:
-        """Whether the last coefficients are."""
-        last = emit.pointer(series, emit.builder.mul(order, INTEGER(self.n)))
-        total = ZERO
-        for j in range(self.n):
-            total = emit.add(total, emit.multiply(ZERO, emit.load(last, j)))
-        return emit.builder.fcmp_ordered("==", total, ZERO)
-
     def _row(self, emit: Emitter, base: Value, order: Value) -> Value:
-        return emit.pointer(base, self.table, emit.builder.mul(order, INTEGER(2 * self.width)))
+        return emit.pointer(base, self.table, emit.builder.mul(order, integer(2 * self.width)))
 
     def _time(self, emit: Emitter, unit: Value, order: Value) -> Value:
         """The coefficient of the time, of an order that is not 0."""
-        return emit.builder.select(emit.builder.icmp_signed("==", order, INTEGER(1)), unit, ZERO)
+        return emit.builder.select(emit.builder.compare("icmp eq", order, integer(1)), unit, ZERO)
 
     def _quantities_before(self, emit: Emitter, base: Value, q: Value, time: Value) -> Quantities:
         """Of the order before that of q, from where they are kept."""
@@ -191,11 +200,11 @@ class SeriesCode:
         builder = emit.builder
         groups = [(group, 0) for group in self.groups.early] + [(group, 1) for group in self.groups.late]
         nothing = emit.pointer(base, self.zeros)
-        one, two, before, before_it = INTEGER(1), INTEGER(2), *(builder.sub(order, INTEGER(i)) for i in (1, 2))
+        one, two, before, before_it = integer(1), integer(2), *(builder.sub(order, integer(i)) for i in (1, 2))
 
         def rows(j: Value, m: Value, least: int) -> tuple[Value, Value]:
             """Rows of X[j] and Y[m - j], or zeros where m is less than `least`."""
-            there = builder.icmp_signed(">=", m, INTEGER(least))
+            there = builder.compare("icmp sge", m, integer(least))
             x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(m, j))
             return builder.select(there, x, nothing), builder.select(there, y, nothing)
 
@@ -290,8 +299,8 @@ class SeriesCode:
         number: Value,
         inverse: Value,
         u: Value,
-        z: Value = None,
-    ) -> tuple[Value, Value, Value]:
+        z: Any = None,
+    ) -> tuple[Value, Value, Any]:
         """Results and factors X and Y of order `number`, from arguments u and z and the sum of products."""
 
         def at(place: int) -> Value:
@@ -324,12 +333,12 @@ class SeriesCode:
 
 
 class CompiledSeries(NamedTuple):
-    """Machine code of a program, to be called as a step is, and what wrote it."""
+    """Functions of a program and of the solution of an order."""
 
-    function: Dispatcher
+    functions: OwnFunctions
     code: SeriesCode
-    n_kept: int  # numbers in the factors
-    numbers: Array  # what the code reads
+    n_factors: int  # numbers that are kept
+    numbers: Array  # what they read
 
     def memory_size(self, order: int) -> int:
         """Length of `memory` for series of this order."""
@@ -337,10 +346,10 @@ class CompiledSeries(NamedTuple):
 
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
-        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_kept + self.code.scratch_size(order) + n
+        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_factors + self.code.scratch_size(order) + n
 
 
-_COMPILED = Newest()
+_MADE = Newest()
 
 
 def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
@@ -351,6 +360,8 @@ def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
     ValueError
         If it would take too long to compile.
     """
+    from twoloop.kernels.data.common import KIT
+
     if program.n_operations > LARGEST:
         raise ValueError(
             f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
@@ -361,65 +372,27 @@ def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
     structure = [own.digest, program.n_q, program.n_rows, code.groups.structure, solution.n_kept]
     structure += numbers.structure(solution.graph, solution.solved.forms)
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
-    function = _COMPILED.get(key)
-    if function is None:
-        _COMPILED[key] = function = _compile(code, solution, own, key)
-    return CompiledSeries(function, code, solution.n_kept, numbers.values)
+
+    def write() -> tuple[list[str], str]:
+        module = Module()
+        write_own(module, "own_factors", own.equations.graph, solution.kept, own.numbers)
+        write_own(module, "own_solution", solution.graph, solution.solved, numbers)
+        recurrences: dict[str, Callable[..., Any]] = {
+            "begin_series": code.begin,
+            "find_order": code.find_order,
+            "take_order": code.take_order,
+        }
+        for name, emit in recurrences.items():
+            llvm_code.write(module, name, KIT.own_type(name), emit)
+        return ["own_factors", "own_solution", *recurrences], str(module)
+
+    made = _MADE.get(key)
+    if made is None:
+        _MADE[key] = made = own_functions("series", _stamp(), key, write)
+    return CompiledSeries(made, code, solution.n_kept, numbers.values)
 
 
-def _compile(code: SeriesCode, solution: Solution, own: OwnCode, key: str) -> Dispatcher:
-    from twoloop.kernels.compile.linking import KernelCompiler
-    from twoloop.kernels.data import common
-    from twoloop.kernels.evaluation import calls
-    from twoloop.kernels.steps import recurrences as series
-
-    n, n_rows, n_kept = code.n, code.n_rows, solution.n_kept
-    keep = function_of(own.equations.graph, solution.kept, own.numbers)
-    solve = function_of(solution.graph, solution.solved, code.numbers)
-    arrays: dict[str, Any] = {"scratch": VECTOR, "series": VECTOR}
-    times: dict[str, Any] = {"t": f8, "unit": f8}
-    known: dict[str, Any] = {"numbers": VECTOR}
-    begin = emitted(code.begin, types.none, **arrays, r=VECTOR, c=VECTOR, lam=VECTOR, **times, state=VECTOR, **known)
-    find_order = emitted(code.find_order, types.none, **arrays, r=VECTOR, c=VECTOR, **times, order=i8, **known)
-    take_order = emitted(code.take_order, types.none, **arrays, a=VECTOR, lam=VECTOR, unit=f8, order=i8, **known)
-    is_finite = emitted(code.is_finite, types.boolean, series=VECTOR, order=i8)
-    BEGIN, ORDER, TARGET = series.N_MEMORY_SCALARS, series.ORDER, series.TARGET
-    N_EVALUATIONS, DONE, NOT_FINITE = common.N_EVALUATIONS, common.DONE, common.NOT_FINITE
-    EVALUATE_THERE, Attempt = calls.EVALUATE_THERE, common.Attempt
-
-    def expand(f, w, options, memory, t, unit, tolerances, state, new_state):  # type: ignore[no-untyped-def]
-        order = int(options[ORDER])
-        series = memory[BEGIN + int(memory[TARGET]) * (order + 1) * n :]
-        place = BEGIN + 2 * (order + 1) * n
-        r, a = memory[place : place + n], memory[place + n : place + 2 * n]
-        place += 2 * n
-        c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
-        place += 2 * n_rows
-        kept, scratch = memory[place : place + n_kept], memory[place + n_kept :]
-        q, v = state[:n], state[n : 2 * n]
-        own_factors = keep((t, q, v), f.numbers, (kept,))
-        if not own_factors:
-            code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
-            if code != DONE:
-                return Attempt(code, np.inf, 0.0)
-        begin(scratch, series, r, c, lam, t, unit, state, f.own_numbers)
-        for k in range(1, order):
-            find_order(scratch, series, r, c, t, unit, k, f.own_numbers)
-            if not own_factors or not solve((r, c, kept), f.own_numbers, (a, lam)):  # M a + G^T lam = r, G a = c
-                f.instead(f, w, r, c, t, unit, tolerances, a, lam)
-            take_order(scratch, series, a, lam, unit, k, f.own_numbers)
-        w.counters[N_EVALUATIONS] += order - 1
-        return Attempt(DONE if is_finite(series, order) else NOT_FINITE, 0.0, 0.0)
-
-    options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **common.OPTIONS}
-    return compile_kept(expand, common.ATTEMPT, (_stamp(), key), **options)
-
-
+@cache
 def _stamp() -> str:
-    """A digest of what writes the code, and of the kernels that call it and are called."""
-    from twoloop.kernels.data import common
-
-    digest = hashlib.sha256(common.stamp("steps.taylor_step").encode())
-    for module in (__file__, series_groups.__file__, llvm_code.__file__, coefficients.__file__):
-        digest.update(Path(str(module)).read_bytes())
-    return digest.hexdigest()
+    """A digest of what writes the functions; what they share with those of the equations is in the key."""
+    return digest_of("", __file__, series_groups)

@@ -1,30 +1,28 @@
 """Machine code for the equations of one mechanism: the tasks of the inner loop that explicit methods call.
 
-The operations of `straight_line` become LLVM's instructions one by one, without numba's front end, which would
-take seconds for some hundred of them. The code is kept on disk as that of the kernels.
+The operations of `straight_line` become LLVM's instructions one by one, past numba, which would take seconds for some
+hundred of them. The code is kept on disk as that of the kernels.
 """
 
 import hashlib
-import weakref
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from twoloop.generate import coefficients, llvm_code, llvm_trigonometry, straight_line
+from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, straight_line
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import Emitter, Quantities, Value
+from twoloop.generate.llvm_code import Emitter, Quantities
+from twoloop.generate.llvm_text import DOUBLE, Module, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Choice, Outputs, StraightLine
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
-from twoloop.kernels.compile.caches import Newest, compile_kept, sources_folder
-from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.private import Dispatcher, make_array
+from twoloop.kernels.compile.caches import Newest, digest_of
+from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
+from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -103,79 +101,95 @@ def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: S
     total = zero
     for value in values:  # what is not finite becomes NaN
         total = emit.add(total, emit.multiply(value, zero))
-    holds = builder.fcmp_ordered("==", total, zero)
+    holds = builder.compare("fcmp oeq", total, zero)
     pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
     pairs += [(emit.constant(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
     for one, other in pairs:
-        holds = builder.and_(holds, builder.fcmp_ordered(">", one, other))
+        holds = builder.both(holds, builder.compare("fcmp ogt", one, other))
     return holds
 
 
-def function_of(graph: Graph, outputs: Outputs, numbers: Coefficients) -> Any:
-    """A function for code that numba compiles: of inputs, of the values of `numbers`, and of vectors to fill.
+def write_function(
+    module: Module,
+    name: str,
+    kind: tuple[str, list[str]],
+    graph: Graph,
+    outputs: Outputs,
+    numbers: Coefficients,
+) -> None:
+    """Write a function of inputs, of the values of `numbers`, and of arrays to fill.
 
-    It returns whether the conditions hold and what it computes is finite, and fills the vectors only then. Numba keeps
-    it permanently; what it is written from must live until it is compiled.
+    It returns whether the conditions hold and what it computes is finite, and fills the arrays only then.
     """
-    graph_there, outputs_there, numbers_there = weakref.ref(graph), weakref.ref(outputs), weakref.ref(numbers)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        def pointer(vectors: Value, k: int) -> Value:
-            return make_array(VECTOR)(context, builder, builder.extract_value(vectors, k)).data
-
-        graph, outputs, numbers = graph_there(), outputs_there(), numbers_there()
-        assert graph is not None and outputs is not None and numbers is not None
-        given, values, filled = arguments
-        emit, inputs = Emitter(builder, make_array(VECTOR)(context, builder, values).data), []
-        for k, (kind, size) in enumerate(zip(signature.args[0], graph.sizes, strict=True)):
-            for j in range(size):
-                is_vector = kind == VECTOR
-                inputs.append(emit.load(pointer(given, k), j) if is_vector else builder.extract_value(given, k))
+    def emit_all(emit: Emitter, *arguments: Value) -> Value:
+        n_given = len(graph.sizes)
+        given, emit.numbers, filled = arguments[:n_given], arguments[n_given], arguments[n_given + 1 :]
+        inputs: list[Value] = []
+        for argument, size in zip(given, graph.sizes, strict=True):
+            inputs += [argument] if argument.type == DOUBLE else [emit.load(argument, j) for j in range(size)]
         written, results = results_of(emit, graph, outputs, inputs, numbers)
         holds = conditions_hold(emit, written, outputs, results[0])
-        with builder.if_then(holds):
-            for k, array in enumerate(results):
+        with emit.builder.if_then(holds):
+            for place, array in zip(filled, results, strict=True):
                 for j, value in enumerate(array):
-                    emit.store(value, pointer(filled, k), j)
+                    emit.store(value, place, j)
         return holds
 
-    @intrinsic
-    def function(typing: Any, given: Any, values: Any, filled: Any) -> Any:
-        return types.boolean(given, values, filled), generate
-
-    return function
+    llvm_code.write(module, name, kind, emit_all)
 
 
-_INNER = Newest()
+_MADE = Newest()
 
 
 class OwnCode:
-    """The inner loop for a system, compiled for its equations, or read from the disk.
+    """Functions made for the equations of a system, compiled, or read from the disk.
 
     Attributes
     ----------
     equations : StraightLine
     numbers : Coefficients
-        What the code reads.
+        What they read.
     digest : str
-        Of all that the code depends on, the values of these apart.
-    inner : Dispatcher
+        Of all that they depend on, the values of these apart.
+    functions : OwnFunctions
+    projects : bool
+        Whether they project, or give accelerations alone.
     """
 
     def __init__(self, equations: StraightLine):
-        from twoloop.kernels.data import common
-
         self.equations, self.numbers = equations, Coefficients()
-        digest = hashlib.sha256(repr(list(_described(equations, self.numbers))).encode())
-        for module in (straight_line, coefficients, llvm_code, llvm_trigonometry):
-            digest.update(Path(str(module.__file__)).read_bytes())
-        digest.update(Path(__file__).read_bytes())
-        self.digest = digest.hexdigest()
-        inner = _INNER.get(self.digest)
-        if inner is None:
-            watched = common.stamp("evaluation.calls"), self.digest
-            _INNER[self.digest] = inner = _inner(equations, self.numbers, watched)
-        self.inner: Dispatcher = inner
+        structure = repr(list(_described(equations, self.numbers)))
+        self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
+        self.projects = equations.closer is not None and equations.nearer is not None
+        made = _MADE.get(self.digest)
+        if made is None:
+            _MADE[self.digest] = made = own_functions("equations", _stamp(), self.digest, self._write)
+        self.functions: OwnFunctions = made
+
+    @property
+    def inner(self) -> Dispatcher:
+        """The inner loop that calls them."""
+        from twoloop.kernels.evaluation import own_inner
+
+        return own_inner.own_inner_loop if self.projects else own_inner.own_evaluations
+
+    def _write(self) -> tuple[list[str], str]:
+        module, equations = Module(), self.equations
+        outputs: dict[str, Any] = {"own_there": equations.there}
+        if self.projects:
+            outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
+            outputs |= {"own_redundant": equations.redundant}
+        for name, each in outputs.items():
+            write_own(module, name, equations.graph, each, self.numbers)
+        return list(outputs), str(module)
+
+
+def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:
+    """The same of one that kernels know by its name."""
+    from twoloop.kernels.data.common import KIT
+
+    write_function(module, name, KIT.own_type(name), graph, outputs, numbers)
 
 
 def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> OwnCode:
@@ -203,76 +217,9 @@ def _described(equations: StraightLine, numbers: Coefficients) -> Iterable[Any]:
             yield list(numbers.structure(equations.graph, outputs.forms))
 
 
-def _inner(equations: StraightLine, numbers: Coefficients, watched: tuple[str, str]) -> Dispatcher:
-    from twoloop.kernels.compile.linking import KernelCompiler
-    from twoloop.kernels.data.common import (
-        BY_GENERAL,
-        DONE,
-        INNER,
-        N_EVALUATIONS,
-        N_FACTORIZATIONS,
-        N_INNER,
-        OPTIONS,
-        ROUNDED,
-    )
-    from twoloop.kernels.evaluation import calls
-    from twoloop.kernels.evaluation.inner import CONTRACTION, MAX_INNER
-    from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
+@cache
+def _stamp() -> str:
+    """A digest of what writes the functions, and of what they are called as."""
+    from twoloop.kernels.data.common import KIT
 
-    options = {"folder": sources_folder(), "pipeline_class": KernelCompiler, **OPTIONS}
-    there = function_of(equations.graph, equations.there, numbers)
-    EVALUATE_THERE, PROJECT = calls.EVALUATE_THERE, calls.PROJECT
-    if equations.closer is None or equations.nearer is None:
-
-        def evaluating(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
-            if task == EVALUATE_THERE:
-                w.counters[N_EVALUATIONS] += 1
-                w.counters[N_FACTORIZATIONS] += 1
-                if there((t, q, v), f.numbers, (a,)):
-                    return DONE
-            w.notes[BY_GENERAL] = 1.0
-            return f.general(f, w, task, t, q, v, theta, a, lam)
-
-        return compile_kept(evaluating, INNER, watched, **options)
-
-    closer, nearer = (function_of(equations.graph, each, numbers) for each in (equations.closer, equations.nearer))
-    redundant, MULTIPLIERS = function_of(equations.graph, equations.redundant, numbers), calls.MULTIPLIERS
-    REDUNDANT, TANGENTS = calls.REDUNDANT, calls.TANGENTS
-
-    def inner(f, w, task, t, q, v, theta, a, lam):  # type: ignore[no-untyped-def]
-        if task == EVALUATE_THERE:
-            w.counters[N_EVALUATIONS] += 1
-            w.counters[N_FACTORIZATIONS] += 1
-            if there((t, q, v), f.numbers, (a,)):
-                return DONE
-        elif task == PROJECT:
-            least, before = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED]), np.inf
-            for k in range(MAX_INNER):
-                w.counters[N_INNER] += 1
-                w.counters[N_FACTORIZATIONS] += 1
-                if k == 0:
-                    fine = closer((t, q, v), f.numbers, (w.x, q))
-                else:
-                    fine = nearer((t, q, v), f.numbers, (a, w.x, q, v, lam))
-                if not fine:
-                    break
-                moved = 0.0
-                for j in range(q.size):
-                    moved = max(moved, abs(w.x[j]))
-                if moved <= least and k > 0:
-                    w.counters[N_EVALUATIONS] += 1
-                    w.notes[BY_GENERAL] = 0.0
-                    return DONE
-                if moved > CONTRACTION * before:
-                    break
-                before = max(moved, least)
-            w.notes[BY_GENERAL] = 1.0
-        elif task == REDUNDANT and w.notes[BY_GENERAL] == 0.0:
-            if redundant((t, q, v), f.numbers, (a,)):
-                return DONE
-            f.general(f, w, TANGENTS, t, q, v, theta, a, lam)  # the rows there, which this code has not left in w
-        elif task <= MULTIPLIERS:  # of methods that need a good partition at every step
-            w.notes[BY_GENERAL] = 1.0
-        return f.general(f, w, task, t, q, v, theta, a, lam)
-
-    return compile_kept(inner, INNER, watched, **options)
+    return digest_of(repr(KIT), __file__, straight_line, coefficients, llvm_code, llvm_text, llvm_trigonometry)

@@ -4,26 +4,19 @@ Each lane has its own step, as `taylor_step` has it, and takes the next run when
 is left to a run of its own: a condition of the code that does not hold, a step that is refused again and again.
 """
 
+from typing import Any
+
 import numpy as np
 from numba import types
+from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.callbacks import VECTOR
+from twoloop.kernels.compile.own_functions import OwnFunctions
+from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, kernel, merged
 
 LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
 
-# tasks of the code made for a mechanism, on what lies in `room`
-(
-    SERIES,  # coefficients about STATE at T, in units of time UNIT
-    LENGTHS,  # LENGTH of the step at which the last two terms are within the tolerances, in units
-    EVALUATE,  # NEW and FOUND: the state and its accelerations by the series, X units of time on
-    CLOSER,  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
-    NEARER,  # the same and velocities, and A and LAM there
-    THERE,  # A at NEW as it stands
-    REDUNDANT,  # whether rows that do not count hold at NEW
-    JUDGE,  # DEFECT and OFF: of a step H from STATE by PREDICTED to NEW
-    TAKE,  # NEW becomes STATE where ACCEPTED
-) = range(9)
 # vectors in `room`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
 (
     T,
@@ -49,9 +42,20 @@ LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
     ACCEPTED,
     N_FIELDS,
 ) = range(22)
-# (task, order, control, room)
-OWN_LANES = types.void(types.int64, types.int64, VECTOR, VECTOR)
-CODE = types.FunctionType(OWN_LANES)
+# functions made for a mechanism, (order, control, room), on what lies in `room`
+TASKS = (
+    "series",  # coefficients about STATE at T, in units of time UNIT
+    "lengths",  # LENGTH of the step at which the last two terms are within the tolerances, in units
+    "evaluate",  # NEW and FOUND: the state and its accelerations by the series, X units of time on
+    "closer",  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
+    "nearer",  # the same and velocities, and A and LAM there
+    "there",  # A at NEW as it stands
+    "redundant",  # whether rows that do not count hold at NEW
+    "judge",  # DEFECT and OFF: of a step H from STATE by PREDICTED to NEW
+    "take",  # NEW becomes STATE where ACCEPTED
+)
+CODE = Reference("LaneKit", {})
+CODE.add_own_functions(dict.fromkeys(TASKS, types.none(types.int64, VECTOR, VECTOR)))
 TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 LEFT, ENDED = 0, 1  # what becomes of a run: left to a run of its own, or made
@@ -68,6 +72,20 @@ FIRST_UNIT = 0.01  # of the span
 SHORTEST = 1e-13  # step, of the time
 MOST_PLACES = 1000  # within a step
 GOLDEN = 0.6180339887498949
+
+
+class LaneKit:
+    """The functions made for a mechanism, as kernels get them."""
+
+    def __init__(self, own: OwnFunctions):
+        self.__dict__.update(own.addresses)
+        self.own, self.table = own, CODE.table(self)
+        self.address = self.table.ctypes.data
+
+
+@typeof_impl.register(LaneKit)
+def _type_of_kit(value: Any, context: Any) -> Any:
+    return CODE
 
 
 def places(n, n_rows, n_numbers, order):
@@ -102,7 +120,7 @@ def _project(code, order, control, room, n, new):
         room[LEFT_TO_MOVE * LANES + k] = room[FINE * LANES + k]
         room[MOVED_BEFORE * LANES + k] = np.inf
         room[ON_CONSTRAINTS * LANES + k] = 0.0
-    code(CLOSER, order, control, room)
+    code.closer(order, control, room)
     for k in range(LANES):
         room[LEFT_TO_MOVE * LANES + k] = room[FINE * LANES + k]
     for _ in range(MOST_PASSES):
@@ -112,7 +130,7 @@ def _project(code, order, control, room, n, new):
             left += room[LEFT_TO_MOVE * LANES + k]
         if left == 0.0:
             break
-        code(NEARER, order, control, room)
+        code.nearer(order, control, room)
         for k in range(LANES):
             if room[LEFT_TO_MOVE * LANES + k] == 0.0:
                 continue
@@ -204,9 +222,9 @@ def _look_within(code, order, control, room, n_places, n_steps):
             room[X * LANES + k] = share * h / room[UNIT * LANES + k]
             room[AHEAD * LANES + k] = room[T * LANES + k] + share * h
             room[FINE * LANES + k] = 1.0
-        code(EVALUATE, order, control, room)
-        code(THERE, order, control, room)
-        code(JUDGE, order, control, room)
+        code.evaluate(order, control, room)
+        code.there(order, control, room)
+        code.judge(order, control, room)
         for k in range(LANES):
             if room[X * LANES + k] > 0.0:
                 defect = room[DEFECT * LANES + k] if room[FINE * LANES + k] == 1.0 else np.inf
@@ -222,13 +240,13 @@ def _make_steps(code, order, control, room, n, n_rows, n_numbers, checks_redunda
         room[X * LANES + k] = h / room[UNIT * LANES + k]
         room[AHEAD * LANES + k] = control[T1] if h == control[T1] - t else t + h
         room[FINE * LANES + k] = room[RUNNING * LANES + k]
-    code(EVALUATE, order, control, room)
+    code.evaluate(order, control, room)
     for i in range(n * LANES):
         room[predicted * LANES + i] = room[new * LANES + i]
     _project(code, order, control, room, n, new)
     if checks_redundant == 1:
-        code(REDUNDANT, order, control, room)
-    code(JUDGE, order, control, room)
+        code.redundant(order, control, room)
+    code.judge(order, control, room)
     for k in range(LANES):
         room[ACCEPTED * LANES + k] = 0.0
         if room[RUNNING * LANES + k] == 0.0:
@@ -270,7 +288,7 @@ def _between(code, order, control, room, n, new, times, out_q, out_v):
             room[ASKED * LANES + k] = room[FINE * LANES + k]
         if n_wanted == 0:
             return
-        code(EVALUATE, order, control, room)
+        code.evaluate(order, control, room)
         _project(code, order, control, room, n, new)
         for k in range(LANES):
             if room[ASKED * LANES + k] == 1.0:
@@ -328,13 +346,13 @@ def advance_lanes(code, settings, control, times, numbers, q0, v0, out_q, out_v,
                 return
             continue
         _set(room, FINE, 1.0)
-        code(SERIES, order, control, room)
-        code(LENGTHS, order, control, room)
+        code.series(order, control, room)
+        code.lengths(order, control, room)
         n_places = _choose_steps(room, control, status)
         if n_places > 0:
             _look_within(code, order, control, room, n_places, n_steps)
         _make_steps(code, order, control, room, n, n_rows, n_numbers, settings[CHECKS_REDUNDANT], status)
-        code(TAKE, order, control, room)
+        code.take(order, control, room)
         _write_ends(room, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:
             _between(code, order, control, room, n, new, times, out_q, out_v)

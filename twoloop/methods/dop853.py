@@ -111,6 +111,6 @@ class DOP853:
             plan,
             step=kernels.COMPILED_EXPLICIT,
             memory=np.zeros(max(plan.memory.size, made.memory_size)),
-            own=made.function,
+            own=(made.functions,),
             instead=kernels.explicit_step,
         )

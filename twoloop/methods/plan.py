@@ -46,13 +46,11 @@ class Plan:
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
-    inner: Any = None  # ... that code; None: the inner loop is the general one
-    numbers: Any = None  # ... and what it reads
-    own: Any = (
-        None  # a part of the step made for the mechanism, what it reads, and what is called where it cannot serve
-    )
-    own_numbers: Any = None
-    instead: Any = None
+    inner: Any = None  # ... the inner loop that calls such code; None: the general one
+    own: tuple[Any, ...] = ()  # functions made for the mechanism, see kernels/data/common.py
+    numbers: Any = None  # what those of the inner loop and of stages read ...
+    own_numbers: Any = None  # ... and those of series
+    instead: Any = None  # what is called where those of the step cannot serve
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
     looks_within: bool = False  # whether its steps look at the equations between their ends; if not, they are limited

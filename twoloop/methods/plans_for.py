@@ -1,7 +1,6 @@
 """The plans by which a method runs a system; those of presets are made once for a system and a tolerance."""
 
 from dataclasses import replace
-from typing import Any
 
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check
@@ -59,7 +58,11 @@ def _made(
         raise ValueError(
             f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{constant}"
         )
-    own: dict[str, Any] = {"inner": code.inner, "numbers": code.numbers.values}
+    plan = replace(_with_code(plan, code), traced=(*plan.traced, code.equations.traced))
     if plan.substitute is not None:
-        plan = replace(plan, substitute=replace(plan.substitute, **own))
-    return replace(plan, **own, traced=(*plan.traced, code.equations.traced)), interiors
+        plan = replace(plan, substitute=_with_code(plan.substitute, code))
+    return plan, interiors
+
+
+def _with_code(plan: Plan, code: OwnCode) -> Plan:
+    return replace(plan, inner=code.inner, own=(code.functions, *plan.own), numbers=code.numbers.values)

@@ -139,11 +139,14 @@ class Taylor:
         if self.code is None:
             return replace(plan, interior=interior)
         code = compiled_series(program, self.code)
+        options = plan.options.copy()
+        options[series.N_FACTORS] = code.n_factors
         return replace(
             plan,
             step=taylor.COMPILED_TAYLOR,
+            options=options,
             memory=np.zeros(code.memory_size(highest)),
-            own=code.function,
+            own=(code.functions,),
             own_numbers=code.numbers,
             instead=taylor.solve_order,
             interior=interior,

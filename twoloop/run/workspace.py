@@ -60,13 +60,13 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:
     read = (plan.numbers, plan.own_numbers)
     kept: dict[Any, tuple[common.Kit, Any]] = system.remembered("kits", dict)
     # what it names by numbers is held by what is kept
-    key = (id(system.functions), flags.tobytes(), *called, plan.own, plan.instead, *map(id, read))
+    key = (id(system.functions), flags.tobytes(), *called, plan.instead, *map(id, (*plan.own, *read)))
     if key in kept:
         return kept[key][0]
     flags = flags.copy()
     flags[common.STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    made = common.Kit(functions, *called, inner_loop, plan.own, plan.instead, *read)
+    made = common.Kit(functions, *called, inner_loop, plan.instead, plan.own, *read)
     if flags[common.FORM] != common.AUGMENTED:  # which a run may change
         if len(kept) == MOST_KITS:
             del kept[next(iter(kept))]

@@ -34,7 +34,7 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that you can write, and nobody else can"
 )
-MOST_KEPT = 500  # functions made for single mechanisms, of each kind, on disk ...
+MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk ...
 MOST_HELD = 50  # ... and in memory; their machine code, some 50 kB, stays there as long as the process lives
 CHECKSUM = hashlib.sha256().digest_size
 
@@ -48,7 +48,6 @@ def compile_kept(
     watched: tuple[str, str] | None,
     *,
     announcement: str = "",
-    folder: Path | None = None,
     **options: Any,
 ) -> Dispatcher:
     """Compile a function for one signature, or read its machine code from the disk.
@@ -64,8 +63,6 @@ def compile_kept(
         compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
     announcement : str
         Said on stderr, once a process, before it compiles.
-    folder : Path, optional
-        Where the machine code is kept, of the newest MOST_KEPT functions of this name; None: where numba keeps it.
     **options
         Of numba.njit.
     """
@@ -73,25 +70,14 @@ def compile_kept(
     function = dispatcher.py_func
     if watched is not None:
         try:
-            dispatcher._cache = _Cache(function, *watched, announcement, folder)
+            dispatcher._cache = _Cache(function, *watched, announcement)
         except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 say_once(UNWRITABLE)
     dispatcher.compile(signature)
     dispatcher.disable_compile()
-    _N_MADE[0] += 1
+    count_made()
     return dispatcher
-
-
-def is_kept(
-    function: Callable[..., Any], signature: Any, watched: tuple[str, str], folder: Path, **options: Any
-) -> bool:
-    """Whether `compile_kept` would find the machine code of a function on the disk."""
-    dispatcher = njit(**options)(named_apart(function, watched))
-    try:
-        return _Cache(dispatcher.py_func, *watched, "", folder).has(signature, dispatcher.targetctx)
-    except RuntimeError:
-        return False
 
 
 class Newest(dict[str, Any]):
@@ -107,8 +93,13 @@ _N_MADE = [0]
 
 
 def n_made() -> int:
-    """How many functions this process has compiled, or read from the disk."""
+    """How many functions, or sets of them for a mechanism, this process has compiled, or read from the disk."""
     return _N_MADE[0]
+
+
+def count_made() -> None:
+    """Count one more."""
+    _N_MADE[0] += 1
 
 
 def folder_of(package: types.ModuleType) -> Path | None:
@@ -147,18 +138,16 @@ def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -
 class _Cache(FunctionCache):
     """Numba's cache of one function, with our stamp; what goes wrong in it costs time and raises nothing."""
 
-    def __init__(
-        self, function: Callable[..., Any], stamp: str, key: str, announcement: str, folder: Path | None = None
-    ):
+    def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         if chosen:  # numba would make it as the umask has it
             with suppress(OSError):
                 make_own(Path(chosen, UserProvidedCacheLocator.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
-        own = own_folder(Path(self._cache_path)) if folder is None else folder
+        own = own_folder(Path(self._cache_path))
         self._cache_path = str(own)
-        self._cache_file = _Files(own, self._impl.filename_base, (source, stamp), folder is not None)
+        self._cache_file = Files(own, self._impl.filename_base, (source, stamp))
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -173,10 +162,6 @@ class _Cache(FunctionCache):
             say_once(self._announcement)
         return found
 
-    def has(self, sig: Any, target_context: Any) -> bool:
-        """Whether there is a file for a signature."""
-        return self._cache_file._path(self._index_key(sig, target_context.codegen())).exists()
-
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)
@@ -184,14 +169,14 @@ class _Cache(FunctionCache):
             say_once(UNWRITABLE)
 
 
-class _Files:
+class Files:
     """The files of one function, one for each key, each behind its checksum, and in the hands of the user alone.
 
     A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
     write at the same time may lead one function to the machine code of another.
     """
 
-    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool):
+    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool = False):
         self.folder, self.name, self.limited = folder, name, limited
         self.made_of = numba.__version__, stamp
 
@@ -207,14 +192,12 @@ class _Files:
         finally:
             unfinished.unlink(missing_ok=True)
         if self.limited:
-            kept = sorted(self.folder.glob(f"{glob.escape(self._kind)}*.nbc"), key=_written)
-            for old in kept[:-MOST_KEPT]:
+            for old in sorted(self._all(), key=_written)[:-MOST_KEPT]:
                 old.unlink(missing_ok=True)
 
-    @property
-    def _kind(self) -> str:
-        """What the names of functions that differ in what they enclose alone have in common."""
-        return self.name.partition(".locals.")[0] + ".locals."
+    def has(self, key: Any) -> bool:
+        """Whether there is a file for a key."""
+        return self._path(key).exists()
 
     def load(self, key: Any) -> Any:
         """What numba made for a key; None if it is missing."""
@@ -229,8 +212,11 @@ class _Files:
 
     def flush(self) -> None:
         """Remove the files of all keys."""
-        for path in self.folder.glob(f"{glob.escape(self.name)}.*.nbc"):
+        for path in self._all():
             path.unlink(missing_ok=True)
+
+    def _all(self) -> list[Path]:
+        return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
 
     def _path(self, key: Any) -> Path:
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
@@ -242,6 +228,14 @@ def _written(path: Path) -> float:
         return path.stat().st_mtime
     except OSError:
         return 0.0
+
+
+def digest_of(text: str, *sources: str | types.ModuleType) -> str:
+    """A digest of a text and of the files of modules."""
+    digest = hashlib.sha256(text.encode())
+    for source in sources:
+        digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
+    return digest.hexdigest()
 
 
 def sources_folder() -> Path:

@@ -30,6 +30,8 @@ def _known(name: str) -> Any:
 class Reference(types.Type):
     """A pointer to a table: of each array its address and its shape, of each function its address.
 
+    Functions are of numba, or of LLVM (see own_functions.py): these get addresses of arrays, and report no errors.
+
     Parameters
     ----------
     name : str
@@ -44,6 +46,7 @@ class Reference(types.Type):
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
         self.functions: dict[str, Signature] = {}
+        self.own_functions: set[str] = set()  # of these, those of LLVM
         self.places: dict[str, int] = {}
         self.n_words = 0
         for field, kind in self.arrays.items():
@@ -55,7 +58,10 @@ class Reference(types.Type):
 
     def __repr__(self) -> str:
         """The name, and what tells layouts apart: machine code on disk is kept by it."""
-        fields = [(field, str(kind)) for field, kind in self.arrays.items()] + list(self.functions)
+        fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
+        fields += [
+            (field, str(self.functions[field])) if field in self.own_functions else field for field in self.functions
+        ]
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
@@ -65,8 +71,24 @@ class Reference(types.Type):
         self.n_words += 1
         _define_call(self, field, signature)
 
+    def add_own_functions(self, signatures: Mapping[str, Signature]) -> None:
+        """Add functions of LLVM, which may be called if they are there; arrays are one-dimensional."""
+        for field, signature in signatures.items():
+            self.functions[field] = signature
+            self.own_functions.add(field)
+            self.places[field] = self.n_words
+            self.n_words += 1
+            _define_own_call(self, field, signature)
+
+    def own_type(self, field: str) -> tuple[str, list[str]]:
+        """The types of the result and of the arguments of a function of LLVM, as LLVM writes them."""
+        signature = self.functions[field]
+        return str(_plain(signature.return_type)), [str(_plain(kind)) for kind in signature.args]
+
     def table(self, values: Any) -> Any:
         """The table, int64, for an object with arrays and functions of these names, which has to outlive it.
+
+        Functions of LLVM it has by their addresses, 0 for those that are not there.
 
         Raises
         ------
@@ -82,7 +104,10 @@ class Reference(types.Type):
             words.extend(array.shape)
         for field, signature in self.functions.items():
             function = getattr(values, field)
-            words.append(0 if function is None else machine_code(function, signature))
+            if field in self.own_functions:
+                words.append(function)
+            else:
+                words.append(0 if function is None else machine_code(function, signature))
         return np.array(words, dtype=np.int64)
 
 
@@ -157,3 +182,31 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
         with builder.if_then(status.is_error, likely=False):
             convention.return_status_propagate(builder, status)
         return value
+
+
+_PLAIN = {
+    types.float64: ir.DoubleType(),
+    types.int64: ir.IntType(64),
+    types.boolean: ir.IntType(1),
+    types.none: ir.VoidType(),
+}
+
+
+def _plain(kind: Any) -> Any:
+    """What LLVM's functions get for an argument."""
+    return _PLAIN[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _PLAIN[kind]
+
+
+def _define_own_call(typ: Reference, field: str, signature: Signature) -> None:
+    place = typ.places[field]
+
+    @lower_builtin((typ.name, field), typ, *signature.args)
+    def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(_plain(signature.return_type), [_plain(each) for each in signature.args])
+        function = _load(context, builder, args[0], place, kind.as_pointer())
+        plain = [
+            make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, args[1:], strict=True)
+        ]
+        value = builder.call(function, plain)
+        return context.get_dummy_value() if signature.return_type == types.none else value

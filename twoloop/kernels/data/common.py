@@ -20,6 +20,7 @@ from numba.extending import typeof_impl
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
 from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
+from twoloop.kernels.compile.own_functions import OwnFunctions
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.reference import Reference
 
@@ -214,10 +215,10 @@ class Kit:
     """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
-    chooses between two others has these as `first` and `second`. An inner loop made for the mechanism leaves to
-    `general` what it does not do itself; `own` is a part of the step made for it, Taylor series or stages, and
-    `instead` what is called where that does not serve. `numbers` are those that the inner loop made for the mechanism
-    reads, `own_numbers` those of that part.
+    chooses between two others has these as `first` and `second`. An inner loop that calls functions made for the
+    mechanism leaves to `general` what these do not do; `instead` is what is called where those of a step do not serve.
+    `own` are sets of such functions; `numbers` is what those of the inner loop and of stages read, `own_numbers` what
+    those of series read.
     """
 
     def __init__(
@@ -228,18 +229,21 @@ class Kit:
         first: Step | None = None,
         second: Step | None = None,
         general: Any = None,
-        own: Any = None,
         instead: Any = None,
+        own: tuple[OwnFunctions, ...] = (),
         numbers: Any = None,
         own_numbers: Any = None,
     ):
         self.__dict__.update(functions._asdict())
-        self.functions, self.inner, self.general, self.own, self.instead = functions, inner, general, own, instead
+        self.functions, self.inner, self.general, self.instead, self.own = functions, inner, general, instead, own
         self.numbers = NONE if numbers is None else numbers
         self.own_numbers = NONE if own_numbers is None else own_numbers
         self.attempt, self.settle = step or Step()
         self.attempt_first, self.settle_first = first or Step()
         self.attempt_second, self.settle_second = second or Step()
+        self.__dict__.update(dict.fromkeys(OWN_FUNCTIONS, 0))
+        for each in own:
+            self.__dict__.update(each.addresses)
         self.table = KIT.table(self)
         self.address = self.table.ctypes.data
 
@@ -262,12 +266,38 @@ for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
 # (kit, work, options, memory, t, h, tolerances, state, new_state) -> Attempt
 ATTEMPT = types.NamedTuple((i8, f8, f8), Attempt)(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-for _name in ("attempt", "attempt_first", "attempt_second", "own", "instead"):
+for _name in ("attempt", "attempt_first", "attempt_second", "instead"):
     KIT.add_function(_name, ATTEMPT)
 # (kit, work, options, memory, tolerances, accepted)
 SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
 for _name in ("settle", "settle_first", "settle_second"):
     KIT.add_function(_name, SETTLE)
+
+# functions made for a mechanism, see generate/straight_code.py, series_code.py and stage_code.py; those that return a
+# flag say whether their conditions hold, and fill what they are given only then
+OWN_FUNCTIONS = {
+    # (t, q, v, numbers, ...): accelerations; positions moved towards the constraints, by x; the same and velocities,
+    # accelerations and multipliers; accelerations where rows that do not count hold, too
+    "own_there": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
+    "own_closer": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
+    "own_nearer": types.boolean(f8, *[VECTOR] * 8),
+    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
+    # of series: factors (t, q, v, numbers, factors), and the solution with them (r, c, factors, own_numbers, a, lam)
+    "own_factors": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
+    "own_solution": types.boolean(*[VECTOR] * 6),
+    # (scratch, series, r, c, lam, t, unit, state, own_numbers)
+    "begin_series": types.none(*[VECTOR] * 5, f8, f8, VECTOR, VECTOR),
+    # (scratch, series, r, c, t, unit, order, own_numbers), (scratch, series, a, lam, unit, order, own_numbers)
+    "find_order": types.none(*[VECTOR] * 4, f8, f8, i8, VECTOR),
+    "take_order": types.none(*[VECTOR] * 4, f8, i8, VECTOR),
+    # of stages: (scratch, state); (scratch, which, weights, t, h, place, numbers); (scratch, which, place)
+    "begin_stages": types.none(VECTOR, VECTOR),
+    "find_stage": types.boolean(VECTOR, i8, VECTOR, f8, f8, VECTOR, VECTOR),
+    "put_stage": types.none(VECTOR, i8, VECTOR),
+    # (scratch, b, fine, coarse, h, end, estimates)
+    "sum_stages": types.none(*[VECTOR] * 4, f8, VECTOR, VECTOR),
+}
+KIT.add_own_functions(OWN_FUNCTIONS)
 
 
 @typeof_impl.register(Kit)

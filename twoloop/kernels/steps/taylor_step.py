@@ -38,12 +38,14 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.calls import evaluate_there, project
+from twoloop.kernels.evaluation.calls import EVALUATE_THERE, evaluate_there, project
 from twoloop.kernels.steps.recurrences import (
     ATTEMPTS,
     KEEP,
     KNOWN,
     LENGTH,
+    N_FACTORS,
+    N_MEMORY_SCALARS,
     NEXT_LENGTH,
     NEXT_UNIT,
     ORDER,
@@ -57,6 +59,7 @@ from twoloop.kernels.steps.recurrences import (
     UNIT,
     WHICH,
     accelerations_found,
+    end_series,
     expand,
     series_of,
 )
@@ -79,12 +82,38 @@ def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
 
 
 @merged
+def _expand_by_code(f, w, options, memory, t, state, unit):
+    """The series by functions made for the mechanism; f.instead solves where their factors cannot."""
+    order, n, n_rows = int(options[ORDER]), w.Q.size, w.Rate.size
+    series = series_of(memory, order, n, memory[TARGET])
+    place = N_MEMORY_SCALARS + 2 * (order + 1) * n
+    r, a = memory[place : place + n], memory[place + n : place + 2 * n]
+    place += 2 * n
+    c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
+    place += 2 * n_rows
+    n_factors = int(options[N_FACTORS])
+    factors, scratch = memory[place : place + n_factors], memory[place + n_factors :]
+    q, v = state[:n], state[n : 2 * n]
+    have_factors = f.own_factors(t, q, v, f.numbers, factors)
+    if not have_factors:
+        code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
+        if code != DONE:
+            return code
+    f.begin_series(scratch, series, r, c, lam, t, unit, state, f.own_numbers)
+    for k in range(1, order):
+        f.find_order(scratch, series, r, c, t, unit, k, f.own_numbers)
+        if not have_factors or not f.own_solution(r, c, factors, f.own_numbers, a, lam):  # M a + G^T lam = r, G a = c
+            f.instead(f, w, r, c, t, unit, r, a, lam)
+        f.take_order(scratch, series, a, lam, unit, k, f.own_numbers)
+    return end_series(w, order, series)
+
+
+@merged
 def _find_series(f, w, options, memory, t, state, unit, which, by_code):
-    """The series about a state, into one of the two places; by f.own, code made for the mechanism, if there is."""
+    """The series about a state, into one of the two places; by functions made for the mechanism, if there are."""
     memory[TARGET] = which
     if by_code:
-        code, _, _ = f.own(f, w, options, memory, t, unit, state, state, state)
-        return code
+        return _expand_by_code(f, w, options, memory, t, state, unit)
     return expand(f, w, options, memory, t, state, unit)
 
 
@@ -284,7 +313,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @kernel(ATTEMPT, vectorized=True)
 def compiled_taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """The step with series found by f.own, code made for the mechanism; f.instead solves where its factors cannot."""
+    """The step with series found by functions made for the mechanism."""
     return _step(f, w, options, memory, t, h, tolerances, state, new_state, True)
 
 

@@ -1,0 +1,260 @@
+"""The language of LLVM as text: modules, functions, blocks and the operations in them.
+
+llvmlite writes it, too, from objects, which takes ten times as long: more than LLVM takes for machine code of it. Types
+are their text. Pointers are written with what they point to, which all versions of LLVM read.
+"""
+
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
+
+
+class Value:
+    """A number, a vector of numbers or a pointer: its type, and how it is written."""
+
+    __slots__ = ("text", "type")
+
+    def __init__(self, kind: str, text: str):
+        self.type, self.text = kind, text
+
+    def __str__(self) -> str:
+        """As an argument."""
+        return f"{self.type} {self.text}"
+
+
+class Phi(Value):
+    """A value that depends on the block from which its own is entered."""
+
+    __slots__ = ("incoming",)
+
+    def __init__(self, kind: str, text: str):
+        super().__init__(kind, text)
+        self.incoming: list[tuple[Value, Block]] = []
+
+    def add_incoming(self, value: Value, block: "Block") -> None:
+        """What it is from a block."""
+        self.incoming.append((value, block))
+
+    def line(self) -> str:
+        """Its definition."""
+        ways = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
+        return f"{self.text} = phi {self.type} {ways}"
+
+
+class Block:
+    """Operations one after another."""
+
+    def __init__(self, name: str):
+        self.name = name
+        self.lines: list[str | Phi] = []
+
+    def text(self) -> str:
+        """All of them."""
+        lines = (line if isinstance(line, str) else line.line() for line in self.lines)
+        return "\n ".join([f"{self.name}:", *lines])
+
+
+def vector_of(kind: str, width: int) -> str:
+    """The type of a vector; of one number it is the number's."""
+    return kind if width == 1 else f"<{width} x {kind}>"
+
+
+def width_of(kind: str) -> int:
+    """How many numbers a value of a type has."""
+    return int(kind[1:].split()[0]) if kind.startswith("<") else 1
+
+
+def element_of(kind: str) -> str:
+    """Of what a vector type is."""
+    return kind[1:-1].split(" x ")[1] if kind.startswith("<") else kind
+
+
+def constant(kind: str, number: float) -> Value:
+    """A number, or a vector of the same one."""
+    element, width = element_of(kind), width_of(kind)
+    bits = struct.unpack("<Q", struct.pack("<d", number))[0]
+    text = f"0x{bits:016X}" if element == DOUBLE else str(number)
+    return Value(kind, text if width == 1 else f"<{', '.join([f'{element} {text}'] * width)}>")
+
+
+def integer(number: int) -> Value:
+    """An integer."""
+    return Value(INTEGER, str(number))
+
+
+def undefined(kind: str) -> Value:
+    """A value that does not matter."""
+    return Value(kind, "undef")
+
+
+class Module:
+    """Functions, and those of others that they call."""
+
+    def __init__(self) -> None:
+        self._declared: dict[str, str] = {}
+        self._functions: list[Builder] = []
+
+    def function(self, name: str, result: str, arguments: Sequence[str]) -> "Builder":
+        """A new function, in whose first block operations are put."""
+        made = Builder(self, name, result, arguments)
+        self._functions.append(made)
+        return made
+
+    def declare(self, name: str, result: str, arguments: Iterable[str]) -> None:
+        """Say of which type a function of LLVM, or of libm, is."""
+        self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
+
+    def __str__(self) -> str:
+        parts = [*self._declared.values(), *(function.text() for function in self._functions), "!0 = !{}"]
+        return "\n".join(parts)
+
+
+class Builder:
+    """Appends operations to the blocks of a function."""
+
+    def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str]):
+        self.module, self.name, self.result = module, name, result
+        self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
+        self._n = 0
+        self._blocks: list[Block] = []
+        self.block = self.append_block()
+
+    def text(self) -> str:
+        """The definition of the function."""
+        arguments = ", ".join(map(str, self.arguments))
+        body = "\n".join(block.text() for block in self._blocks)
+        return f"define {self.result} @{self.name}({arguments}) {{\n{body}\n}}"
+
+    def append_block(self) -> Block:
+        """A new block."""
+        block = Block(f"b{len(self._blocks)}")
+        self._blocks.append(block)
+        return block
+
+    def position_at_end(self, block: Block) -> None:
+        """Put what follows into a block."""
+        self.block = block
+
+    def _line(self, text: str) -> None:
+        self.block.lines.append(text)
+
+    def _value(self, kind: str, text: str) -> Value:
+        self._n += 1
+        made = Value(kind, f"%v{self._n}")
+        self.block.lines.append(f"{made.text} = {text}")
+        return made
+
+    def operation(self, name: str, a: Value, b: Value) -> Value:
+        """An operation on two values of a type, such as "add" or "fmul fast"."""
+        return self._value(a.type, f"{name} {a.type} {a.text}, {b.text}")
+
+    def negative(self, flags: str, a: Value) -> Value:
+        """-a of a number that is no integer."""
+        return self._value(a.type, f"fneg {flags} {a.type} {a.text}")
+
+    def add(self, a: Value, b: Value) -> Value:
+        """a + b of integers."""
+        return self.operation("add", a, b)
+
+    def sub(self, a: Value, b: Value) -> Value:
+        """a - b of integers."""
+        return self.operation("sub", a, b)
+
+    def mul(self, a: Value, b: Value) -> Value:
+        """a b of integers."""
+        return self.operation("mul", a, b)
+
+    def both(self, a: Value, b: Value) -> Value:
+        """The bits that both have."""
+        return self.operation("and", a, b)
+
+    def convert(self, name: str, a: Value, kind: str) -> Value:
+        """Another type of a value, such as "sitofp" or "bitcast"."""
+        return self._value(kind, f"{name} {a.type} {a.text} to {kind}")
+
+    def compare(self, name: str, a: Value, b: Value) -> Value:
+        """Whether a relation holds, such as "fcmp oeq" or "icmp slt"."""
+        kind = vector_of(BIT, width_of(a.type))
+        return self._value(kind, f"{name} {a.type} {a.text}, {b.text}")
+
+    def select(self, condition: Value, a: Value, b: Value) -> Value:
+        """The first of two values where the condition holds."""
+        return self._value(a.type, f"select {condition}, {a}, {b}")
+
+    def call(self, name: str, kind: str, arguments: Sequence[Value]) -> Value:
+        """The value of a function of the module, or of one that is declared by this."""
+        self.module.declare(name, kind, [value.type for value in arguments])
+        return self._value(kind, f"call {kind} @{name}({', '.join(map(str, arguments))})")
+
+    def gep(self, base: Value, place: Value) -> Value:
+        """A pointer some elements further on."""
+        return self._value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {place}")
+
+    def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
+        """What stands in memory; `constant`: it never changes."""
+        kind, never = pointer.type[:-1], ", !invariant.load !0" if constant else ""
+        return self._value(kind, f"load {kind}, {pointer}, align {align}{never}")
+
+    def store(self, value: Value, pointer: Value, align: int = 8) -> None:
+        """Put a value into memory."""
+        self._line(f"store {value}, {pointer}, align {align}")
+
+    def insert(self, vector: Value, value: Value, place: int) -> Value:
+        """A vector with another element."""
+        return self._value(vector.type, f"insertelement {vector}, {value}, {WORD} {place}")
+
+    def extract(self, vector: Value, place: int) -> Value:
+        """An element of a vector."""
+        return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
+
+    def first_everywhere(self, vector: Value) -> Value:
+        """A vector of its first element."""
+        mask = f"<{width_of(vector.type)} x {WORD}> zeroinitializer"
+        return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
+
+    def phi(self, kind: str) -> Phi:
+        """A value that depends on where the block is entered from."""
+        self._n += 1
+        made = Phi(kind, f"%v{self._n}")
+        self.block.lines.append(made)
+        return made
+
+    def go_to(self, block: Block) -> None:
+        """End a block."""
+        self._line(f"br label %{block.name}")
+
+    def branch(self, condition: Value, then: Block, otherwise: Block) -> None:
+        """End a block by a choice."""
+        self._line(f"br {condition}, label %{then.name}, label %{otherwise.name}")
+
+    @contextmanager
+    def if_then(self, condition: Value) -> Iterator[None]:
+        """What is done where a condition holds."""
+        then, after = self.append_block(), self.append_block()
+        self.branch(condition, then, after)
+        self.block = then
+        yield
+        self.go_to(after)
+        self.block = after
+
+    @contextmanager
+    def if_else(self, condition: Value) -> Iterator[tuple[Any, Any]]:
+        """What is done where a condition holds, and where it does not: two contexts."""
+        then, otherwise, after = (self.append_block() for _ in range(3))
+        self.branch(condition, then, otherwise)
+
+        @contextmanager
+        def within(block: Block) -> Iterator[None]:
+            self.block = block
+            yield
+            self.go_to(after)
+
+        yield within(then), within(otherwise)
+        self.block = after
+
+    def ret(self, value: Value | None) -> None:
+        """End the function."""
+        self._line("ret void" if value is None else f"ret {value}")

@@ -1,0 +1,109 @@
+"""Functions of LLVM made for one mechanism: compiled past numba, kept on disk, and called by kernels at their address.
+
+Numba writes, parses and optimises some thousand lines around each function, and its front end takes ten milliseconds
+for a line of source. What is made for a mechanism is arithmetic on numbers in memory, in the order in which it is to be
+done, so that LLVM has little to do before it makes machine code of it.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from llvmlite import binding
+from numba.core.registry import cpu_target
+
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, count_made, say_once, sources_folder
+
+
+class OwnFunctions:
+    """Functions in memory, as long as this object lives.
+
+    Parameters
+    ----------
+    names : list of str
+    content : bytes
+        Of `object_code`.
+
+    Attributes
+    ----------
+    addresses : dict
+        By their names.
+    """
+
+    def __init__(self, names: list[str], content: bytes):
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+        object_file = binding.ObjectFileRef.from_data(content)
+        self._engine.add_object_file(object_file)
+        self._engine.finalize_object()
+        self.addresses = {name: int(self._engine.get_function_address(name)) for name in names}
+
+
+def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[list[str], str]]) -> OwnFunctions:
+    """Functions that `write` writes: their names, and the text of a module; read from the disk where they are kept.
+
+    Parameters
+    ----------
+    kind : str
+        Under which they are kept, the newest MOST_KEPT of each kind.
+    stamp, key : str
+        What the functions depend on: a digest of what writes them, and of their own content.
+    write : callable
+    """
+    files, place = _files(kind, stamp), _place(key)
+    try:
+        kept = files.load(place)
+    except Exception:  # a file of another installation; it is written anew
+        kept = None
+    if kept is None:
+        names, text = write()
+        kept = names, object_code(text)
+        try:
+            files.save(place, kept)
+        except OSError:
+            say_once(UNWRITABLE)
+    count_made()
+    return OwnFunctions(*kept)
+
+
+def are_kept(kind: str, stamp: str, key: str) -> bool:
+    """Whether `own_functions` would find them on the disk."""
+    return _files(kind, stamp).has(_place(key))
+
+
+def _files(kind: str, stamp: str) -> Files:
+    return Files(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
+
+
+def _place(key: str) -> Any:
+    return (*cpu_target.target_context.codegen().magic_tuple(), key)
+
+
+def object_code(text: str) -> bytes:
+    """Machine code for this processor."""
+    machine = _machine()
+    target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
+    module = binding.parse_assembly(target + text)
+    tuning = binding.create_pipeline_tuning_options(speed_level=1)
+    builder = binding.create_pass_builder(machine, tuning)
+    passes = binding.create_new_module_pass_manager()
+    # these two make code of small mechanisms faster by a tenth; all others together find nothing more
+    if hasattr(passes, "add_reassociate_pass"):
+        passes.add_reassociate_pass()
+        passes.add_instruction_combine_pass()
+    else:  # llvmlite 0.44 has no single passes
+        passes = builder.getModulePassManager()
+    passes.run(module, builder)
+    content: bytes = machine.emit_object(module)
+    return content
+
+
+@cache
+def _triple() -> str:
+    return str(binding.get_process_triple())
+
+
+def _machine() -> Any:
+    """The processor as numba sees it, which NUMBA_CPU_NAME may change; an engine keeps the one that it is given."""
+    options: dict[str, Any] = {"opt": 2}
+    cpu_target.target_context.codegen()._customize_tm_options(options)
+    return binding.Target.from_triple(_triple()).create_target_machine(**options)
