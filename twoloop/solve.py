@@ -126,7 +126,7 @@ def solve_dae(
         symbols; of a system of compiled callbacks in runs that go where none has been, and the 2nd, 4th, 8th, ....
     compiled : bool
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
-        "DOP853" and "Adams": two to eight times as fast, after 0.4 to 7 s, which grow with the mechanism, once for
+        "DOP853" and "Adams": two to eight times as fast, after 0.1 to 6 s, which grow with the mechanism, once for
         equations of the same structure, as the code is kept on disk and reads its numbers. For other parameters the
         equations are only written down again, in hundredths of a second for a planar linkage. The callbacks must not
         branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.

@@ -31,7 +31,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-BUILD_SECONDS = 1e-3  # for a quantity, about
+BUILD_SECONDS = 3e-4  # for a quantity, about
 LANE_WRITERS = (lane_code, lane_series, lane_emitter)
 WRITERS = (series, straight_line, straight_code, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
