@@ -23,12 +23,10 @@ MOTIONS = read()
 
 
 def calls(place):
-    """Names, tolerances and options of the runs of a family: the default, in turn with code of its own, and others."""
+    """Names, tolerances and options of the runs of a family: the default, without and with code of its own, others."""
     names = ["auto", "Taylor", *(OTHERS[(4 * place + k) % len(OTHERS)] for k in range(4))]
     made = [(name, TOLERANCES[(place + k) % len(TOLERANCES)], {}) for k, name in enumerate(names)]
-    if place % 3 < 2:  # making the code takes longer than all runs
-        made.append((names[place % 3], TOLERANCES[1 + place % 4], {"compiled": True}))
-    return made
+    return made + [(name, tolerance, {"compiled": True}) for name, tolerance, _ in made[:2]]
 
 
 @pytest.mark.parametrize("family", [family for family in FAMILIES if family not in NARROW])
@@ -39,7 +37,8 @@ def test_a_run_is_right_or_says_that_it_is_not(family):
         made = judged(mechanism, known, name, tolerance, TIME_LIMIT, **options)
         told = f"{name}, {options}, at {tolerance:g} on {mechanism.name}: {made}"
         assert made["outcome"] != SILENT, told
-        if name == "auto" and not options and family not in MAY_END:
+        refused = options and made["status"] == "RAISED"  # of equations that branch there is no code
+        if name == "auto" and not refused and family not in MAY_END:
             assert made["outcome"] == RIGHT, told
 
 

@@ -276,10 +276,12 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         memory[PASSED] += h
         return Attempt(DONE, 0.0, 0.0)
     off = departure(w, tolerances, h, q, v, q1)
-    if off > 0.0:
-        memory[SHORTER] = min(1.0, x / memory[LENGTH] * (ALLOWED / off) ** (1.0 / order))
+    memory[SHORTER], allowed = 1.0, np.inf
+    if off > 0.0:  # where growth, or a force ahead, cut the step short of LENGTH, how far short says nothing
+        allowed = (ALLOWED / off) ** (1.0 / order)
+        memory[SHORTER] = min(1.0, max(x / memory[LENGTH], 1.0 / GROWTH) * allowed)
     if off > 1.0:
-        return Attempt(DONE, off, memory[SHORTER] * memory[LENGTH] / x)
+        return Attempt(DONE, off, allowed)
     if checked:
         defect = excess(tolerances, h, order, found, a1, q1, v1)
         if defect > 1.0:
