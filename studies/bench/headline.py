@@ -17,6 +17,7 @@ OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
 BEST = "best of ours"
 STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
 PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
+NEARLY, CHEAPER = 1.25, 1.5  # by which a run misses an error, and takes less time, where that is to be said
 FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of which counts
 SCIPY = "SciPy's best"
 
@@ -89,8 +90,9 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     dict
         case, t_end, errors, first_at (tolerance of the first calls, None without them), and lines: name, first_s or
         None, and at each error solver, call_s, inside_s (of it inside the integrator, of the cheapest run that is good
-        enough), keeps (the constraints) and from_python, or in their place why there is none: "not run", "not
-        reached", "not asked".
+        enough; None of rivals), keeps (the constraints), from_python and near (error and call_s of a run that nearly
+        gets there and takes much less, or None), or in their place why there is none: "not run", "not reached", "not
+        asked".
     """
     rows = rows[rows["case"] == case]
     if rows.empty:
@@ -100,23 +102,39 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     sundials = {name: (rows["family"] == "SUNDIALS") & rows["solver"].str.startswith(name) for name in FROM_C}
     lines = []
     for name, which in (own | sundials | {SCIPY: rows["family"] == "SciPy"}).items():
-        runs = rows[which]
+        runs, rival = rows[which], name not in (DEFAULT, OWN_CODE)
         built = first[first["solver"].isin(runs["solver"])] if len(first) else first
         first_s = float(built["first_call_s"].min()) if len(built) else None
-        lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error) for error in PRICED]})
+        lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error, rival) for error in PRICED]})
     found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
     return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None}
 
 
-def _priced(runs: pd.DataFrame, error: float) -> dict[str, Any]:
-    by_solver = [(tables.time_for(own, error), str(name)) for name, own in runs.groupby("solver")]
-    best = min(((time, name) for time, name in by_solver if time == time), default=None)  # not NaN
-    if best is not None:
-        own = runs[runs["solver"] == best[1]]
-        line = tables.run_for(own, error)
-        told = {"keeps": bool(line["keeps_constraints"]), "from_python": bool(line["called_from"] == "Python")}
-        return {"solver": best[1], "call_s": float(best[0]), "inside_s": float(line["inside_s"]), "why": None} | told
+def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
+    """The cheapest of some solvers; rivals by the rule of the standings, where they were not run at about the error."""
+    costs = tables.costs_at(runs, error, doubt=rival)
+    solver = min(costs, key=lambda name: costs[name][0], default=None)
+    if solver is not None:
+        own, call_s = runs[runs["solver"] == solver], costs[solver][0]
+        line = own.iloc[0]
+        told: dict[str, Any] = {
+            "keeps": bool(line["keeps_constraints"]),
+            "from_python": bool(line["called_from"] == "Python"),
+        }
+        inside_s = None if rival else float(tables.run_for(own, error)["inside_s"])
+        told |= {"inside_s": inside_s, "near": _near(runs, error, call_s)}
+        return {"solver": solver, "call_s": float(call_s), "why": None} | told
     put = tables.put(runs)
     missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
     why = "not run" if put.empty else "not reached" if missed else "not asked"
-    return {"solver": None, "call_s": None, "why": why, "keeps": True, "from_python": False}
+    return {"solver": None, "call_s": None, "why": why, "keeps": True, "from_python": False, "near": None}
+
+
+def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] | None:
+    """The cheapest run that misses an error by little and takes much less time than one that does not."""
+    errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
+    missing = runs[(errors > error) & (errors <= NEARLY * error) & (times * CHEAPER < call_s)]
+    if missing.empty:
+        return None
+    run = missing.loc[missing["call_s"].astype(float).idxmin()]
+    return {"error": float(run["error_q"]), "call_s": float(run["call_s"])}

@@ -17,6 +17,8 @@ KINDS = {  # tags of mechanisms, and what a user calls them
     "non-holonomic": "rolling, or sliding on an edge: non-holonomic",
 }
 
+OTHER_KINDS = {*KINDS, "singular", "stiff"}  # of which the table says more
+
 
 def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
     """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
@@ -30,8 +32,21 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
     made = found.get("work_precision", {})
     often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
-    rows += _of_kinds(made.get("rivals", {}).get("mechanisms", []))
+    mechanisms = made.get("rivals", {}).get("mechanisms", [])
+    rows += _of_short_calls([each for each in mechanisms if each.get("tags") and not OTHER_KINDS & {*each["tags"]}])
+    rows += _of_kinds(mechanisms)
     return rows + ([{"what": "run many times", "take": "; ".join(often)}] if often else [])
+
+
+def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Who is the cheapest on the other smooth mechanisms, whose calls take milliseconds."""
+    cheapest = Counter(_cheapest(each["at"]) for each in mechanisms)
+    cheapest.pop("", None)
+    if not cheapest:
+        return []
+    parts = [f"{call(solver)} on {n}" for solver, n in cheapest.most_common()]
+    n, what = len(mechanisms), "smooth, rigid, in calls of a few milliseconds"
+    return [{"what": what, "take": f"of {n} mechanisms, the cheapest at most errors: {', '.join(parts)}"}]
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
@@ -45,7 +60,7 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         solver, n = max(cheapest.items(), key=lambda item: (item[0] != "", item[1]), default=("", 0))
         if solver and n == len(these):
             said = f"{call(solver)}, the cheapest at most errors on {n} of {len(these)} such mechanisms"
-            rows.append({"what": words, "take": said + _drifting([solver], these)})
+            rows.append({"what": words, "take": said})
             told |= {each["case"] for each in own}
         elif these:
             open_kinds.append(words)
@@ -59,20 +74,8 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         ranked = sorted(by_solver.items(), key=lambda item: -len(item[1]))
         parts = [f"{call(solver)} on {listed(cases)}" for solver, cases in ranked]
         parts += [f"none is the cheapest at most errors on {listed(open_ones)}"] if open_ones else []
-        drifting = [name for name in by_solver if _drifting([name], list(left.values()))]
-        said = "; ".join(parts) + _drifting(drifting, list(left.values()), drifting != list(by_solver))
-        rows.append({"what": "; ".join(open_kinds), "take": said if by_solver else _UNDECIDED})
+        rows.append({"what": "; ".join(open_kinds), "take": "; ".join(parts) if by_solver else _UNDECIDED})
     return rows
-
-
-def _drifting(names: Sequence[str], mechanisms: Sequence[Sequence[Mapping[str, Any]]], named: bool = False) -> str:
-    """What is said where none of these solvers keeps the constraints; `named`: others stand beside them."""
-    runs = [run for at in mechanisms for line in at for run in (line["ours"], line["others"]) if run]
-    kept = [run.get("keeps", True) for run in runs if run["solver"] in names]
-    if any(kept) or not kept:
-        return ""
-    who = listed(list(map(call, names))) if named else "it" if len(names) == 1 else "they"
-    return f"; given accelerations, {who} {'drifts' if len(names) == 1 else 'drift'} off the constraints"
 
 
 def _won(at: Sequence[Mapping[str, Any]]) -> Counter[str]:
@@ -96,16 +99,21 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
-    """From which run on code for the mechanism pays, by the first calls, where it does."""
+    """From which run on code for the mechanism pays, by the first calls: on every mechanism, and the soonest."""
     paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
-    sides = ([line for line in paying if line["solver"].endswith(", compiled") is ours] for ours in (False, True))
-    best = [min(side, key=lambda line: (line["never"], max(line["pays"])), default=None) for side in sides]
-    parts = [
-        f"{call(line['solver'])} pays soonest beside `auto`, {_from_run(line)}" for line in best if line is not None
-    ]
-    if len(parts) > 1:
-        parts[1] = f"of ours {parts[1]}"
-    return ["; ".join(parts) + " (at an error of 1e-8)"] if parts else []
+    if not paying:
+        return []
+    always = min((line for line in paying if not line["never"]), key=_latest, default=None)
+    soonest = [line for line in paying if always is None or (line["never"] and _latest(line) < _latest(always))]
+    parts = [f"on every mechanism {call(always['solver'])} breaks even first, {_from_run(always)}"] if always else []
+    if soonest:
+        told = [f"{call(line['solver'])} ({_from_run(line)})" for line in sorted(soonest, key=_latest)]
+        parts.append(f"{'sooner, but not on all: ' if always else 'not on all: '}{', '.join(told)}")
+    return [f"beside `{DEFAULT}`, at an error of 1e-8, {'; '.join(parts)}"]
+
+
+def _latest(line: Mapping[str, Any]) -> float:
+    return float(max(line["pays"]))
 
 
 def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -1,7 +1,7 @@
 """Every mechanism with a verified end x every solver of ours and of other projects: which is ahead at which error.
 
-Errors are those at the end of the reference, which is known there to more digits than by any motion between. A part of
-`studies.work_precision`.
+Errors are those at the end of the reference, which is known there to more digits than by any motion between: the
+largest of a coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -31,6 +31,12 @@ from twoloop.mechanisms import Problem, Reference
 
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
+RANGES = {  # of errors; none: all of them on the mechanisms that cross singular positions
+    "1e-3 to 1e-6": DECADES[:4],
+    "1e-7 to 1e-9": DECADES[4:7],
+    "1e-10 to 1e-13": DECADES[7:],
+    "singular positions": (),
+}
 SHOWN = DECADES[::2]  # at which the four-bars are judged
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
 AHEAD = {"heyoka": 2, "rivals called from Python": 8, "other compiled rivals": 4}  # aimed at on the four-bars
@@ -158,7 +164,29 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
     found["put"] = put(rows)
+    found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
+    python = rows[rows["called_from"] == "Python"]["solver"].unique()
+    ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
+    found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
+    found["residual"] = residual(rows)
     return found | {"aims": aims(by_case[name] for name in GEOMETRIES if name in by_case)}
+
+
+def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) -> dict[str, Any]:
+    """Standings within a range of errors on mechanisms without singular positions; on the others at all errors."""
+    singular = not errors
+    own = [each for each in made if ("singular" in each["tags"]) is singular]
+    pairs = [[at["standing"] for at in each["at"] if singular or at["error"] in errors] for each in own]
+    return {"name": name, "n_mechanisms": len(own), "standings": headline.counted(pairs)}
+
+
+def residual(rows: pd.DataFrame) -> float | None:
+    """Of rivals that do not enforce the constraints, what is left of these at the end over the error: the median."""
+    free = rows[(rows["family"] != "two-loop") & ~rows["keeps_constraints"].astype(bool)]
+    if free.empty:
+        return None
+    shares = (free["violation_q"].astype(float) / free["error_q"].astype(float)).replace(np.inf, np.nan).dropna()
+    return float(shares.median()) if len(shares) else None
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:
@@ -202,7 +230,8 @@ def picture(rows: pd.DataFrame) -> Figure:
         line = figures.with_gaps(rows[rows["solver"] == solver])
         look = figures.look(line[line["error_q"].notna()].iloc[0])
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
-    axes.set(xscale="log", yscale="log", xlabel="error after 10 s (m, rad)", ylabel="CPU time of the call (ms)")
+    error = "error after 10 s, over max(1, max |q|)"
+    axes.set(xscale="log", yscale="log", xlabel=error, ylabel="CPU time of the call (ms)")
     figures.legend(figure, [axes], figures.LEGEND)
     figure.suptitle("Four-bar linkage, 10 s: what an accuracy costs", fontsize=10)
     return figure
@@ -225,7 +254,7 @@ def heat_map(found: dict[str, Any]) -> Figure:
         axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
-        axes.set(title=name, xlabel="error at the end (m, rad)")
+        axes.set(title=name, xlabel="error at the end, over max(1, max |q|)")
     told = "blue: ours ahead; in brackets: undecided; a word: only these get there"
     figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
     figure.colorbar(image, ax=panels, label="ratio")

@@ -55,9 +55,9 @@ def test_the_headline_names_default_compiled_default_and_best_in_this_order():
     head, _, *lines = (line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|"))
     assert head[0] == f"of {3 * n} pairs of mechanism and error" and head[-1].endswith("of 3 mechanisms")
     assert [line[0] for line in lines] == [
-        "**`auto`**, which a user gets",
+        "**`auto`**, the default",
         "**`auto, compiled`**",
-        "the best of our methods, chosen when all had run",
+        "the best of our methods in hindsight",
     ]
     # ahead, behind, undecided, alone, alone of those asked, missed; on mechanisms nowhere behind
     assert lines[0][1:] == lines[1][1:] == [str(count) for count in (0, n, n, n, 0, 0, 2)]
@@ -193,7 +193,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
     [
         (
             0.5,
-            ["**Reached**: our best nowhere", "had run | 11 | 0 | 0 |", "on the four-bars: 4.0 to 4.0 times."],
+            ["**Reached**: our best nowhere", "in hindsight | 11 | 0 | 0 |", "on the four-bars: 4.0 to 4.0 times"],
             ["**Missed**"],
         ),
         (1.5, ["**Reached**: our best nowhere", "**Missed**: 2 times as fast as heyoka"], ["**Missed**: our"]),
