@@ -35,7 +35,7 @@ UNWRITABLE = (
     "that you can write, and nobody else can"
 )
 MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk ...
-MOST_HELD = 50  # ... and in memory; their machine code, some 50 kB, stays there as long as the process lives
+MOST_HELD = 50  # ... and in memory
 CHECKSUM = hashlib.sha256().digest_size
 
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too

@@ -80,10 +80,18 @@ def _place(key: str) -> Any:
 
 def object_code(text: str) -> bytes:
     """Machine code for this processor."""
-    machine = _machine()
+    machine, passes, builder = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
-    tuning = binding.create_pipeline_tuning_options(speed_level=1)
+    passes.run(module, builder)
+    content: bytes = machine.emit_object(module)
+    return content
+
+
+@cache
+def _compiler() -> tuple[Any, Any, Any]:
+    """The processor and LLVM's passes, once a process: of passes that are let go some 300 kB stay."""
+    machine, tuning = _machine(), binding.create_pipeline_tuning_options(speed_level=1)
     builder = binding.create_pass_builder(machine, tuning)
     passes = binding.create_new_module_pass_manager()
     # these two make code of small mechanisms faster by a tenth; all others together find nothing more
@@ -92,9 +100,7 @@ def object_code(text: str) -> bytes:
         passes.add_instruction_combine_pass()
     else:  # llvmlite 0.44 has no single passes
         passes = builder.getModulePassManager()
-    passes.run(module, builder)
-    content: bytes = machine.emit_object(module)
-    return content
+    return machine, passes, builder
 
 
 @cache
