@@ -61,7 +61,7 @@ QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
     *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES),
-    *("LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1"),
+    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
