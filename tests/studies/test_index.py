@@ -255,7 +255,8 @@ def test_classes_come_in_their_order_and_the_long_one_from_the_energy():
 
 
 TABLE3 = {"one_constant": False, "irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0]}
-VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a"], "only_others": [], "none_right": ["b", "c"], "not_put": ["d"]}
+VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a", "d"], "only_others": [], "none_right": ["b", "c"]}
+VALID["misses"] = {"inexact": 2, "wrong": 4, "said so": 0, "not run": 1, "limit": 3}
 VALID |= {"n_singular": 0, "n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
 
 
@@ -269,7 +270,8 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "right on 17, only ours on 1, only others on 0, none on 2. On the other 1 only ours are" in text
+    assert "right on 17, only ours on 2, only others on 0, none on 2. Where only ours are, 2 runs" in text
+    assert "2 runs of others were inexact, 4 wrong, 3 stopped by our time limit, 1 not run. Wrong runs" in text
     assert "1 of 500 of ours, 57 of 300 of others" in text
     planted = {"n": 73, "missed": ["x"], "mutants": None}
     assert "catch 72 of 73 planted faults ([planted errors]" in screen(tmp_path, planted_errors=planted)
