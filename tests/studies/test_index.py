@@ -273,8 +273,20 @@ def test_what_can_be_trusted_is_counted(tmp_path):
     assert "right on 17, only ours on 2, only others on 0, none on 2. Where only ours are, 2 runs" in text
     assert "2 runs of others were inexact, 4 wrong, 3 stopped by our time limit, 1 not run. Wrong runs" in text
     assert "1 of 500 of ours, 57 of 300 of others" in text
-    planted = {"n": 73, "missed": ["x"], "mutants": None}
-    assert "catch 72 of 73 planted faults ([planted errors]" in screen(tmp_path, planted_errors=planted)
+    by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
+    planted = {
+        "n": 73,
+        "missed": ["x"],
+        "by": by,
+        "mutants": {"n": 40, "seen": 33, "kernels": {"adams": {}, "bdf": {}}},
+    }
+    text = screen(tmp_path, planted_errors=planted)
+    assert (
+        "- Of 73 faults that we planted in models, solvers and reports `solve_dae` itself refuses or stops 20; " in text
+    )
+    assert "30 show only against a known motion; 2 by too many evaluations" in text
+    assert "20 are caught by our test suite; no check of those run catches 1: x. Of 40 random changes to" in text
+    assert "the kernels of adams and bdf it sees 33. [Planted errors]" in text
 
 
 def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):

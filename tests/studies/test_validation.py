@@ -136,8 +136,8 @@ def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_ru
     inexact = {"outcome": "inexact", "error_q": 2e-5, "digits_q": 4.7}
     found = validation.findings_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
     text = render("validation", found, {"models": ""}, stamp="stamp", quick=False)
-    said = "- On double pendulum only ours are right: `Gauss12` and `BDF`. Of the others, run and inexact: `LSODA, index 1`"
-    assert said + " (2e-5).\n" in text and "not run" not in text
+    said = "- On double pendulum only ours are right: `Gauss12` and `BDF`. Of the others, run and inexact: "
+    assert said + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
     assert found["misses"] == {"inexact": 1, "wrong": 0, "said so": 0, "not run": 0, "limit": 0}
 
 
