@@ -199,8 +199,8 @@ def sizes() -> dict[str, int]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The ways that ran, and at equal error ours beside the others.
 
-    The error of a way is the largest of its runs, at a tolerance at which none failed. Ratios of the mechanisms on which
-    heyoka runs in compact mode are apart.
+    The error of a way is the largest of its runs, at a tolerance at which none failed. Ratios of the mechanisms on
+    which heyoka runs in compact mode are apart.
     """
     made = rows[(rows["group"] == GROUP) & rows["tol"].notna()]  # of packages that are there
     made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=AGREE / 10)
