@@ -232,7 +232,9 @@ def graded(ran: pd.DataFrame) -> dict[str, int]:
 def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """Outcomes of each solver on the traps that it was run on: ours, others without a largest step, and with."""
     ran = rows[rows["outcome"] != NOT_RUN]
-    counts = [{"solver": str(name)} | counts_of(own) | graded(own) for name, own in ran.groupby("solver", sort=False)]
+    counts: list[dict[str, Any]] = [
+        {"solver": str(name), **counts_of(own), **graded(own)} for name, own in ran.groupby("solver", sort=False)
+    ]
     return sorted(counts, key=lambda line: (not line["solver"].endswith(OURS), line["solver"].endswith(LIMITED)))
 
 
