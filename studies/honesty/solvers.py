@@ -1,4 +1,4 @@
-"""The solvers of `studies.honesty`, as their users call them: ours, and others as they come and with `max_step`."""
+"""The solvers of `studies.honesty`, as their users call them: ours, and others without `max_step` and with."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,7 +27,20 @@ DEFAULT, DEFAULT_COMPILED = f"auto{OURS}", f"auto, compiled{OURS}"
 QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
 LIMITED = ", max_step"  # of others that take no step longer than ours do by default
 
+# whose a solver is, in the words of the findings
+DEFAULTS = {DEFAULT: "default", DEFAULT_COMPILED: "compiled"}
+KINDS = ("default", "compiled", "ours", "heyoka", "sundials", "scipy", "limited")
+
 Call = Callable[[Trap], Result]
+
+
+def kind_of(name: str) -> str:
+    """Which of KINDS a solver is; others with a largest step are limited, whosever they are."""
+    if name.endswith(OURS):
+        return DEFAULTS.get(name, "ours")
+    if name.endswith(LIMITED):
+        return "limited"
+    return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C) else "scipy"
 
 
 def own(method: str, trap: Trap) -> Result:
@@ -39,7 +52,7 @@ def own(method: str, trap: Trap) -> Result:
 
 
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
-    """Another project's, as it comes, or with the longest step that ours take by default."""
+    """Another project's, without a largest step, or with the longest that ours take by default."""
     longest = LONGEST_UNSEEN * trap.t_end if limited else None
     options = {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
     tolerances = {"tol": trap.tolerance} if solve is solve_heyoka else {"rtol": trap.tolerance, "atol": trap.tolerance}
@@ -47,7 +60,7 @@ def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
 
 
 def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
-    """Name to call, of those that are asked a group of traps; ours first, then others as they come and limited."""
+    """Name to call, of those that are run on a group of traps; ours first, then others without `max_step` and with."""
     ours = (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
     made: dict[str, Call] = {f"{name}{OURS}": partial(own, name) for name in (QUICK_OWN if quick else ours)}
     others: dict[str, Callable[..., Result]] = {}

@@ -14,21 +14,36 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from references.heyoka.taylor import LARGEST_UNROLLED
+from references.sundials.loop import SMALLEST_STEP
 from studies.bench import figures
 from studies.bench.apart import apart
 from studies.bench.cli import StudyError
 from studies.bench.end_states import EXACT
+from studies.bench.render import power
 from studies.bench.sharp_forces import T_END
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
-from studies.honesty.solvers import CVODE_C, DEFAULT, DEFAULT_COMPILED, HEYOKA, LIMITED, OURS, Call, solvers, why_not
+from studies.honesty.solvers import (
+    CVODE_C,
+    HEYOKA,
+    KINDS,
+    LIMITED,
+    OURS,
+    SCIPY,
+    Call,
+    kind_of,
+    solvers,
+    why_not,
+)
 from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile import callbacks
 
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
+USUAL = 1e-8  # tolerance of the traps that are not about tolerances
 GRACE = 6.0  # s beyond the time limit of a run after which it hangs
 TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right answer: the first that succeed
 TRUTH_LIMIT = 10.0  # s that one of them may take
@@ -42,10 +57,10 @@ REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, t
 )
 BUILT = (HEYOKA, CVODE_C)  # solvers that are built for each system, which takes longer than they run
 
-PARTS = {  # of the bars of the figure
-    "right": ((RIGHT,), figures.BLUE),
-    "said so": ((SAID,), figures.SKY),
-    "wrong and silent, or hanging": ((SILENT, HANG), figures.RED),
+PARTS = {  # of the bars of the figure, in counts of `totals`
+    "gross": (f"silently wrong, off by over {power(EXACT)}", figures.RED),
+    "slight": (f"silently wrong, off by {power(LOOSENESS * USUAL)} to {power(EXACT)}", figures.ORANGE),
+    SAID: ("reported failure", figures.SKY),
 }
 
 
@@ -160,8 +175,8 @@ def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -
     """Compile in this process what the children call, on a harmless motion."""
     shared = name.removesuffix(LIMITED)
     sane, tolerance = trap.sane or trap.system, 1e-4
-    callbacks = (getattr(sane.functions, kind) for kind in KINDS)
-    made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *callbacks)
+    functions = (getattr(sane.functions, kind) for kind in callbacks.KINDS)
+    made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *functions)
     if shared in BUILT:
         tolerance = trap.tolerance
         made_for += (trap.group, trap.name, trap.mechanism)
@@ -200,27 +215,31 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
     theirs = [line for line in found["held_out"]["solvers"] if not line["solver"].endswith((OURS, LIMITED))]
-    gross = held[held["outcome"].isin((SILENT, HANG)) & ~(held["error"].astype(float) <= EXACT)][
-        "solver"
-    ].value_counts()
-    counted = [
-        {"solver": name, "n": line["n"], "wrong": line[SILENT] + line[HANG], "gross": int(gross.get(name, 0))}
-        for line in theirs
-        for name in [line["solver"]]
-    ]
+    counted = [{key: line[key] for key in ("solver", "n", "wrong", "gross")} for line in theirs]
     found["held_out"]["by_solver"] = sorted(counted, key=lambda line: -line["wrong"])
-    return found | {"exact": EXACT, "forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+    found |= {"unrolled_to": LARGEST_UNROLLED, "smallest_step": SMALLEST_STEP}
+    found |= {"exact": EXACT, "off": LOOSENESS * USUAL, "usual": USUAL, "scipy": list(SCIPY)}
+    return found | {"forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+
+
+def graded(ran: pd.DataFrame) -> dict[str, int]:
+    """Runs that are wrong and silent or hang: all, off by over EXACT or without an end, and off by less."""
+    wrong = ran["outcome"].isin((SILENT, HANG))
+    slight = wrong & (ran["error"].astype(float) <= EXACT)
+    return {"wrong": int(wrong.sum()), "gross": int((wrong & ~slight).sum()), "slight": int(slight.sum())}
 
 
 def totals(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Outcomes of each solver on the traps that it was run on: ours, others as they come, and limited."""
+    """Outcomes of each solver on the traps that it was run on: ours, others without a largest step, and with."""
     ran = rows[rows["outcome"] != NOT_RUN]
-    counts = [{"solver": str(name)} | counts_of(own) for name, own in ran.groupby("solver", sort=False)]
+    counts: list[dict[str, Any]] = [
+        {"solver": str(name), **counts_of(own), **graded(own)} for name, own in ran.groupby("solver", sort=False)
+    ]
     return sorted(counts, key=lambda line: (not line["solver"].endswith(OURS), line["solver"].endswith(LIMITED)))
 
 
 def parts_of(rows: pd.DataFrame) -> dict[str, pd.Series]:
-    """Which rows are of ours, of others as they come, and of these with a largest step."""
+    """Which rows are of ours, of others without a largest step, and of these with one."""
     ours, limited = rows["solver"].str.endswith(OURS), rows["solver"].str.endswith(LIMITED)
     return {"ours": ours, "others": ~ours & ~limited, "limited": limited}
 
@@ -233,7 +252,7 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def of_traps(ran: pd.DataFrame) -> list[dict[str, Any]]:
-    """Of each trap, whose runs had which outcome, and which solvers as they come were wrong and silent, or hung."""
+    """Of each trap, whose runs had which outcome, and which without a largest step were wrong and silent, or hung."""
     found = []
     for trap, own in ran.groupby("trap", sort=False):
         line = {whose: counts_of(own[which]) for whose, which in parts_of(own).items()}
@@ -243,26 +262,23 @@ def of_traps(ran: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
-    """Runs, of what, and those wrong without a word: of the default, compiled, of our others, of others, limited.
+    """Runs and those wrong without a word, of each of KINDS, and of all others without a largest step.
 
     What an adapter refuses is no run.
     """
-    parts = parts_of(rows)
-    parts = {"default": rows["solver"] == DEFAULT, "compiled": rows["solver"] == DEFAULT_COMPILED} | parts
-    parts["ours"] &= ~parts["default"] & ~parts["compiled"]
+    kinds = rows["solver"].map(kind_of)
+    parts = {kind: kinds == kind for kind in KINDS} | {"others": parts_of(rows)["others"]}
     found = {}
     for name, which in parts.items():
         own = rows[which]
         ran = own[own["outcome"] != NOT_RUN]
-        wrong = ran["outcome"].isin((SILENT, HANG))
-        line = {"n": len(ran), "wrong": int(wrong.sum()), "unasked": int(unasked(ran).sum())}
-        line["gross"] = int((wrong & ~(ran["error"].astype(float) <= EXACT)).sum())
+        line = {"n": len(ran), "unasked": int(unasked(ran).sum())} | graded(ran)
         found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
     return found
 
 
 def bad_in(rows: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
-    """Runs that are wrong and silent, or hang, of ours, of others as they come, and limited."""
+    """Runs that are wrong and silent, or hang, of ours, of others without a largest step, and with one."""
     bad = rows[rows["outcome"].isin((SILENT, HANG))]
     columns = ["trap", "mechanism", "solver", "outcome", "error"]
     return {whose: bad[which][columns].to_dict("records") for whose, which in parts_of(bad).items()}
@@ -287,25 +303,48 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 def picture(totals: Sequence[dict[str, Any]]) -> Figure:
-    """A bar for each solver, ours first, then others: the share of its runs with the outcomes of each part."""
-    names = [f"{line['solver'].replace(OURS, '')} ({line['n']})" for line in totals]
-    figure, axes = plt.subplots(figsize=(7.6, 0.17 * len(totals) + 0.9), layout="constrained")
-    left = np.zeros(len(totals))
-    for what, (outcomes, color) in PARTS.items():
-        counts = [sum(line[each] for each in outcomes) for line in totals]
-        shares = np.array([100.0 * count / line["n"] for count, line in zip(counts, totals, strict=True)])
-        bars = axes.barh(names, shares, left=left, color=color, label=what)
-        if SILENT in outcomes:
-            axes.bar_label(bars, [str(count) if count else "" for count in counts], label_type="center", fontsize=7)
+    """Bars of the runs that did not end right, of ours, of others and of these with a largest step.
+
+    Where all runs of several solvers are right, these share a line.
+    """
+    groups: dict[str, list[dict[str, Any]]] = {"ours": [], "others": [], "others, max_step": []}
+    for line in totals:
+        limited = line["solver"].endswith(LIMITED)
+        groups["ours" if line["solver"].endswith(OURS) else "others, max_step" if limited else "others"].append(line)
+    bars: list[tuple[str, list[float], list[int]]] = []
+    ends: dict[str, int] = {}
+    for whose, own in groups.items():
+        bad = [line for line in own if line[RIGHT] < line["n"]]
+        bad = own if len(own) - len(bad) == 1 else bad
+        for line in bad:
+            name = line["solver"].removesuffix(OURS).removesuffix(LIMITED)
+            counts = [line[part] for part in PARTS]
+            bars.append((f"{name} ({line['n']})", [100.0 * count / line["n"] for count in counts], counts))
+        if len(own) > len(bad):
+            n = sum(line["n"] for line in own) - sum(line["n"] for line in bad)
+            bars.append((f"{len(own) - len(bad)} solvers, all right ({n})", [0.0] * len(PARTS), [0] * len(PARTS)))
+        ends[whose] = len(bars)
+    figure, axes = plt.subplots(figsize=(7.6, 0.2 * len(bars) + 1.2), layout="constrained")
+    places, left = np.arange(len(bars)), np.zeros(len(bars))
+    for k, (words, color) in enumerate(PARTS.values()):
+        shares = np.array([each[1][k] for each in bars])
+        drawn = axes.barh(places, shares, left=left, color=color, label=words)
+        numbers = [str(each[2][k]) if each[2][k] else "" for each in bars]
+        axes.bar_label(drawn, numbers, label_type="center", fontsize=7)
         left += shares
-    n_own = sum(line["solver"].endswith(OURS) for line in totals)
-    axes.axhline(n_own - 0.5, color="black", linewidth=0.8)
-    for text, place in (("ours", 0.5 * n_own), ("others", 0.5 * (n_own + len(totals)))):
-        axes.text(101.0, place - 0.5, text, rotation=90.0, va="center")
-    axes.set(xlabel="share of runs (%)", xlim=(0.0, 100.0), ylim=(len(totals) - 0.4, -0.6), ylabel="solver (its runs)")
+    begin = 0
+    for whose, end in ends.items():
+        if end > begin:
+            axes.text(1.01, 0.5 * (begin + end - 1), whose, transform=axes.get_yaxis_transform(), va="center")
+            axes.axhline(end - 0.5, color="black", linewidth=0.8)
+        begin = end
+    axes.set_yticks(places, [each[0] for each in bars])
+    axes.set(xlabel="share of runs (%); the rest is right", ylabel="solver (its runs)", ylim=(len(bars) - 0.5, -0.5))
+    axes.set_xlim(left=0.0)
     axes.tick_params(axis="y", labelsize=8, length=0.0)
     axes.grid(False)
-    figures.legend(figure, [axes], "numbers: runs")
+    axes.set_title("Sharp forces held out: runs that did not end right (numbers: runs)")
+    figure.legend(loc="outside lower center", ncols=len(PARTS))
     return figure
 
 

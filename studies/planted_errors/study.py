@@ -42,6 +42,13 @@ MOST_EVALUATIONS = {  # about 1.4 times what sound runs take: too many are a fau
 TIME_LIMIT = 20.0  # s of a check
 QUICK = 5  # of so many faults one is planted by a quick run, and all wrong traces, which cost next to nothing
 NONE = "none"
+# who catches a fault, in the order of the report, and how what catches it begins; all else are tests
+ITSELF, KNOWN, BOUNDS, TESTS = "solve_dae", "known motion", "bounds", "tests"
+BEGINS = {
+    ITSELF: ("start or run refused", "run stopped"),
+    KNOWN: ("reference",),
+    BOUNDS: ("energy", "violation", "count of evaluations", "time limit of the check", "the process of the check"),
+}
 
 
 def run_check(problem: Problem, solver: str) -> str:
@@ -158,12 +165,19 @@ def make(output: Output) -> pd.DataFrame:
         return pd.DataFrame([kept.made(fault.name, partial(row_of, fault)) for fault in faults])
 
 
+def catcher(caught_by: str) -> str:
+    """Who catches a fault: `solve_dae` as it stands, a comparison with a known motion, bounds of a run, or a test."""
+    return next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     missed = rows[rows["caught_by"] == NONE]
     caught = (rows["caught_by"] != NONE).groupby(rows["place"], sort=False)
     places = {str(place): {"n": len(own), "caught": int(own.sum())} for place, own in caught}
-    return {"n": len(rows), "missed": missed["fault"].tolist(), "places": places, "tolerance": TOLERANCE}
+    who = rows[rows["caught_by"] != NONE]["caught_by"].map(catcher)
+    by = {each: int((who == each).sum()) for each in (ITSELF, KNOWN, BOUNDS, TESTS)}
+    return {"n": len(rows), "missed": missed["fault"].tolist(), "by": by, "places": places, "tolerance": TOLERANCE}
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import pandas as pd
 
 from studies.bench.sharp_forces import FRICTION, families
-from studies.bench.sharp_motion import RIGHT, SAID, SILENT, Mechanism, Motion, case, judged
+from studies.bench.sharp_motion import JUMPS, RIGHT, SAID, SILENT, Mechanism, Motion, case, judged
+from studies.bench.solvers import DEFAULT
 from studies.bench.store import Row
 from studies.honesty.study import REFUSALS
 
@@ -85,7 +86,18 @@ def counts(rows: pd.DataFrame) -> dict[str, Any]:
     n_loose = int((loose["error"].astype(float) > LARGE).sum())
     found["loose"] = {"tolerance": max(TOLERANCES), "error": LARGE, "n": n_loose}
     found["families"] = {str(family): len(own) for family, own in silent.groupby("what")}
-    return found
+    by_tolerance = rows.groupby("tol")["allowed"].agg(["median", "max"]).sort_index(ascending=False)
+    found["allowed"] = [
+        {"tol": float(tol), "median": float(line["median"]), "most": float(line["max"])}
+        for tol, line in by_tolerance.iterrows()
+    ]
+    misled = silent[silent["method"] == DEFAULT].sort_values("error", ascending=False)
+    found["default"] = {
+        "method": DEFAULT,
+        "n": int(((rows["method"] == DEFAULT) & ~refused).sum()),
+        "wrong": misled[["what", "name", "tol", "error"]].to_dict("records"),
+    }
+    return found | {"jumps": JUMPS}
 
 
 def main(quick: bool) -> None:

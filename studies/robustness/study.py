@@ -173,7 +173,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"tolerance": TOLERANCE, "looseness": LOOSENESS, "t_end": T_END, "grows": GROWS}
     found["n_linkages"] = len(drawn.groupby(["what", "value"]))
     found["n_redrawn"] = int(drawn.drop_duplicates(["what", "value"])["n_redrawn"].sum())
-    found["sensitivity"] = float(drawn["sensitivity"].max())
+    found["sensitivity"], found["allowed"] = float(drawn["sensitivity"].max()), float(drawn["allowed"].max())
     found["sharp"] = sharp_runs.counts(rows[rows["group"] == sharp_runs.SHARP])
     stopped = drawn[drawn["outcome"] == SAID]
     found["n_stopped"], found["n_stopped_rank"] = len(stopped), int(stopped["message"].str.contains("rank").sum())

@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from studies.bench.collector import Run, warm_up
 from studies.bench.end_states import DECADES, EXACT, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
@@ -61,7 +62,7 @@ QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
     *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES),
-    *("LSODA, index 1", "DOP853, index 1", "Radau, index 1", "BDF, index 1"),
+    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
@@ -86,14 +87,15 @@ APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solver
 OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
 SHORT = {
     "RANK_LOST": "rank",
-    "TIME_LIMIT": "time",
-    "NOT_APPLICABLE": "n/a",
-    "NOT_AVAILABLE": "absent",
-    "RAISED": "refused",
+    "TIME_LIMIT": "L",
+    "NOT_APPLICABLE": "–",
+    "NOT_AVAILABLE": "–",
+    "RAISED": "–",
     "STEP_TOO_SMALL": "step",
     "SOLVER_FAILED": "failed",
     "NOT_CONVERGED": "failed",
 }
+NO_FAILURES = ("L", "–")  # of these
 
 
 def runs(quick: bool) -> list[Run]:
@@ -201,10 +203,17 @@ def of_problem(name: str, rows: pd.DataFrame) -> dict[str, Any]:
         some = tight[own & tight["digits_q"].notna()]
         best = some.loc[some["digits_q"].astype(float).idxmax()] if len(some) else None
         found[which] = None if best is None else {"solver": best["solver"], "digits": float(best["digits_q"])}
-        put = tight[own & (tight["outcome"] != "not run")]
-        found[f"{which}_put"], found[f"{which}_stopped"] = len(put), bool((put["status"] == "TIME_LIMIT").any())
         found[f"{which}_right"] = tight[own & (tight["outcome"] == "right")]["solver"].tolist()
     return found
+
+
+def misses_of(own: pd.DataFrame) -> dict[str, Any]:
+    """What became of each run that is not right: the solvers by what happened, and errors of those that ended."""
+    limit = own["status"] == "TIME_LIMIT"
+    which = {what: (own["outcome"] == what) & ~limit for what in OUTCOMES if what != "right"} | {"limit": limit}
+    ended = own[own["outcome"].isin(("inexact", "wrong"))]
+    errors = {str(row["solver"]): float(row["error_q"]) for _, row in ended.iterrows()}
+    return {what: own[some]["solver"].tolist() for what, some in which.items()} | {"errors": errors}
 
 
 def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -250,11 +259,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "wrong": wrong,
         "only_others": [line["case"] for line in problems if line["others_right"] and not line["ours_right"]],
     }
-    alone = [line for line in problems if line["ours_right"] and not line["others_right"]]
-    # alone is ours where others were put to it and none of these was ended by our limit of time
-    asked = [line["case"] for line in alone if line["others_put"] and not line["others_stopped"]]
-    found["only_ours"] = [{"case": line["case"], "put": line["others_put"]} for line in alone if line["case"] in asked]
-    found["not_put"] = [line["case"] for line in alone if line["case"] not in asked]
+    alone = {line["case"]: line["ours_right"] for line in problems if line["ours_right"] and not line["others_right"]}
+    others = rows[~ours & (rows["tol"] == TIGHT)]
+    found["only_ours"] = [
+        {"case": case, "right": right} | misses_of(others[others["case"] == case]) for case, right in alone.items()
+    ]
+    found["misses"] = {what: sum(len(line[what]) for line in found["only_ours"]) for what in (*OUTCOMES[1:], "limit")}
     found["refused"] = bool((rows["outcome"] == "not run").any())
     found["n_others"] = int(rows[~ours]["solver"].nunique())
     singular = [problem.name for problem in (make() for make in MAKE) if "singular" in problem.tags]
@@ -305,16 +315,29 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     image = axes.imshow(shown.astype(float), vmin=0.0, vmax=14.0, cmap=colours, aspect="auto")
     for _, row in tight.iterrows():
         place, digits = (solvers.index(row["solver"]), cases.index(row["case"])), row["digits_q"]
-        text = SHORT.get(row["status"], "failed") if pd.isna(digits) else f"{max(0.0, digits):.1f}"
+        text = _short(row) if pd.isna(digits) else f"{max(0.0, digits):.1f}"
+        if text in NO_FAILURES:
+            corner = place[0] - 0.5, place[1] - 0.5
+            axes.add_patch(Rectangle(corner, 1.0, 1.0, facecolor="white", edgecolor="#b0b0b0", hatch="////"))
         axes.text(*place, text, ha="center", va="center", fontsize=7, color="white" if digits < 8.0 else "black")
     axes.set_xticks(range(len(solvers)), solvers, rotation=35, ha="right", rotation_mode="anchor")
     axes.set_yticks(range(len(cases)), cases)
     axes.grid(False)
     n_own = sum(CATALOGUE[name].family == "two-loop" for name in solvers)
     axes.axvline(n_own - 0.5, color="white", linewidth=3.0)
-    axes.set_title(f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: ours, right: others")
+    axes.set_title(
+        f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: ours, right: others\n"
+        f"grey: stopped by the solver; hatched: no failure, L: stopped by us after {number(TIME_LIMIT)} s, –: not run",
+        fontsize=9,
+    )
     figure.colorbar(image, ax=axes, label="decimals")
     return {"validation": figure}
+
+
+def _short(row: pd.Series) -> str:
+    """What stands in the place of the decimals; a refusal of ours is one, that of an adapter is no run."""
+    refused = row["status"] == "RAISED" and row["outcome"] != "not run"
+    return "refused" if refused else SHORT.get(row["status"], "failed")
 
 
 def _of_exudyn(line: dict[str, Any] | None) -> str:

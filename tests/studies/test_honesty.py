@@ -11,7 +11,7 @@ import pytest
 from studies.bench.render import render
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
-from studies.honesty.solvers import IDA_C, LIMITED, own, solvers, why_not
+from studies.honesty.solvers import DEFAULT, DEFAULT_COMPILED, IDA_C, KINDS, LIMITED, kind_of, own, solvers, why_not
 from studies.honesty.traps import (
     FORCE,
     GROWN,
@@ -135,17 +135,17 @@ def test_sentences_turn_with_the_rows():
     def text(rows):
         return render("honesty", honesty.findings_of(rows), {}, stamp="stamp", quick=False)
 
-    assert "None of ours is silent" in text(rows) and "All runs are right: a; b." in text(rows)
+    assert "None of ours is silently wrong" in text(rows) and "All runs are correct: a; b." in text(rows)
     rows.loc[3, "outcome"] = honesty.SAID
-    assert "All runs are right: a." in text(rows)
+    assert "All runs are correct: a." in text(rows)
     rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
     told = text(rows)
-    assert "- Of ours 1 run is silent or hangs: b." in told
-    assert "All runs are right: a." in told and "All runs say so" not in told
+    assert "- Of ours 1 run is silently wrong or hangs: b." in told
+    assert "All runs are correct: a." in told and "All runs report failure" not in told
     assert "No solver notices: b" in told
 
 
-OURS, COMPILED, OTHER, THEIRS = honesty.DEFAULT, honesty.DEFAULT_COMPILED, "BDF (twoloop)", "LSODA, index 1"
+OURS, COMPILED, OTHER, THEIRS = DEFAULT, DEFAULT_COMPILED, "BDF (twoloop)", "LSODA, index 1"
 BOUND = THEIRS + LIMITED
 
 
@@ -176,16 +176,35 @@ def told_of_forces(rows):
 
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces())
-    none = dict.fromkeys(("wrong", "unasked", "gross", "refused"), 0)
+    none = dict.fromkeys(("wrong", "unasked", "gross", "slight", "refused"), 0)
     assert found["trust"]["default"] == none | {"n": 2}
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
-    wrong = {"default": 0, "compiled": 1, "ours": 1, "others": 1, "limited": 0}
+    wrong = dict.fromkeys(KINDS, 0) | {"compiled": 1, "ours": 1, "scipy": 1, "others": 1}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
-    assert "| the default, compiled | 0 of 0 | 0 | 1 of 2 | 0 | 0 |" in text
-    assert "| other projects' solvers as they come | 0 of 0 | 0 | 1 of 2 | 0 | 0 |" in text
-    assert "| the same with max_step | 0 of 0 | 0 | 0 of 2 | 0 | 0 |" in text
+    assert "| the default, compiled | 0 | 0 | 0 | 2 | 0 | 1 |" in text
+    for who in ("SciPy's LSODA, DOP853, Radau and BDF", "other projects' solvers without max_step"):
+        assert f"| {who} | 0 | 0 | 0 | 2 | 0 | 1 |" in text
+    assert "| other projects' solvers with max_step | 0 | 0 | 0 | 2 | 0 | 0 |" in text and "| heyoka |" not in text
     line = found["forces"]["families"][0]
     assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == line["limited"][honesty.RIGHT] == 1
+
+
+def test_an_error_is_large_or_small_and_a_run_without_an_end_is_large():
+    rows = rows_of_forces([(OURS, MISTAKE), (OURS, FORCE), (THEIRS, FORCE)])
+    rows.loc[rows["solver"] == OURS, "error"] = [2.0 * honesty.EXACT, 0.5 * honesty.EXACT]
+    rows.loc[(rows["solver"] == THEIRS) & (rows["group"] == FORCE), ["outcome", "error"]] = honesty.HANG, np.nan
+    found, text = told_of_forces(rows)
+    got = {who: (found["trust"][who]["gross"], found["trust"][who]["slight"]) for who in ("default", "scipy")}
+    assert got == {"default": (1, 1), "scipy": (1, 0)}
+    assert "| the default | 0 | 0 | 0 | 2 | 1 | 1 |" in text and "off by 1e-5 to 1e-3 |" in text
+
+
+def test_every_solver_is_of_one_kind():
+    named = {name: kind_of(name) for name in solvers(False, FORCE)}
+    assert set(named.values()) == set(KINDS)
+    assert [name for name, kind in named.items() if kind == "heyoka"] == ["heyoka, Taylor"]
+    assert {name.split(",")[0] for name, kind in named.items() if kind == "scipy"} == {*honesty.SCIPY}
+    assert all(name.startswith(("IDA", "CVODE")) for name, kind in named.items() if kind == "sundials")
 
 
 def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
@@ -196,7 +215,10 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["traps"][0]["silent"] == [OURS, THEIRS]
     assert "| a | 1/0/2 | 1/0/0 | auto; LSODA, index 1 |" in text
-    assert "- Of ours 1 run is silent or hangs: a." in text and "None of ours is silent, and" not in text
+    assert (
+        "- Of ours 1 run is silently wrong or hangs: a." in text and "None of ours is silently wrong, and" not in text
+    )
+    assert "so that the force was never evaluated: 1 of the default, 1 of SciPy's" in text
 
 
 @pytest.mark.parametrize(
@@ -217,7 +239,7 @@ def test_a_refusal_is_no_run(message):
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert "| the default, compiled | 0 of 0 | 0 | 0 of 1 | 0 | 0 |" in text and "1 of the default, compiled," in text
+    assert "| the default, compiled | 0 | 0 | 0 | 1 | 0 | 0 |" in text and "1 of the default, compiled," in text
 
 
 def test_what_a_refusal_says_is_what_is_said():

@@ -60,9 +60,13 @@ def test_sentences_turn_with_the_rows():
         found = planted_errors.findings_of(rows) | {"mutants": None}
         return render("planted_errors", found, {"faults": ""}, stamp="stamp", quick=False)
 
-    assert "All are caught" in text(rows)
+    assert "refuses or stops 0; 0 show only against a known motion; 3 are caught by our test suite.\n" in text(rows)
     rows.loc[1, "caught_by"] = planted_errors.NONE
-    assert "2 are caught; no check of those run catches: fault 1." in text(rows)
+    assert "2 are caught by our test suite; no check of those run catches 1: fault 1." in text(rows)
+    rows["caught_by"] = ["start or run refused: ValueError", "run stopped: wrong_trace", "reference: q"]
+    assert "refuses or stops 2; 1 show only against a known motion; 0 are caught" in text(rows)
+    rows["caught_by"] = ["count of evaluations", "violation: a", "tests/test_tableaux.py::test_order"]
+    assert planted_errors.findings_of(rows)["by"] == {"solve_dae": 0, "known motion": 0, "bounds": 2, "tests": 1}
 
 
 def test_every_run_with_a_fault_has_a_bound_of_its_evaluations():

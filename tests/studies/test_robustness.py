@@ -114,7 +114,7 @@ def rows_of(outcome, last=1e-16):
     long = {"group": "long", "what": "long", "method": "BDF", "outcome": "right", "n_steps": 10, "bytes_a_step": 50.0}
     long |= {"first_q": 1e-16, "last_q": last, "first_v": 1e-16, "last_v": 1e-16, "energy": 1e-9}
     sharp = {"group": "sharp", "what": "drag", "name": "pendulum", "method": "auto", "outcome": outcome, "value": 0.0}
-    sharp |= {"message": "REACHED_END", "tol": 1e-4, "error": 0.02}
+    sharp |= {"message": "REACHED_END", "tol": 1e-4, "error": 0.02, "allowed": 0.5}
     return pd.DataFrame([*lines, long | {"value": 1.0}, long | {"value": 10.0}, sharp])
 
 
@@ -126,15 +126,22 @@ def text_of(rows):
 def test_sentences_turn_with_the_rows():
     good = text_of(rows_of("right"))
     assert "No run of the linkages, of any size and mass" in good
-    assert "None of 1 runs, of 1 random mechanisms under sharp forces (half of them drags and frictions)." in good
+    assert "With all methods none of 1 runs is silently wrong, of 1 random mechanisms under sharp forces (half" in good
+    assert "- None of 1 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-4, mis" in good
+    assert "misleads the default; no other project's solver was run there." in good
+    assert "up to 1e-5 m or rad for a linkage, up to 0.50 under sharp forces (at a tolerance of 1e-4)." in good
+    assert "An error may be as large as 0.50 at 1e-4 (0.50 in the median) m or rad" in good
     assert "1 runs that count as right there are off by more than 1e-2." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
     bad = text_of(rows_of(robustness.SILENT, last=1e-12))
     assert "Of linkages, sizes and masses: 2 runs" in bad
-    assert (
-        "Yes: 1 of 1 runs, of 1 random mechanisms under sharp forces (half of them drags and frictions): drag in 1 run."
-        in bad
-    )
+    assert "With all methods 1 of 1 runs are silently wrong, of 1 random mechanisms under sharp forces" in bad
+    assert "(half of them drags and frictions): drag in 1 run." in bad
+    assert "- 1 of 1 random mechanisms under sharp" in bad
+    assert " 1e-4, misleads the default (drag: off by 0.020 at 1e-4);" in bad
+    more = pd.concat([rows_of(robustness.SILENT), rows_of(robustness.SILENT).tail(1).assign(error=0.3, value=1.0)])
+    text = text_of(more.reset_index(drop=True))
+    assert "- 2 of 2 random" in text and " mislead the default (at worst drag: off by 0.30 at 1e-4);" in text
     assert "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad

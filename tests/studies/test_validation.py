@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -98,6 +99,14 @@ def found_of(rows):
     return found
 
 
+def alone_of(found):
+    """Where ours alone are right: what became of the others, as far as anything did."""
+    return {
+        line["case"]: {what: names for what, names in line.items() if names and what not in ("case", "right", "errors")}
+        for line in found["only_ours"]
+    }
+
+
 def test_findings_turn_with_the_rows():
     found = found_of(made_up())
     assert found["ours_always"] == ["Gauss12", "BDF"] and found["only_others"] == found["ours_short"] == []
@@ -113,14 +122,35 @@ def test_findings_turn_with_the_rows():
     assert found["n_wrong"] == {"ours": 4, "others": 0}
     refused = {"outcome": "not run", "status": "RAISED", "error_q": np.nan, "digits_q": np.nan}
     found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))
-    assert (found["not_put"], found["only_ours"]) == (["double pendulum"], [])
+    assert alone_of(found) == {"double pendulum": {"not run": ["LSODA, index 1"]}}
     found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
-    assert found["only_ours"] == [{"case": "double pendulum", "put": 1}] and found["not_put"] == []
+    assert alone_of(found) == {"double pendulum": {"wrong": ["LSODA, index 1"]}}
     assert found["n_ended"] == {"ours": 16, "others": 8}
     stopped = stopped | {"status": "TIME_LIMIT"}
     found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=stopped))
-    assert (found["not_put"], found["only_ours"]) == (["double pendulum"], [])  # our limit is no miss of theirs
+    assert alone_of(found) == {"double pendulum": {"limit": ["LSODA, index 1"]}}  # our limit is no miss of theirs
     assert found["n_ended"] == {"ours": 16, "others": 4}
+
+
+def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_run():
+    inexact = {"outcome": "inexact", "error_q": 2e-5, "digits_q": 4.7}
+    found = validation.findings_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
+    text = render("validation", found, {"models": ""}, stamp="stamp", quick=False)
+    said = "- On double pendulum only ours are right: `Gauss12` and `BDF`. Of the others, run and inexact: "
+    assert said + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
+    assert found["misses"] == {"inexact": 1, "wrong": 0, "said so": 0, "not run": 0, "limit": 0}
+
+
+def test_cells_that_are_no_failures_are_hatched():
+    rows = made_up()
+    for k, (status, outcome) in enumerate((("TIME_LIMIT", "said so"), ("RAISED", "not run"), ("RAISED", "said so"))):
+        place = rows.index[(rows["tol"] == validation.TIGHT)][k]
+        rows.loc[place, ["status", "outcome", "digits_q"]] = status, outcome, np.nan
+    (figure,) = validation.figures_of(rows, {}).values()
+    shown = figure.axes[0]
+    assert [text.get_text() for text in shown.texts][:3] == ["L", "–", "refused"]
+    assert sum(bool(patch.get_hatch()) for patch in shown.patches) == 2
+    plt.close(figure)
 
 
 def deceived_row(problem, solver, tolerance):
