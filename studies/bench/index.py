@@ -104,7 +104,8 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
 def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
     """The line of a largest energy error, from runs with a drift, without, or both.
 
-    What wanders is marked as what drifts. These are made once: times that differ by less than a share `equal` are not told apart.
+    What wanders is marked as what drifts. These are made once: times that differ by less than a share `equal` are not
+    told apart.
     """
     line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
     line |= {"times": at["times"], "neighbour": None}
