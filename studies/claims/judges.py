@@ -14,7 +14,7 @@ from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, as_good_cost
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.energy.drift import NO_DRIFT, verdict
 from studies.energy.runs import ONE
-from studies.table3.causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells
+from studies.table3.causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, by_repetition, cells
 from studies.violation import grows
 
 IRK_GROUP, NEWMARK_GROUP, GSTIFF_GROUP = "Table 3: IRK", "Table 3: Newmark", "GSTIFF stand-in"
@@ -38,7 +38,7 @@ APART = 10.0  # times the error: no longer equal
 # of the linkage's solvers: with multipliers for the velocities' constraints too, and independent coordinates alone
 PROJECTING = ("IDA, stabilised", IDA_C)
 STATE_SPACE = (IRK_LINE, NEWMARK, QUARTER, "SunRadau5", "Gauss6", "Gauss12", OWN_BDF)
-ERRORS = (0.3, 0.1, 0.03, 0.01)  # the same for Newmark's method on the linkage, which reaches no less
+ERRORS = (0.1, 0.03, 0.01)  # the same for Newmark's method on the linkage, which reaches no less
 
 
 def low_index_on_index_3(rows: Rows) -> Judgement:
@@ -271,7 +271,8 @@ def fourteen_times(rows: Rows) -> Judgement:
         for what, each in ratios.items():
             each.append(slow[what] / fast[what])
     times, evaluations = ratios.values()
-    return decide([min(times + evaluations) >= PRINTED_RATIO / FLAT], time=times[0], evaluations=evaluations[0])
+    scatter = by_repetition(*(rows.cell(group, FINEST, FINEST) for group in (NEWMARK_GROUP, IRK_GROUP)))
+    return decide([min(times + evaluations) >= PRINTED_RATIO / FLAT], time=scatter, evaluations=evaluations[0])
 
 
 def table_3_seconds(rows: Rows) -> Judgement:
