@@ -120,7 +120,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         for _, row in paper.iterrows():
             look = figures.look(row) | {"marker": "", "linewidth": 0.9}
             panel.plot(*row["series"][name], drawstyle="steps-post", **look)
-        panel.axhline(LONG, color=figures.RED, lw=1.0, ls=":", label=f"{LONG:g} s: the paper's steps are mostly longer")
+        panel.axhline(LONG, color=figures.RED, lw=1.0, ls=":", label=f"{LONG:g} s: mostly exceeded in the paper")
         panel.set(ylabel="step size (s)", yscale="log")
     places = paper.loc[IRK, "series"]
     for (name, (marker, what)), color in zip(MARKS.items(), (figures.RED, figures.BLUE), strict=True):

@@ -197,7 +197,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         drawn = [(row, row["series"][level]) for _, row in line_up.iterrows() if level in row["series"]]
         ours = [sizes for row, sizes in drawn if row["family"] == "two-loop"]
         low, high = np.nanmin(ours, axis=0), np.nanmax(ours, axis=0)
-        panel.fill_between(t, low, high, color=figures.GREY, alpha=0.5, lw=0, label="all methods of ours")
+        panel.fill_between(t, low, high, color=figures.VIOLET, alpha=0.25, lw=0, label="all methods of ours")
         for row, sizes in drawn:
             if row["solver"] in OVER_TIME:
                 panel.plot(t, sizes, markevery=7, **figures.look(row))

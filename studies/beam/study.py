@@ -174,7 +174,7 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 
 def _cell(runs: pd.DataFrame, error: float, cell: str) -> str:
-    """A cell of the table; of a solver that has runs, but none about as bad as the error, its cheapest that is as good."""
+    """A cell of the table; of a solver whose runs are none about as bad as the error, the cheapest that is as good."""
     if cell != "not asked":
         return cell
     known = runs["error_tip"].dropna()

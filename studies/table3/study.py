@@ -37,7 +37,18 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
-from studies.table3.causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, by_repetition, causes, in_two_groups, machine, printed, reading_runs
+from studies.table3.causes import (
+    FAMILIES,
+    PAPER_IRK,
+    PAPER_NEWMARK,
+    TOLERANCES,
+    by_repetition,
+    causes,
+    in_two_groups,
+    machine,
+    printed,
+    reading_runs,
+)
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss
 
@@ -206,7 +217,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
     found["explicit"] = _explicit(first)
     default = first[(first["solver"] == DEFAULT) & first["error_q"].notna()]
-    found["default_explicit"] = bool(len(default) and all(tables.used(run) == "explicit" for _, run in default.iterrows()))
+    found["default_explicit"] = bool(
+        len(default) and all(tables.used(run) == "explicit" for _, run in default.iterrows())
+    )
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
     return found | causes(first)

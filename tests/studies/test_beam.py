@@ -89,22 +89,27 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     made.loc[(made["solver"] == PAPER) & loosest & (made["case"] == STIFF), "call_s"] = 0.1
     found = found_of(tmp_path, made)["cases"][1]
     over = {at["error"]: at["over"] for at in found["newmark"]["at"]}
-    assert over == pytest.approx({1e-2: 200.0, 1e-3: 2.0, 1e-4: 0.2})
+    assert over == pytest.approx({1e-2: 200.0, 1e-3: 0.2, 1e-4: 0.2})
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_errors_that_are_not_equal_are_said_and_a_solver_with_runs_is_asked(tmp_path):
     made = rows()
     ran = made["group"] == "run"
-    made.loc[ran & (made["solver"] == PAPER), "error_tip"] = 1e-8
+    made.loc[ran & (made["solver"] == PAPER), "error_tip"] = 1.1e-9
     made.loc[ran & (made["solver"] == QUARTER) & (made["case"] == STIFF), "error_tip"] *= 1e-3
     made.loc[ran & (made["solver"] == NEWMARK) & (made["case"] == STIFF), "error_tip"] *= 1e-3
     found = found_of(tmp_path, made)["cases"][1]["newmark"]
-    assert found["apart"] and found["all_better"] and found["loosest"] == 1e-8
+    assert found["apart"] and found["all_better"] and found["loosest"] == 1.1e-9
     text = (tmp_path / "beam.md").read_text()
-    assert "(all its runs are better); the errors are not equal" in text and "errs by 1e-8 m" in text
-    lines = [line for line in text.splitlines() if line.startswith(f"| {QUARTER} |")]
-    assert len(lines) == 1 and "not asked" not in lines[0] and "°" in lines[0]
+    assert "(all its runs are better); the errors are not equal" in text and "errs by 1.1e-9 m" in text
+
+
+def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
+    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan], "call_s": [1.1, 3.0, 0.1]})
+    assert study._cell(runs, 1e-2, "not asked") == "1.1°"
+    assert study._cell(runs, 1e-5, "1.2") == "1.2"
+    assert study._cell(runs, 1e-9, "not asked") == "least error 1e-6"
 
 
 @pytest.mark.usefixtures("unsaved")
