@@ -176,6 +176,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     for rival in RIVALS:
         spans = {name: _span(ratios(rows, rival, what)) for name, what in COSTS.items()}
         against[rival] = {"spans": spans, "verdicts": {name: verdict(span) for name, span in spans.items()}}
+    stabilised = where(controlled, solver=STABILISED).groupby("tableau", sort=False)["violation_q"].max()
+    at_end = [tableau.name for tableau in (SUN, GAUSS, RADAU) if not np.allclose(tableau.A[-1], tableau.b)]
     kept = {name: float(where(controlled, solver=name)["violation_q"].max()) for name in VARIANTS}
     tableaux = list(dict.fromkeys(rows["tableau"]))
     orders = {variant: {tableau: order(rows, variant, tableau) for tableau in tableaux} for variant in VARIANTS}
@@ -192,6 +194,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "orders": orders,
         "frozen_order_one": all(value < ONE for value in orders[FROZEN].values()),
         "kept": kept,
+        # a step that does not end in a stage is projected in the stabilised form
+        "projected_at_end": [name for name in at_end if name in tableaux],
+        "stabilised_alone": {name: float(x) for name, x in stabilised.items() if name not in at_end},
         "kept_as_well": kept[PROJECTED] <= max(KEPT, kept[PAPER]),
         # in the first and in the last tenth of the run that the figure shows
         "drift": None if drift is None else [float(drift["violation_early"]), float(drift["violation_late"])],

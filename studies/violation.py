@@ -11,6 +11,7 @@ from studies.bench import figures, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run
+from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import CHECKED, violations
 from studies.bench.render import number
 from studies.bench.solvers import (
@@ -47,15 +48,15 @@ PAIRS = (  # kept, not kept
     (CVODE_C_PROJECTED, "CVODE from C, BDF"),
     ("IDA, stabilised", "IDA, index1"),
 )
-OWN = (DEFAULT, "SunRadau5", "Gauss12", OWN_EXPLICIT)
+OWN = (DEFAULT, OWN_CODE, "SunRadau5", "Gauss12", OWN_EXPLICIT)
 ALONG = (*(name for pair in PAIRS for name in pair), "LSODA, index 1", IDA_C, HEYOKA, CVODE_C, *OWN)
 MORE = dict.fromkeys((HEYOKA, CVODE_C, CVODE_C_PROJECTED), 1e-8)  # tolerances, in the line-up of this study
 STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
-QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *OWN)
-DRAWN = (*PAIRS[0], *PAIRS[1], HEYOKA, CVODE_C, IDA_C, DEFAULT, OWN_EXPLICIT)  # cost over error
+QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *(name for name in OWN if name != OWN_CODE))  # which compiles
+DRAWN = (*PAIRS[0], *PAIRS[1], HEYOKA, CVODE_C, IDA_C, DEFAULT, OWN_CODE)  # cost over error
 EXUDYN = ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2")
 OVER_TIME = ("DOP853, index 1", "IDA, index1", "IDA, stabilised", CVODE_C, HEYOKA, gear(2), *EXUDYN)
-LISTED = (*OVER_TIME, HEYOKA, CVODE_C, CVODE_C_PROJECTED, "IDA, index1", IDA_C, "DOP853, projected", gear(5))
+LISTED = tuple(dict.fromkeys((*OVER_TIME, CVODE_C_PROJECTED, IDA_C, "DOP853, projected", gear(5))))
 TARGETS = (1e-2, 1e-4, 1e-6)
 
 
@@ -169,6 +170,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "ours_keep": bool((ours[["violation_q", "violation_v"]].max(axis=1) <= KEPT).all()),
         "ours_growing": [row["solver"] for _, row in known[own].iterrows() if grows(row, "q")],
         "others_growing": [row["solver"] for row in others],
+        "growing_unprojected": all(not row["keeps_constraints"] for row in others),
         "growing_to": [min(sizes, default=0.0), max(sizes, default=0.0)],
         "inner_loose": float(loose[TIGHT]),
         "both_loose": float(loose[LOOSE]),
@@ -181,7 +183,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "n_kept_first": sum(bool(ranking["keeps_constraints"].iloc[0]) for ranking in ranked),
         "listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index],
         "targets": TARGETS,
-        "cost": tables.work_precision(along, TARGETS, (*DRAWN, *STABILISED[1::3])),
+        "cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3])),
         "pairs": [found for names in PAIRS if (found := pair(along, *names))],
     }
 
@@ -195,7 +197,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         drawn = [(row, row["series"][level]) for _, row in line_up.iterrows() if level in row["series"]]
         ours = [sizes for row, sizes in drawn if row["family"] == "two-loop"]
         low, high = np.nanmin(ours, axis=0), np.nanmax(ours, axis=0)
-        panel.fill_between(t, low, high, color=figures.GREY, alpha=0.5, lw=0, label="all methods of ours")
+        panel.fill_between(t, low, high, color=figures.VIOLET, alpha=0.25, lw=0, label="all methods of ours")
         for row, sizes in drawn:
             if row["solver"] in OVER_TIME:
                 panel.plot(t, sizes, markevery=7, **figures.look(row))

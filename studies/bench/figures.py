@@ -52,7 +52,7 @@ mpl.rcParams.update(
 
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, RED, PINK, GREY, BROWN = "#D9C400", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
+YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
 VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default, and of Taylor and others
 
 STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
@@ -261,8 +261,8 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
         known = runs[runs["error_q"].notna()]
         if known.empty:
             continue
-        called = "P" if known["called_from"].iloc[0] == "Python" else "c"
-        one = look(known.iloc[0]) | {"label": f"{solver} [{called}]"}
+        called = " [P]" if known["called_from"].iloc[0] == "Python" else ""
+        one = look(known.iloc[0]) | {"label": f"{solver}{called}"}
         errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
         spread = [times - runs["call_q1"].astype(float), runs["call_q3"].astype(float) - times]
         left.errorbar(errors, times, yerr=spread, elinewidth=0.8, **one)
@@ -270,6 +270,6 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
             right.plot(errors, runs["n_evaluations"].astype(float), **one)
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
-    legend(figure, [left], f"{LEGEND}\nleft out: motion lost\n[c] compiled, [P] Python")
+    legend(figure, [left], f"{LEGEND}\nleft out: motion lost\n[P]: called from Python")
     figure.suptitle(title, fontsize=10)
     return figure

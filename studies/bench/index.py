@@ -104,7 +104,8 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
 def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
     """The line of a largest energy error, from runs with a drift, without, or both.
 
-    These are made once: times that differ by less than a share `equal` are not told apart.
+    What wanders is marked as what drifts. These are made once: times that differ by less than a share `equal` are not
+    told apart.
     """
     line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
     line |= {"times": at["times"], "neighbour": None}
@@ -112,7 +113,7 @@ def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
         runs = [at[kind][which] for kind in kinds if at[kind][which]]
         if runs:
             best = min(runs, key=lambda run: float(run["call_s"]))
-            line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": best["drifts"]}
+            line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": not best["calm"]}
     costs = sorted(line[which]["call_s"] for which in WHOSE if line[which])
     return line | {"undecided": len(costs) > 1 and costs[0] > (1.0 - equal) * costs[1]}
 

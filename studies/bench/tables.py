@@ -339,6 +339,11 @@ def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequen
     return lines
 
 
+def as_good(runs: pd.DataFrame, target: float, what: str = "call_s") -> float:
+    """Cost of the cheapest run of a solver that is at least as good as an error, however much better; NaN: none is."""
+    return float(runs[runs["error_q"].astype(float) <= target][what].astype(float).min())
+
+
 def with_quartiles(middle: float, low: float, high: float) -> str:
     """Seconds, the quartiles in brackets where they are more than `SPREAD` of the median apart."""
     texts = [number(value) for value in (low, middle, high)]

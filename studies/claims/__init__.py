@@ -18,7 +18,17 @@ from studies.claims.rows import STUDIES, Rows, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 
 ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())
-COLUMNS = ("section", "statement", "criterion", "fixed", "judge", "stand_in", "assumed")  # of a claim, for claims.csv
+COLUMNS = (
+    "section",
+    "statement",
+    "criterion",
+    "fixed",
+    "judge",
+    "stand_in",
+    "inputs",
+    "choice",
+    "assumed",
+)  # of a claim, for claims.csv
 Judged = Mapping[str, tuple[Claim, Judgement]]
 
 
@@ -34,15 +44,22 @@ def judged(rows: Rows) -> dict[str, tuple[Claim, Judgement]]:
 
 
 def findings_of(pairs: Judged) -> dict[str, Any]:
-    """Verdicts and numbers by claim, how many of each verdict, and the places of those that hold by construction."""
+    """Verdicts and numbers by claim, how many of each verdict, and the places of those that hold by construction.
+
+    What the paper chose, and does not claim, is not counted among its claims.
+    """
     circular: dict[str, list[str]] = {}
     for k, (claim, found) in enumerate(pairs.values(), 1):
         if found.verdict is Verdict.CIRCULAR:
             circular.setdefault(claim.circular, []).append(str(k))
     verdicts = [found.verdict for _, found in pairs.values()]
+    counted = [(claim, found.verdict) for claim, found in pairs.values() if not claim.choice]
     return {
-        "n": len(pairs),
-        "after": sum(claim.fixed == "after" for claim, _ in pairs.values()),
+        "n": len(counted),
+        "after": sum(claim.fixed == "after" for claim, _ in counted),
+        "by_stand_in": sum(bool(claim.stand_in) and verdict is not Verdict.NOT_RUN for claim, verdict in counted),
+        "judged": sum(verdict is not Verdict.NOT_RUN for _, verdict in counted),
+        "places": {key: k for k, key in enumerate(pairs, 1)},
         "counts": {verdict.value: verdicts.count(verdict) for verdict in Verdict},
         "claims": {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()},
         "circular": circular,

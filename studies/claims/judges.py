@@ -1,5 +1,7 @@
 """The judges but those of the beams: from rows to a verdict and the numbers that decide; named in claims.toml."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -8,10 +10,11 @@ from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.solvers import GEAR_ORDERS, IDA_C, IRK, IRK_LINE, NEWMARK, OWN_BDF, QUARTER, gear
 from studies.claims.beam_judges import FOLLOWS, TIPS
 from studies.claims.experiments import PASSES
-from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
+from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, as_good_costs, cheapest, common_costs
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.energy.drift import NO_DRIFT, verdict
-from studies.table3.causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells
+from studies.energy.runs import ONE
+from studies.table3.causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, by_repetition, cells
 from studies.violation import grows
 
 IRK_GROUP, NEWMARK_GROUP, GSTIFF_GROUP = "Table 3: IRK", "Table 3: Newmark", "GSTIFF stand-in"
@@ -30,18 +33,25 @@ CHANGE = 1.1  # times the steps: a tolerance affects them
 PRINTED_RATIO = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]  # 50.93 s over 3.60 s
 TARGETS = (1e-1, *TIPS)
 FINER = (*TIPS, 1e-5, 1e-6)  # m, on the stiffer beam no run of Newmark's method is much worse
+BOTH_BETAS = (NEWMARK, QUARTER)
+APART = 10.0  # times the error: no longer equal
 # of the linkage's solvers: with multipliers for the velocities' constraints too, and independent coordinates alone
 PROJECTING = ("IDA, stabilised", IDA_C)
 STATE_SPACE = (IRK_LINE, NEWMARK, QUARTER, "SunRadau5", "Gauss6", "Gauss12", OWN_BDF)
-ERRORS = (0.3, 0.1, 0.03, 0.01)  # the same for Newmark's method on the linkage, which reaches no less
+ERRORS = (0.1, 0.03, 0.01)  # the same for Newmark's method on the linkage, which reaches no less
 
 
 def low_index_on_index_3(rows: Rows) -> Judgement:
     runs = rows.long("motion", group=GSTIFF_GROUP)
     runs = runs[~runs["solver"].str.contains("ramp")]
-    good = runs[(runs["status"] == "REACHED_END") & ~runs["astray"]]
-    least = 0.0 if good.empty else float(good["error_y3"].min())
-    return decide([good.empty], good=len(good), runs=len(runs), least=least)
+    good = (runs["status"] == "REACHED_END") & ~runs["astray"]
+    values: dict[str, Any] = {"bad": int((~good).sum()), "runs": len(runs), "longest": 0.0, "orders": [0]}
+    if good.any():
+        longest = runs["h"][good].max()  # below which some orders always follow
+        short = good[runs["h"] <= longest].groupby(runs["solver"]).all()
+        orders = [order for order in GEAR_ORDERS if short.get(gear(order), False)]
+        values |= {"longest": float(longest), "orders": [min(orders, default=0), max(orders, default=0)]}
+    return decide([not good.any()], not good.all(), **values)
 
 
 def index_1_drifts(rows: Rows) -> Judgement:
@@ -57,9 +67,17 @@ def baumgarte_inexact(rows: Rows) -> Judgement:
 
 
 def projection_exact(rows: Rows) -> Judgement:
-    solvers = {"projected": "DOP853, projected", "multipliers": "IDA, stabilised"}
-    worst = {key: float(rows.long("table3", solver=name)["violation_q"].max()) for key, name in solvers.items()}
-    return decide((each < SATISFIED for each in worst.values()), **worst)
+    """Of runs that are in phase, as a solution that is astray says nothing of a form of the equations."""
+    worst, values = [], {}
+    for key, name in (("projected", "DOP853, projected"), ("multipliers", "IDA, stabilised")):
+        runs = rows.long("table3", solver=name, problem=DEFAULT)
+        runs = runs[~runs["astray"]].set_index("tol")["violation_q"].astype(float)
+        worst.append(float(runs.max()))
+        values[key] = worst[-1]
+        for at, tol in (("middle", 1e-8), ("tight", 1e-13)):
+            near = runs[np.isclose(runs.index.to_numpy(float), tol, rtol=1e-6, atol=0.0)]
+            values[f"{key}_{at}"] = float(near.iloc[0]) if len(near) else np.nan
+    return decide((each < SATISFIED for each in worst), **values)
 
 
 def _cheapest(rows: Rows, solvers: tuple[str, ...], what: str) -> list[float]:
@@ -91,7 +109,7 @@ def every_stage(rows: Rows) -> Judgement:
 def constraints_kept(rows: Rows) -> Judgement:
     run = rows.long("violation", solver=IRK, group="line-up").iloc[0]
     worst = max(float(run[f"violation_{level}"]) for level in "qva")
-    loosest = float(rows.long("table3", group=IRK_GROUP, problem=DEFAULT)["violation_q"].max())
+    loosest = float(rows.cell(IRK_GROUP, COARSEST, COARSEST)["violation_q"])
     return decide([worst < SATISFIED and not grows(run, "q")], levels=worst, loosest=loosest)
 
 
@@ -105,13 +123,18 @@ def symplectic_stable(rows: Rows) -> Judgement:
     runs = rows.pick("energy", 10.0 * LONG, solver=("Sun Radau IIB(3)", IRK), partition="lasting")
     runs = runs[runs["t_end"] == runs["t_end"].max()]
     drifts = ~_steady(runs)
-    own, canonical = runs["variables"] == "velocities", (runs["variables"] == "momenta") & runs["h"].notna()
+    own, canonical = runs["variables"] == "velocities", runs["variables"] == "momenta"
     change = (runs["slope"].abs() * runs["t_end"])[own]
-    share, least = 100.0 * float((change / runs["kinetic"][own]).max()), change.idxmin()
+    share = 100.0 * float((change / runs["kinetic"][own]).max())
+    least, most = change.idxmin(), change.idxmax()
+    steady = runs[canonical & ~drifts]
     stable = share < 100.0 * LOST and not runs["lost"][own].any() and (runs["status"][own] == "REACHED_END").all()
     values = {"drifting": int(drifts[own].sum()), "runs": int(own.sum()), "share": share}
     values |= {"least": float(change[least]), "kinetic": float(runs["kinetic"][least])}
-    values |= {"steady_on_momenta": int((~drifts[canonical]).sum()), "t_end": float(runs["t_end"].max())}
+    values |= {"most": float(change[most]), "most_kinetic": float(runs["kinetic"][most])}
+    values |= {"on_momenta": int(canonical.sum()), "steady_on_momenta": len(steady)}
+    values["steady_fixed_on_one"] = bool(steady["h"].notna().all() and (steady["case"] == ONE).all())
+    values["t_end"] = float(runs["t_end"].max())
     return decide([stable, not drifts[own].any()], stable, **values)
 
 
@@ -119,6 +142,7 @@ def newmark_symplectic(rows: Rows) -> Judgement:
     area, plain, other = (rows.number(f"Newmark's {key}") for key in ("area", "plain area", "area, gamma 0.6"))
     runs = rows.pick("energy", 10.0 * LONG, named="Newmark", partition="lasting")
     kept, values = int(_steady(runs).sum()), {"plain": 100.0 * plain, "other": 100.0 * other, "runs": len(runs)}
+    values["lost"] = int(runs["lost"].sum())
     return decide([area < SATISFIED, other > SATISFIED, kept], False, area=area, kept=kept, **values)
 
 
@@ -236,7 +260,7 @@ def newmark_star(rows: Rows) -> Judgement:
 def irk_star(rows: Rows) -> Judgement:
     runs = rows.long("table3", group=IRK_GROUP, problem=DEFAULT, err_out=COARSEST)
     good = ~runs["lost"] & ~runs["astray"] & (runs["y3_max"] < PASSES)
-    values = {"astray": int(runs["astray"].sum()), "cells": len(runs), "error": float(runs["error_q"].max())}
+    values = {"lost": int(runs["lost"].sum()), "astray": int(runs["astray"].sum()), "cells": len(runs)}
     return decide([good.all()], top=1e3 * float(runs["y3_max"].max()), **values)
 
 
@@ -247,7 +271,8 @@ def fourteen_times(rows: Rows) -> Judgement:
         for what, each in ratios.items():
             each.append(slow[what] / fast[what])
     times, evaluations = ratios.values()
-    return decide([min(times + evaluations) >= PRINTED_RATIO / FLAT], time=times[0], evaluations=evaluations[0])
+    scatter = by_repetition(*(rows.cell(group, FINEST, FINEST) for group in (NEWMARK_GROUP, IRK_GROUP)))
+    return decide([min(times + evaluations) >= PRINTED_RATIO / FLAT], time=scatter, evaluations=evaluations[0])
 
 
 def table_3_seconds(rows: Rows) -> Judgement:
@@ -269,22 +294,34 @@ def _along(rows: Rows, solver: str, problem: str) -> pd.DataFrame:
 
 
 def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
-    """CPU time of Newmark, both beta, over Runge-Kutta's at equal error: linkage, and both beams."""
+    """CPU time of Newmark, both beta, over Runge-Kutta's: at equal errors on linkages, on the beams of runs as good.
+
+    On the beams Runge-Kutta has no run as bad as the errors, so that the errors compared are not equal: of each the
+    cheapest run counts that is at least as good.
+    """
     ratios: dict[str, list[float]] = {"linkage": [], "soft": [], "stiff": []}
-    for name in (NEWMARK, QUARTER):
+    for name in BOTH_BETAS:
         for problem in dict.fromkeys(rows.long("table3")["problem"]):
             one, other = (_along(rows, solver, problem) for solver in (name, IRK_LINE))
             ratios["linkage"] += common_costs(
                 one, other, tuple(e for e in ERRORS if e < one["error_q"].max()), "call_s"
             )
         for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
-            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), FINER, "call_s")
+            ratios[key] += as_good_costs(rows.beam(case, name), rows.beam(case, IRK), FINER, "call_s")
     return ratios
 
 
 def more_efficient(rows: Rows) -> Judgement:
     ratios = {name: span(each) for name, each in _newmark_over_irk(rows).items()}
-    return decide((low > 1.0 for low, _ in ratios.values()), **ratios)
+    values: dict[str, Any] = {"linkages": rows.long("table3")["problem"].nunique()}
+    unequal = []
+    for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
+        paper, newmark = (rows.beam(case, "", solver=names)["error_q"].astype(float) for names in (IRK, BOTH_BETAS))
+        values[f"{key}_error"] = float(paper.max())
+        unequal.append(APART * paper.max() < newmark.min())
+    values["unequal"] = all(unequal)
+    values |= {"loosest": FINER[0], "finest": FINER[-1]}
+    return decide((low > 1.0 for low, _ in ratios.values()), **ratios, **values)
 
 
 def because_of_order(rows: Rows) -> Judgement:

@@ -103,6 +103,15 @@ def common_costs(one: pd.DataFrame, other: pd.DataFrame, targets: tuple[float, .
     return ratios
 
 
+def as_good_costs(one: pd.DataFrame, other: pd.DataFrame, targets: tuple[float, ...], what: str) -> list[float]:
+    """Costs of `one` over those of `other`, of each the cheapest run that is at least as good as an error."""
+    costs = [[tables.as_good(runs, e, what) for runs in (one, other)] for e in targets]
+    ratios = [a / b for a, b in costs if np.isfinite(a) and np.isfinite(b)]
+    if not ratios:
+        raise NotRun(f"{one['solver'].iloc[0]} and {other['solver'].iloc[0]} have no error that both reach")
+    return ratios
+
+
 def cheapest(runs: pd.DataFrame, target: float, what: str) -> float:
     """Least cost of any solver at an error; NaN where none has it."""
     costs = [tables.time_for(own, target, what) for _, own in runs.groupby("solver")]

@@ -21,8 +21,10 @@ class Verdict(StrEnum):
     HOLDS = "holds"
     PART = "holds in part"
     FAILS = "does not hold"
+    ASSUMED = "not reproduced (inputs assumed)"
     CONSISTENT = "consistent"
     CIRCULAR = "holds by construction"
+    CHOICE = "choice of the paper"
     NOT_RUN = "not run"
 
 
@@ -72,6 +74,8 @@ class Claim:
     options: Mapping[str, Any] = field(default_factory=dict)
     circular: str = ""
     stand_in: str = ""
+    inputs: str = ""
+    choice: bool = False
     assumed: bool = False
 
     def judgement(self, judge: Callable[..., Judgement], rows: Rows) -> Judgement:
@@ -84,11 +88,15 @@ class Claim:
             return Judgement(Verdict.NOT_RUN, why=f"the rows lack {column}")
         if not np.isfinite(np.hstack(list(found.values.values()))).all():
             return Judgement(Verdict.NOT_RUN, why="the rows lack a value that decides")
-        if found.verdict is Verdict.HOLDS and self.circular:
-            return replace(found, verdict=Verdict.CIRCULAR)
-        if found.verdict in (Verdict.HOLDS, Verdict.PART) and self.stand_in:
-            return replace(found, verdict=Verdict.CONSISTENT)
-        return found
+        marked = {
+            Verdict.HOLDS: Verdict.CIRCULAR
+            if self.circular
+            else Verdict.CONSISTENT
+            if self.stand_in
+            else Verdict.HOLDS,
+            Verdict.FAILS: Verdict.ASSUMED if self.inputs else Verdict.FAILS,
+        }
+        return replace(found, verdict=Verdict.CHOICE if self.choice else marked.get(found.verdict, found.verdict))
 
     def text(self, found: Judgement) -> str:
         """The numbers of a judgement in the words of `claims.toml`."""

@@ -48,15 +48,19 @@ def drift(t: Array, mean: Array) -> tuple[float, float]:
 
 
 def verdict(row: pd.Series) -> str:
-    """What the energy of a run does, from the numbers of its row alone."""
+    """What the energy of a run does, from the numbers of its row alone.
+
+    Without a slope a run is free of drift only where no change above the swing could hide in the scatter of its
+    windows: a net slope of nothing may be a walk that came back.
+    """
     if row["status"] != "REACHED_END":
         status = str(row["status"]).lower().replace("_", " ")
         return status if pd.isna(row["t_reached"]) else f"{status} at {row['t_reached']:.4g} s"
     if row["lost"]:
         return IS_LOST
-    change = abs(row["slope"]) * row["t_end"]
     if abs(row["slope"]) <= RESOLVED * row["slope_error"]:
-        return NO_DRIFT if change <= row["swing"] else IRREGULAR
+        return NO_DRIFT if bound(row) <= row["swing"] else IRREGULAR
+    change = abs(row["slope"]) * row["t_end"]
     if change <= EPS * row["kinetic"] * row["n_steps"]:
         return ROUNDS
     return DRIFTS if change > row["swing"] else SLOWLY

@@ -68,7 +68,8 @@ def told(row: pd.Series) -> dict[str, Any]:
     found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
     found |= {name: row[name] for name in ("verdict", "status")}
     found["label"] = f"{row['name']}, {setting(row)}"
-    found["kinetic"] = float(row["kinetic"])
+    found |= {"kinetic": float(row["kinetic"]), "fixed_steps": bool(pd.notna(row["h"]))}
+    found["explicit"] = row.get("used") == "explicit" or row["solver"] == OWN_EXPLICIT
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
     found |= {"calm": row["verdict"] == NO_DRIFT, "drifts": row["verdict"] in DRIFTING}
     return found | {"keeps": bool(row["keeps_constraints"])}
@@ -101,6 +102,10 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
         at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
+    kept = [level["no_drift"]["ours"] for level in at[1:] if level["no_drift"]["ours"]]
+    both = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
+    over_drifting = [one["call_s"] / other["call_s"] for one, other in both if one and other]
+    rivals = [other for one, other in both if one and other]
     listed = rows[rows["group"].isin(("other", "controlled"))]
     places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
     return {
@@ -110,6 +115,12 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         "kinetic": kinetic,
         "no_drift": at[0]["no_drift"],
         "at": at[1:],
+        "calm_ours": {
+            "labels": list(dict.fromkeys(run["label"] for run in kept)),
+            "fixed": bool(kept) and all(run["fixed_steps"] for run in kept),
+            "over_drifting": [min(over_drifting), max(over_drifting)] if over_drifting else None,
+            "drifting_explicit": bool(rivals) and all(run["explicit"] for run in rivals),
+        },
         "n_pays": sum(level["pays"] for level in at[1:]),
         "n_equal": sum(level["equal"] for level in at[1:]),
         "equal": EQUAL,
@@ -137,19 +148,23 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     calm = {name: fixed[which]["verdict"] == NO_DRIFT for name, which in kinds.items()}
     controlled = rows[rows["group"] == "controlled"]
     steady = controlled[~controlled["verdict"].isin(DRIFTING)]
-    sun, gauss, canonical = (told(pick(rows, ONE, *which)) for which in ((SUN,), (GAUSS,), (SUN, MOMENTA)))
+    chosen = ((SUN,), (GAUSS,), (SUN, MOMENTA), (RADAU,))
+    sun, gauss, canonical, radau = (told(pick(rows, ONE, *which)) for which in chosen)
     both = {"one": ONE, "switching": SWITCHING}
     return {
         "long": long_of(rows[rows["case"] == SWITCHING]),
         "sun": sun,
         "gauss": gauss,
-        "radau": told(pick(rows, ONE, RADAU)),
+        "radau": radau,
+        "radau_over_sun": abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None,
+        "radau_controlled": bool((controlled["solver"] == RADAU).any()),
         "canonical": canonical,
         "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
         "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
         "variants": variants_of(rows[rows["group"] == "fixed"]),
         "n": {name: len(each) for name, each in calm.items()},
         "n_calm": {name: int(each.sum()) for name, each in calm.items()},
+        "uneven_drifts": bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all()),
         "n_controlled": len(controlled),
         "controlled_steady": [told(run) | {"case": run["case"]} for _, run in steady.iterrows()],
         "lasting": dict(Counter(fixed[kinds["lasting"]]["verdict"].map(_fate))),

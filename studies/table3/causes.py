@@ -1,5 +1,7 @@
 """Why the paper's time over ours is not one factor in Table 3: causes and readings of the text, tested on the rows."""
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from itertools import product
 from typing import Any, Literal
@@ -16,6 +18,7 @@ from twoloop.methods.tableaux import sun_radau_iib
 
 TOLERANCES = ERR_OUT
 FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
+GAP = 0.1  # of the median: between groups of times
 FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
 Reading = Literal["all", "independent"]
 READINGS: dict[Reading, str] = {"all": "all of z", "independent": "y_i only"}  # what criterion (32) is taken over
@@ -39,6 +42,22 @@ def machine(rows: pd.DataFrame, group: str, err_in: float, err_out: float) -> pd
     """Our run of a cell."""
     found = where(rows, group=group, err_in=err_in, err_out=err_out)
     return None if found.empty else found.iloc[0]
+
+
+def by_repetition(slow: pd.Series, fast: pd.Series) -> list[float]:
+    """Least and largest time of one run over that of another, of repetitions made in turn."""
+    ratios = [a / b for a, b in zip(slow["times"], fast["times"], strict=False)]
+    return [float(min(ratios)), float(max(ratios))] if ratios else [math.nan, math.nan]
+
+
+def in_two_groups(times: Sequence[float]) -> bool:
+    """Whether times fall into two groups, of two or more each: farther apart than all within them, and not by noise."""
+    t = np.sort(np.asarray(times, dtype=float))
+    if t.size < 4:
+        return False
+    cut = 2 + int(np.diff(t)[1:-1].argmax())  # the first place of the upper group
+    gap = t[cut] - t[cut - 1]
+    return bool(gap > GAP * np.median(t) and gap > np.ptp(t[:cut]) + np.ptp(t[cut:]))
 
 
 def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:

@@ -17,7 +17,7 @@ from studies.table3.causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from twoloop.mechanisms import four_bar
 
 CLAIMS = load()
-HOLDS, PART, FAILS, CONSISTENT, CIRCULAR, NOT_RUN = Verdict
+HOLDS, PART, FAILS, ASSUMED, CONSISTENT, CIRCULAR, CHOICE, NOT_RUN = Verdict
 FIRST, SECOND = four_bar().name, "another linkage"
 GOOD = {"status": "REACHED_END", "lost": False, "astray": False, "t_end": 100.0, "floor": 1e-12, "repeat": 0}
 EXPERIMENTS = {
@@ -57,10 +57,12 @@ def table3():
             for solver, cpu, drift in (("index 1", 1.0, 100.0), ("projected", 0.9, 1.0)):
                 row = {"group": "comparison", "solver": f"DOP853, {solver}", "problem": problem, "error_q": error}
                 row |= {"violation_early": 1e-15, "violation_late": 1e-15 * drift, "violation_q": 1e-15 * drift}
+                row |= {"tol": (1e-3, 1e-8, 1e-10, 1e-13)[j]}
                 rows.append(row | {"call_s": cpu * (j + 1), "n_evaluations": 1e4 * cpu * (j + 1)})
             for solver, cpu in (("index1", 1.0), ("stabilised", 1.1)):
                 row = {"group": "comparison", "solver": f"IDA, {solver}", "problem": problem, "error_q": error}
                 row |= {"violation_early": 1e-6, "violation_late": 1e-3, "violation_q": 1e-6}
+                row |= {"tol": (1e-3, 1e-8, 1e-10, 1e-13)[j]}
                 rows.append(row | {"call_s": cpu * (j + 1), "n_evaluations": 1e4 * cpu * (j + 1)})
     return pd.DataFrame([GOOD | row for row in rows])
 
@@ -98,7 +100,7 @@ def beam():
         ):
             row = {"group": "run", "case": case, "solver": solver, "tol": tol, "error_tip": error, "call_s": cpu * slow}
             if solver in (NEWMARK, QUARTER) and slow > 1.0:
-                row["error_tip"], row["call_s"] = 1e-3 * error, 0.3 * cpu * slow
+                row["error_tip"], row["call_s"] = 2e-3 * error, 0.3 * cpu * slow
             row |= {
                 "n_evaluations": 1e6 * cpu * slow,
                 "n_steps": 6e3,
@@ -124,7 +126,9 @@ def energy():
         ("Newmark, β = 1/2", "velocities", 1e-13),
     ):
         rows.append(GOOD | {"solver": solver, "variables": variables, "slope": slope, "slope_error": 1e-11})
-    made = pd.DataFrame(rows).assign(partition="lasting", h=0.02, t_end=1e4, n_steps=500_000, kinetic=5.6)
+    made = pd.DataFrame(rows).assign(
+        case="one partition", partition="lasting", h=0.02, t_end=1e4, n_steps=500_000, kinetic=5.6
+    )
     return made.assign(swing=1e-3, t_reached=1e4)
 
 
@@ -198,6 +202,9 @@ EXPECTED = {
     **dict.fromkeys(("tolerances_and_steps", "values_alone", "general", "every_stage"), PART),
     **dict.fromkeys(("implicit_needed", "symplectic_stable", "euler_predictor", "partition_kept"), PART),
     **dict.fromkeys(("gstiff_short", "gstiff_long", "parting"), CONSISTENT),
+    **dict.fromkeys(("fourteen_times", "table_3_seconds", "soft_step", "beam_seconds"), ASSUMED),
+    **dict.fromkeys(("richardson", "difference_is_the_error", "limit_reset_34"), CHOICE),
+    "low_index_fails": PART,
     **dict.fromkeys(("newmark_tolerances", "newmark_star"), CIRCULAR),
     **dict.fromkeys(("index_1_drifts", "constraints_kept", "agree_and_reach", "large_steps", "works_long"), HOLDS),
     **dict.fromkeys(("beams_work", "dependents_in_the_loop", "newmark_symplectic", "stiff_step"), HOLDS),
@@ -211,11 +218,13 @@ def test_verdicts_of_the_made_up_rows(tables):
 
 
 FLIPS = [  # claim, study, rows, changes, verdict then
-    ("low_index_fails", "motion", "group == 'GSTIFF stand-in'", {"astray": True}, HOLDS),
+    ("low_index_fails", "motion", "group == 'GSTIFF stand-in'", {"astray": True}, CONSISTENT),
+    ("low_index_fails", "motion", "group == 'GSTIFF stand-in'", {"astray": False}, FAILS),
     ("index_1_drifts", "table3", "solver.str.startswith('DOP')", {"violation_late": 1e-15}, PART),
     ("index_1_drifts", "table3", "solver == solver", {"violation_late": 1e-15}, FAILS),
     ("baumgarte_inexact", "violation", "group == 'tolerances'", {"violation_q": 1e-5}, HOLDS),
     ("projection_exact", "table3", "solver == 'IDA, stabilised'", {"violation_q": 0.0}, HOLDS),
+    ("projection_exact", "table3", "solver == 'IDA, stabilised' and tol > 1e-13", {"astray": True}, NOT_RUN),
     ("projection_inefficient", "table3", "solver.str.contains('sta|pro')", {"call_s": 9, "n_evaluations": 1e9}, HOLDS),
     ("projection_inefficient", "table3", "solver.str.endswith('1')", {"call_s": 1e-6, "n_evaluations": 1.0}, FAILS),
     ("jacobian_difficult", "beam", "solver == 'SunRadau5'", {"call_s": 99.0}, PART),
@@ -228,7 +237,6 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("newmark_symplectic", "energy", "solver.str.startswith('Newmark')", {"slope": -1e-6}, FAILS),
     ("parting", "beam", "group == 'sensitivity'", {"before": 0.03}, FAILS),
     ("parting", "beam", "group == 'sensitivity'", {"largest": 0.03}, FAILS),
-    ("limit_reset_34", "beam", "solver == 'PaperIRK'", {"n_rejected_convergence": 1.0}, HOLDS),
     ("agree_and_reach", "motion", "solver == 'PaperIRK'", {"top": 0.01}, PART),
     ("agree_and_reach", "motion", "solver == 'PaperIRK'", {"error_y3_short": 0.1}, FAILS),
     ("gstiff_short", "motion", "h == 0.02", {"error_y3_short": 1e-3}, FAILS),
@@ -249,7 +257,7 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("implicit_needed", "beam", "solver.str.startswith('DOP')", {"n_evaluations": 1e9, "call_s": 99.0}, HOLDS),
     ("implicit_needed", "beam", "solver == 'TRBDF2'", {"n_evaluations": 1e9, "call_s": 99.0}, FAILS),
     ("soft_step", "beam", "solver == 'PaperIRK'", {"h_median": 1e-3}, HOLDS),
-    ("stiff_step", "beam", "solver == 'PaperIRK'", {"h_median": 1e-3}, FAILS),
+    ("stiff_step", "beam", "solver == 'PaperIRK'", {"h_median": 1e-3}, ASSUMED),
     ("beams_work", "beam", "case == 'very flexible'", {"error_q": 0.1}, PART),
     ("grows_a_lot", "beam", "solver == 'PaperIRK'", {"call_s": 1.0}, FAILS),
     ("beam_seconds", "beam", "case == 'moderately stiff'", {"call_s": 111.6}, HOLDS),
@@ -267,8 +275,6 @@ OTHER_NUMBERS = [
     ("partition_kept", "partitions mostly kept", 3.0, FAILS),
     ("energy_bounds_y3", "linkages passing", 0.0, HOLDS),
     ("any_method", "methods of their order", 9.0, PART),
-    ("richardson", "share of the step for the estimate", 0.05, HOLDS),
-    ("difference_is_the_error", "estimate over error", 1.1, HOLDS),
     ("values_alone", "calls differenced", 4.0, HOLDS),
     ("values_alone", "difference", 1e-3, FAILS),
     ("general", "mechanisms right", 21.0, HOLDS),
@@ -312,7 +318,40 @@ def test_one_factor_of_the_machine_would_be_seen(tables):
 
 def test_every_claim_is_seen_to_turn():
     turned = {flip[0] for flip in FLIPS} | {flip[0] for flip in OTHER_NUMBERS} | {"table_3_seconds"}
-    assert turned == {claim.key for claim in load()}
+    assert turned == {claim.key for claim in load() if not claim.choice}
+
+
+@pytest.mark.parametrize(
+    ("key", "number", "value"),
+    [
+        ("richardson", "share of the step for the estimate", 0.05),
+        ("difference_is_the_error", "estimate over error", 1.1),
+    ],
+)
+def test_what_the_paper_chose_has_a_number_and_no_verdict(key, number, value, tables):
+    claim = next(claim for claim in CLAIMS if claim.key == key)
+    found = [claim.judgement(judge_of(claim), Rows(tables, EXPERIMENTS | more)) for more in ({}, {number: value})]
+    assert [each.verdict for each in found] == [CHOICE, CHOICE] and len({claim.text(each) for each in found}) == 2
+    assert beam_judges.limit_reset_34(Rows(tables, {})).verdict is FAILS
+    few = with_changed(tables, "beam", "solver == 'PaperIRK'", {"n_rejected_convergence": 1.0})
+    assert beam_judges.limit_reset_34(Rows(few, {})).verdict is HOLDS
+    n_choices = sum(claim.choice for claim in CLAIMS)
+    assert claims.findings_of(judged(Rows(tables, EXPERIMENTS)))["n"] == len(CLAIMS) - n_choices and n_choices == 3
+
+
+def test_errors_of_the_beams_are_compared_as_they_are(tables):
+    """PaperIRK has no run as bad as the errors: of Newmark's the cheapest counts that is as good, and it is said."""
+    found = judges.more_efficient(Rows(tables, EXPERIMENTS)).values
+    assert found["unequal"] and found["soft_error"] == 1e-9 and found["soft"] == pytest.approx([0.4, 3.2])
+    near = with_changed(tables, "beam", "solver == 'PaperIRK'", {"error_q": 1e-8})
+    assert not judges.more_efficient(Rows(near, EXPERIMENTS)).values["unequal"]
+
+
+def test_a_run_on_momenta_is_said_not_to_drift_for_what_it_is(tables):
+    found = judges.symplectic_stable(Rows(tables, EXPERIMENTS)).values
+    assert (found["on_momenta"], found["steady_on_momenta"], found["steady_fixed_on_one"]) == (1, 1, True)
+    other = with_changed(tables, "energy", "variables == 'momenta'", {"case": "switching"})
+    assert not judges.symplectic_stable(Rows(other, EXPERIMENTS)).values["steady_fixed_on_one"]
 
 
 def test_without_rows_nothing_is_judged():
@@ -340,7 +379,8 @@ def test_a_missing_column_or_row_is_not_run_and_never_an_exception(name, tables)
 def test_quick_rows_do_not_answer_what_is_about_long_runs(tables):
     short = {name: table.assign(t_end=0.1) for name, table in tables.items()}
     found = {key: each.verdict for key, (_, each) in judged(Rows(short, EXPERIMENTS)).items()}
-    of_experiments = {flip[0] for flip in OTHER_NUMBERS}
+    of_experiments = {flip[0] for flip in OTHER_NUMBERS} | {claim.key for claim in CLAIMS if claim.choice}
+    assert found["limit_reset_34"] is NOT_RUN
     assert {key for key, verdict in found.items() if verdict is not NOT_RUN} <= of_experiments
 
 
@@ -366,6 +406,9 @@ def test_circular_and_stand_in_limit_the_verdict():
     assert verdict(HOLDS) is HOLDS
     assert verdict(HOLDS, circular="it was read so") is CIRCULAR and verdict(FAILS, circular="x") is FAILS
     assert verdict(HOLDS, stand_in="another") is CONSISTENT and verdict(FAILS, stand_in="another") is FAILS
+    assert verdict(PART, stand_in="another") is PART
+    assert verdict(FAILS, inputs="geometry") is ASSUMED and verdict(HOLDS, inputs="geometry") is HOLDS
+    assert {verdict(each, choice=True) for each in (HOLDS, PART, FAILS)} == {CHOICE}
 
 
 def test_report_rows_and_findings(folder):
@@ -374,7 +417,11 @@ def test_report_rows_and_findings(folder):
     for claim in load():
         assert f" {claim.statement.removesuffix('.')}" in text
         row = rows[rows["claim"] == claim.key].iloc[0]
-        assert row["verdict"].capitalize() in text and row["number"] in text and row["criterion"] == claim.criterion
+        assert (
+            (row["verdict"].capitalize() in text or claim.choice)
+            and row["number"] in text
+            and row["criterion"] == claim.criterion
+        )
     assert "nan" not in text and (folder / "errata.md").exists()
     assert len(text.split()) < 1000
 

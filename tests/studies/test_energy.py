@@ -182,7 +182,7 @@ def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of, quic
 def test_all_controlled_runs_drift_or_not(rows, found_of):
     found = found_of(changed(rows.copy(), "group == 'controlled'", slope=1.0, slope_error=0.0))
     assert found["controlled_steady"] == [] and found["n_controlled"] > 0
-    found = found_of(changed(rows, "group == 'controlled'", slope=0.0))
+    found = found_of(changed(rows, "group == 'controlled'", slope=0.0, slope_error=0.0))
     assert len(found["controlled_steady"]) == found["n_controlled"]
     assert found["paper"]["one"]["calm"] and found["paper"]["switching"]["calm"]
 
@@ -237,6 +237,8 @@ def row_of(**changes):
         ({"swing": 1e-4}, SLOWLY),
         ({"slope_error": 1e-9}, IRREGULAR),
         ({"slope_error": 1e-9, "swing": 1e-4}, NO_DRIFT),
+        ({"slope": 0.0, "slope_error": 1e-11}, NO_DRIFT),
+        ({"slope": 0.0, "slope_error": 1e-10}, IRREGULAR),  # no net slope, but 3e-6 J may hide in the scatter
         ({"slope": 1e-13, "slope_error": 1e-15}, ROUNDS),  # 1e-9 J; one rounding a step makes 2e-9 J
         ({"lost": True}, IS_LOST),
         ({"status": "NOT_CONVERGED", "t_reached": 12.5}, "not converged at 12.5 s"),
@@ -266,6 +268,29 @@ def test_a_random_walk_is_seldom_called_a_drift():
 def test_a_slope_needs_windows():
     with pytest.raises(ValueError, match="needs 20 windows or more; given 19"):
         drift(np.arange(19.0), np.arange(19.0))
+
+
+def test_what_wanders_and_comes_back_is_not_free_of_drift():
+    t = np.linspace(0.0, 1e4, 100)
+    for size, expected in ((1e-7, NO_DRIFT), (1e-4, IRREGULAR)):
+        slope, error = drift(t, size * np.sin(2.0 * np.pi * t / 1e4))
+        row = row_of(slope=0.0, slope_error=error)
+        assert abs(slope) < 3.0 * error and verdict(row) == expected
+
+
+def test_cheaper_runs_that_drift_are_told_beside_those_that_do_not(rows, found_of, tmp_path):
+    own = f"case == '{SWITCHING}' and family == 'two-loop'"
+    rows = changed(rows, own, slope=1.0, slope_error=0.0, call_s=9.0, energy=1e-9)
+    even = f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}' and partition == 'symmetric' and variables == 'velocities'"
+    rows = changed(rows, even, slope=0.0, call_s=6.0)
+    rows = changed(rows, f"case == '{SWITCHING}' and solver == '{OWN_EXPLICIT}'", call_s=2.0)
+    found = found_of(rows)["long"]["calm_ours"]
+    assert found["fixed"] and found["drifting_explicit"] and found["over_drifting"] == [3.0, 3.0]
+    assert (
+        "Explicit methods whose energy drifts or wanders are 3.0 times cheaper" in (tmp_path / "energy.md").read_text()
+    )
+    assert found_of(changed(rows, own, slope=1.0))["long"]["calm_ours"]["labels"] == []
+    assert "None of ours is without drift." in (tmp_path / "energy.md").read_text()
 
 
 def test_windows_are_whole_periods():

@@ -56,7 +56,7 @@ def found_of(folder, made, quick=False):
 @pytest.mark.usefixtures("unsaved")
 def test_findings_turn_with_the_rows(tmp_path):
     found, n = found_of(tmp_path, rows()), len(PRESETS) + 3
-    assert found["holds"] and found["longer"] and found["retries_more"]
+    assert found["holds"] and found["longer"]
     assert found["ratios"] == pytest.approx([200.0, 200.0])
     assert found["switches"] == 100 and found["switches_per_period"] == pytest.approx(2.2, abs=0.1)
     assert (found["n_known"], found["n_worse_at_switch"]) == (n, n)
@@ -67,7 +67,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[ours, "retried_switch"] = 0.0
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
     found = found_of(tmp_path, made)
-    assert not found["holds"] and not found["longer"] and not found["retries_more"]
+    assert not found["holds"] and not found["longer"]
     assert (found["n_known"], found["n_worse_at_switch"]) == (n, 0)
     made.loc[made["solver"] == "Gauss6", "retried_switch"] = 0.9
     assert found_of(tmp_path, made)["n_worse_at_switch"] == 1

@@ -23,7 +23,7 @@ def text(rows):
 
 def test_sentences_turn_with_the_rows():
     given = text(rows())
-    assert "All chains up to n = 5 were made" in given
+    assert "All chains up to n = 5 were derived and compiled" in given
     assert "compiling takes 30 s with them (`tangents=True`) and 3.0 s without" in given
     assert "takes 1.5 s of CPU time in the median, 1.5 s at most" in given
     assert "costs 1.1 to 1.1 times as much. Counts of evaluations are the same." in given
@@ -31,7 +31,7 @@ def test_sentences_turn_with_the_rows():
     worse.loc[0, "second_s"], worse.loc[1, "status"] = 2.5, "TIME_LIMIT"
     worse.loc[2, ["twin_us", "twin_evaluations"]] = 2.0, 101.0
     given = text(worse)
-    assert "Not all chains were made: angles, n = 5: TIME_LIMIT" in given
+    assert "Not all chains were derived and compiled: angles, n = 5: TIME_LIMIT" in given
     assert "takes 2.5 s of CPU time in the median, 2.5 s at most" in given
     assert "costs 2.0 to 2.0 times as much" in given
     assert "Counts of evaluations differ in four-bar." in given

@@ -18,9 +18,11 @@ from studies.table3.causes import (
     PAPER_NEWMARK,
     READINGS,
     TOLERANCES,
+    by_repetition,
     causes,
     cells,
     fit,
+    in_two_groups,
     printed,
 )
 
@@ -103,6 +105,14 @@ def test_a_partition_too_cheap_to_be_measured_explains_nothing(tmp_path):
     made.loc[made["solver"] == "fixed step, symmetric", "call_s"] = 0.09
     found = found_of(tmp_path, made)
     assert found["partition_us"] <= 0.0 and not found["partition_explains"]
+
+
+def test_ratios_of_times_show_their_scatter():
+    slow, fast = (pd.Series({"times": times}) for times in ((1.0, 0.7, 0.9, 0.71), (0.1, 0.1, 0.1, 0.1)))
+    assert by_repetition(slow, fast) == pytest.approx([7.0, 10.0])
+    assert in_two_groups((1.00, 0.72, 0.94, 0.72, 0.93))
+    assert not in_two_groups((1.0, 0.9, 0.8, 0.7, 0.6)) and not in_two_groups((1.0, 1.01, 1.02, 1.01, 1.5))
+    assert not in_two_groups((1.0, 2.0))
 
 
 @pytest.mark.usefixtures("unsaved")
