@@ -106,7 +106,9 @@ def test_errors_that_are_not_equal_are_said_and_a_solver_with_runs_is_asked(tmp_
 
 
 def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
-    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan], "call_s": [1.1, 3.0, 0.1]})
+    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan], "call_s": [1.1, 3.0, 0.1]}).assign(
+        error_q=lambda x: x["error_tip"]
+    )
     assert study._cell(runs, 1e-2, "not asked") == "1.1°"
     assert study._cell(runs, 1e-5, "1.2") == "1.2"
     assert study._cell(runs, 1e-9, "not asked") == "least error 1e-6"
