@@ -17,7 +17,7 @@ from studies.bench.solvers import (
     PAPER_TOL,
     QUARTER,
 )
-from studies.bench.tables import time_for
+from studies.bench.tables import as_good
 from studies.claims.rows import BEAM_END, BEAMS, Rows, cheapest
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.table3.causes import FLAT
@@ -43,7 +43,7 @@ def jacobian_difficult(rows: Rows) -> Judgement:
     """That of a tableau's outer loop alone, and against the paper's procedure; whether they are difficult, not."""
     counts = {key: rows.number(f"Newton over fixed point, {case}") for key, case in zip(KEYS, BEAMS, strict=True)}
     counts["linkage"] = rows.number("Newton over fixed point, linkage")
-    seconds = [[time_for(rows.beam(case, name), TIP) for name in ("SunRadau5", IRK)] for case in BEAMS]
+    seconds = [[as_good(rows.beam(case, name), TIP) for name in ("SunRadau5", IRK)] for case in BEAMS]
     times = [newton / paper for newton, paper in seconds]
     return decide((ratio > 1.0 for ratio in (*counts.values(), *times)), times=span(times), **counts)
 
