@@ -30,7 +30,7 @@ MAIN_RIVALS = (
     ("SciPy", ""),
 )  # family, how names begin
 ERROR = "largest position error over the run (m, rad)"
-LEGEND = "solid: twoloop\nfilled: keeps constraints\ngaps: failed, or > a decade"
+LEGEND = "solid: twoloop\nfilled: keeps constraints\nno line: a run failed, or\nerrors over a decade apart"
 
 mpl.rcParams.update(
     {
