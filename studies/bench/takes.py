@@ -51,7 +51,8 @@ def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, s
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Of each kind who is the cheapest on all mechanisms; of the other kinds who is it on which mechanism."""
-    rows, open_kinds, told = [], [], set()
+    open_kinds, told = [], set()
+    closed: dict[str, list[tuple[str, set[str]]]] = defaultdict(list)
     others: dict[str, Sequence[Mapping[str, Any]]] = {}
     for kind, words in KINDS.items():
         own = [each for each in mechanisms if kind in each.get("tags", ())]
@@ -59,12 +60,17 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         cheapest = Counter(_cheapest(at) for at in these)
         solver, n = max(cheapest.items(), key=lambda item: (item[0] != "", item[1]), default=("", 0))
         if solver and n == len(these):
-            said = f"{call(solver)}, the cheapest at most errors on {n} of {len(these)} such mechanisms"
-            rows.append({"what": words, "take": said})
-            told |= {each["case"] for each in own}
+            cases = {each["case"] for each in own}
+            closed[solver].append((words, cases))
+            told |= cases
         elif these:
             open_kinds.append(words)
             others |= {each["case"]: each["at"] for each in own}
+    rows = []
+    for solver, kinds in closed.items():
+        n = len(set().union(*(cases for _, cases in kinds)))
+        said = f"{call(solver)}, the cheapest at most errors on {n} of {n} such mechanisms"
+        rows.append({"what": "; ".join(words for words, _ in kinds), "take": said})
     left = {case: at for case, at in others.items() if case not in told}
     by_solver: dict[str, list[str]] = defaultdict(list)
     for case, at in left.items():

@@ -278,7 +278,9 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "right on 17, only ours on 2, only others on 0, none on 2. Runs of others where only ours are right: 2" in text
+    assert (
+        "right on 17, only ours on 2, only others on 0, none on 2. Runs of others where only ours are right: 2" in text
+    )
     assert "ours are right: 2 inexact, 4 wrong, 3 stopped by our time limit, 1 not run. Wrong runs" in text
     assert "1 of 500 of ours, 57 of 300 of others" in text
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
