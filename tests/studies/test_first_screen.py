@@ -160,7 +160,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
     expected = [
         "| smooth, rigid (crane, 10 s) | `compiled=True` for errors of 1e-2, 1e-4 and 1e-6 |",
         "| long and conservative (four-bar, switching, 1e4 s) | `LSODA` for errors of 0.020 J |",
-        "| redundant constraints; spatial | `IDA from C, stabilised`, the cheapest at most errors on 1 of 1 such mechanisms |",
+        "| redundant constraints; spatial | `IDA from C, stabilised`, the cheapest at most errors on 1 of 1 such "
+        "mechanisms |",
         "on the four-bar in ms, by the error after 10 s of motion (the largest of a coordinate, over the largest "
         "coordinate where that exceeds 1). The fixed cost of our calls",
         f"\n| 1e-4 | {cells} |\n| 1e-6 | {cells} |\n",
