@@ -22,7 +22,8 @@ from typing import Any
 import numba
 import numpy as np
 from numba import njit
-from numba.core.caching import FunctionCache, NullCache, UserProvidedCacheLocator
+from numba.core import caching
+from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import Type
@@ -37,6 +38,8 @@ UNWRITABLE = (
 MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk ...
 MOST_HELD = 50  # ... and in memory
 CHECKSUM = hashlib.sha256().digest_size
+# numba 0.61 has it under a private name
+_LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
@@ -142,7 +145,7 @@ class _Cache(FunctionCache):
         chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         if chosen:  # numba would make it as the umask has it
             with suppress(OSError):
-                make_own(Path(chosen, UserProvidedCacheLocator.get_suitable_cache_subpath(inspect.getfile(function))))
+                make_own(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
         own = own_folder(Path(self._cache_path))

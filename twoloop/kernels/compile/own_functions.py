@@ -14,6 +14,8 @@ from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile.caches import UNWRITABLE, Files, count_made, say_once, sources_folder
 
+SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
+
 
 class OwnFunctions:
     """Functions in memory, as long as this object lives.
@@ -80,27 +82,40 @@ def _place(key: str) -> Any:
 
 def object_code(text: str) -> bytes:
     """Machine code for this processor."""
-    machine, passes, builder = _compiler()
+    machine = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
+    passes, builder = _two_passes() if SINGLE_PASSES else _all_passes()
     passes.run(module, builder)
     content: bytes = machine.emit_object(module)
     return content
 
 
 @cache
-def _compiler() -> tuple[Any, Any, Any]:
-    """The processor and LLVM's passes, once a process: of passes that are let go some 300 kB stay."""
-    machine, tuning = _machine(), binding.create_pipeline_tuning_options(speed_level=1)
-    builder = binding.create_pass_builder(machine, tuning)
+def _compiler() -> Any:
+    return _machine()
+
+
+@cache
+def _two_passes() -> tuple[Any, Any]:
+    """Those that make code of small mechanisms faster by a tenth; all others together find nothing more.
+
+    Made once a process: of passes that are let go some 300 kB stay.
+    """
     passes = binding.create_new_module_pass_manager()
-    # these two make code of small mechanisms faster by a tenth; all others together find nothing more
-    if hasattr(passes, "add_reassociate_pass"):
-        passes.add_reassociate_pass()
-        passes.add_instruction_combine_pass()
-    else:  # llvmlite 0.44 has no single passes
-        passes = builder.getModulePassManager()
-    return machine, passes, builder
+    passes.add_reassociate_pass()
+    passes.add_instruction_combine_pass()
+    return passes, _pass_builder()
+
+
+def _all_passes() -> tuple[Any, Any]:
+    """Of llvmlite 0.44, whose passes serve one module."""
+    builder = _pass_builder()
+    return builder.getModulePassManager(), builder
+
+
+def _pass_builder() -> Any:
+    return binding.create_pass_builder(_compiler(), binding.create_pipeline_tuning_options(speed_level=1))
 
 
 @cache
