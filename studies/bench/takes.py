@@ -9,6 +9,7 @@ from studies.bench.solvers import DEFAULT
 from twoloop.methods.presets import PRESETS
 
 _UNDECIDED = "the default: no solver is told apart from the others"
+DECIDED = ("ahead", "behind", "alone")  # verdicts by which one is the cheapest
 SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
 KINDS = {  # tags of mechanisms, and what a user calls them
     "redundant": "redundant constraints",
@@ -105,17 +106,20 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
-    """From which run on code for the mechanism pays, by the first calls: on every mechanism, and the soonest."""
+    """By which run code for the mechanism has paid, by the first calls: on every mechanism, and what is sooner."""
     paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
     if not paying:
         return []
     always = min((line for line in paying if not line["never"]), key=_latest, default=None)
-    soonest = [line for line in paying if always is None or (line["never"] and _latest(line) < _latest(always))]
-    parts = [f"on every mechanism {call(always['solver'])} breaks even first, {_from_run(always)}"] if always else []
-    if soonest:
-        told = [f"{call(line['solver'])} ({_from_run(line)})" for line in sorted(soonest, key=_latest)]
-        parts.append(f"{'sooner, but not on all: ' if always else 'not on all: '}{', '.join(told)}")
-    return [f"beside `{DEFAULT}`, at an error of 1e-8, {'; '.join(parts)}"]
+    sooner = [line for line in paying if always is None or (line["never"] and _latest(line) < _latest(always))]
+    told = [always] if always else []
+    parts = [_by_run(line) for line in [*told, *sorted(sooner, key=_latest)]]
+    return [f"breaks even with `{DEFAULT}`, at an error of 1e-8: {'; '.join(parts)}"]
+
+
+def _by_run(line: Mapping[str, Any]) -> str:
+    where = f"on all {line['n']} mechanisms" if not line["never"] else f"on {line['n'] - line['never']} of {line['n']}"
+    return f"{call(line['solver'])} {where} by run {_latest(line):.0f}"
 
 
 def _latest(line: Mapping[str, Any]) -> float:
@@ -126,17 +130,12 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:
     """Who is the cheapest at most errors where many runs are one call, by mechanism."""
     by_way: dict[str, list[str]] = {}
     for each in cases:
-        won = Counter(min(at["run_s"], key=at["run_s"].get) for at in each["at"] if at["run_s"])
+        won = Counter(min(at["run_s"], key=at["run_s"].get) if at["verdict"] in DECIDED else "" for at in each["at"])
         if won:
             by_way.setdefault(won.most_common(1)[0][0], []).append(each["case"])
-    parts = [f"`{way}` on {listed(names)}" for way, names in sorted(by_way.items(), key=lambda item: -len(item[1]))]
-    return [f"in one call {', '.join(parts)}"] if parts else []
-
-
-def _from_run(line: Mapping[str, Any]) -> str:
-    least, most = min(line["pays"]), max(line["pays"])
-    runs = f"{least:.0f}" if least == most else f"{least:.0f} to {most:.0f}"
-    return f"from run {runs} on" + (f", on {line['never']} of {line['n']} mechanisms never" if line["never"] else "")
+    ways = sorted(by_way.items(), key=lambda item: (item[0] == "", -len(item[1])))
+    parts = [f"{f'`{way}`' if way else 'undecided'} on {listed(names)}" for way, names in ways]
+    return [f"in one call {', '.join(parts)}"] if any(by_way) else []
 
 
 def call(solver: str) -> str:

@@ -291,6 +291,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     elsewhere = [line["tol"] for line in wrong if line["family"] != "two-loop" and line["case"] not in singular]
     found["wrong_elsewhere"] = {"n": len(elsewhere), "tightest": min(elsewhere, default=None)}
     stopped, sides = rows["status"].eq("TIME_LIMIT"), {"ours": ours, "python": rows["called_from"] == "Python"}
+    sides["compiled"] = ~ours & ~sides["python"]
     found["n_stopped"] = {side: [int(stopped[which].sum()), int(which.sum())] for side, which in sides.items()}
     return found | {"time_limit": TIME_LIMIT}
 
