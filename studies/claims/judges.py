@@ -316,8 +316,9 @@ def more_efficient(rows: Rows) -> Judgement:
     values: dict[str, Any] = {"linkages": rows.long("table3")["problem"].nunique()}
     unequal = []
     for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
+        runs = rows.beam(case, "", solver=IRK)
         paper, newmark = (rows.beam(case, "", solver=names)["error_q"].astype(float) for names in (IRK, BOTH_BETAS))
-        values[f"{key}_error"] = float(paper.max())
+        values[f"{key}_error"] = float(max(paper.max(), runs["floor"].max()))  # what the reference resolves
         unequal.append(APART * paper.max() < newmark.min())
     values["unequal"] = all(unequal)
     values |= {"loosest": FINER[0], "finest": FINER[-1]}
