@@ -37,7 +37,7 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-LARGEST = 3000  # operations, which take 6 s to compile; the time grows faster than their number
+LARGEST = 3000  # operations: the time to compile them grows faster than their number
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 

@@ -79,7 +79,7 @@ def compile_kept(
                 say_once(UNWRITABLE)
     dispatcher.compile(signature)
     dispatcher.disable_compile()
-    count_made()
+    _N_MADE[0] += 1
     return dispatcher
 
 
@@ -96,13 +96,8 @@ _N_MADE = [0]
 
 
 def n_made() -> int:
-    """How many functions, or sets of them for a mechanism, this process has compiled, or read from the disk."""
+    """How many functions of numba, which stay in memory, this process has compiled, or read from the disk."""
     return _N_MADE[0]
-
-
-def count_made() -> None:
-    """Count one more."""
-    _N_MADE[0] += 1
 
 
 def folder_of(package: types.ModuleType) -> Path | None:

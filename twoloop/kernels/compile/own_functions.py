@@ -12,7 +12,7 @@ from typing import Any
 from llvmlite import binding
 from numba.core.registry import cpu_target
 
-from twoloop.kernels.compile.caches import UNWRITABLE, Files, count_made, say_once, sources_folder
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, say_once, sources_folder
 
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
@@ -63,7 +63,6 @@ def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[lis
             files.save(place, kept)
         except OSError:
             say_once(UNWRITABLE)
-    count_made()
     return OwnFunctions(*kept)
 
 

@@ -2,7 +2,5 @@
 
 from numba.core import cgutils
 from numba.core.dispatcher import Dispatcher
-from numba.core.typing import signature
-from numba.np.arrayobj import make_array
 
-__all__ = ["Dispatcher", "cgutils", "make_array", "signature"]
+__all__ = ["Dispatcher", "cgutils"]
