@@ -319,15 +319,15 @@ def swinging_under(gravity):
 
 def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
     monkeypatch.setattr("twoloop.kernels.compile.caches.MOST_HELD", 1)
-    held, made = [], straight_code.OwnCode
+    held, made = [], straight_code.SharedCode
 
     class Watched(made):
-        def __init__(self, equations):
-            super().__init__(equations)
+        def __init__(self, *given):
+            super().__init__(*given)
             held.append(weakref.ref(self.functions))
             held.append(weakref.ref(self))
 
-    monkeypatch.setattr(straight_code, "OwnCode", Watched)
+    monkeypatch.setattr(straight_code, "SharedCode", Watched)
     options = {"measure": plain, "parallel": "threads", "workers": 1, "compiled": True, "method": "DOP853", **QUICK}
     # 0, 1 and -1 stand in the code
     rows = sweep(swinging_under, [{"gravity": gravity} for gravity in (9.0, 1.0, -1.0, 0.0)], **options)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.known_numbers import Known, Powers, Record
+from twoloop.generate.known_numbers import Known, Powers, Record, array_of
 from twoloop.generate.tracing import Form, Graph, rounded
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
@@ -43,9 +43,13 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """The coefficients of forms, in the order in which these are met first; the same form has the same numbers."""
+    """The coefficients of forms, in the order in which these are met first; the same form has the same numbers.
 
-    def __init__(self) -> None:
+    `apart`: those that vary with parameters stand in a memory of their own, as each lane has its own.
+    """
+
+    def __init__(self, apart: bool = False) -> None:
+        self._apart = apart
         self._values: list[float] = []
         self._varying: dict[tuple[float, Powers], Known] = {}
         self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
@@ -54,6 +58,11 @@ class Coefficients:
     def values(self) -> NDArray[np.float64]:
         """What code reads."""
         return np.array(self._values, dtype=np.float64)
+
+    @property
+    def formulas(self) -> Any:
+        """The same, as formulas where they know their parameters."""
+        return array_of(self._values)
 
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
         """Terms and constant with numbers in their places."""
@@ -91,12 +100,14 @@ class Coefficients:
         return record.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
-        if type(value) is Known:
-            made_of = value.scale, value.powers
-            self._varying.setdefault(made_of, value)
-            return Coefficient(value, list(self._varying).index(made_of), varies=True)
-        near = float(round(value)) if math.isfinite(value) else value
-        if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near):
-            return near
+        if type(value) is Known:  # which is another number for other parameters, whatever it is now
+            if self._apart:
+                made_of = value.scale, value.powers
+                self._varying.setdefault(made_of, value)
+                return Coefficient(value, list(self._varying).index(made_of), varies=True)
+        else:
+            near = float(round(value)) if math.isfinite(value) else value
+            if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near):
+                return near
         self._values.append(value)
         return Coefficient(value, len(self._values) - 1)

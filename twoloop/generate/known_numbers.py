@@ -75,7 +75,10 @@ class Record:
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """A function that gives what a number is for other parameters (n_runs, n_p): (n_runs,), or one for all."""
+        """A function that gives what a number is for other parameters.
+
+        These are (n_p,), or (n_runs, n_p): then it gives (n_runs,), or one number for all.
+        """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}
 
@@ -92,7 +95,7 @@ class Record:
             if place not in atoms:
                 definition = self.atoms[place]
                 if definition is None:
-                    atoms[place] = parameters[:, place]
+                    atoms[place] = parameters.T[place]
                 elif definition[0] == "sum":
                     atoms[place] = sum(c * product(powers) for powers, c in definition[1])
                 else:
@@ -100,10 +103,7 @@ class Record:
             return atoms[place]
 
         def value(number: float) -> Any:
-            if type(number) is not Known:
-                return number
-            with np.errstate(all="ignore"):
-                return number.scale * product(number.powers)
+            return number.scale * product(number.powers) if type(number) is Known else number
 
         return value
 
@@ -111,8 +111,9 @@ class Record:
         """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
         value = self.on(parameters)
         made = np.empty((len(parameters), len(numbers)))
-        for k, each in enumerate(numbers):
-            made[:, k] = value(each)
+        with np.errstate(all="ignore"):
+            for k, each in enumerate(numbers):
+                made[:, k] = value(each)
         return made
 
 
@@ -140,6 +141,11 @@ class Known(float):
             return made
         out[0][...] = made
         return out[0]
+
+    def to(self, exponent: float) -> "Known":
+        """The power with a whole exponent that is not 0."""
+        powers = tuple([(place, exponent * own) for place, own in self.powers])
+        return Known(float(self) ** exponent, self.record, self.scale**exponent, powers)
 
     def __neg__(self) -> "Known":
         return Known(-float(self), self.record, -self.scale, self.powers)
@@ -177,36 +183,30 @@ def _sum(one: float, other: float) -> float:
 
 
 def _product(one: float, other: float) -> float:
-    record, scale = _record(one, other), 1.0
-    powers: dict[int, float] = {}
-    for each in (one, other):
-        if type(each) is Known:
-            scale *= each.scale
-            for place, exponent in each.powers:
-                powers[place] = powers.get(place, 0.0) + exponent
-        else:
-            scale *= each
-    left = tuple(sorted((place, exponent) for place, exponent in powers.items() if exponent))
-    return Known(float(one) * float(other), record, scale, left) if left and scale else scale
+    if type(one) is not Known:
+        one, other = other, one
+    assert isinstance(one, Known)
+    if type(other) is not Known:
+        return Known(float(one) * other, one.record, one.scale * other, one.powers) if other else 0.0
+    powers = dict(one.powers)
+    for place, exponent in other.powers:
+        powers[place] = powers.get(place, 0.0) + exponent
+    scale, left = one.scale * other.scale, tuple(sorted(each for each in powers.items() if each[1]))
+    return Known(float(one) * float(other), one.record, scale, left) if left else scale
 
 
 def _power(one: float, exponent: float) -> float:
-    if type(exponent) is Known or exponent != math.floor(
-        exponent
-    ):  # the root of a square is no product: it has no sign
+    if type(exponent) is Known or not exponent.is_integer():  # the root of a square is no product: it has no sign
         return _function("power", one, exponent)
     assert isinstance(one, Known)
-    if exponent == 0.0:
-        return 1.0
-    powers = tuple((place, exponent * own) for place, own in one.powers)
-    return Known(float(one) ** exponent, one.record, one.scale**exponent, powers)
+    return one.to(exponent) if exponent else 1.0
 
 
 _OPERATIONS: dict[str, Callable[[float, float], float]] = {
     "add": _sum,
     "subtract": lambda one, other: _sum(one, -other),
     "multiply": _product,
-    "divide": lambda one, other: _product(one, _power(other, -1.0) if type(other) is Known else 1.0 / other),
+    "divide": lambda one, other: _product(one, other.to(-1.0) if type(other) is Known else 1.0 / other),
     "power": _power,
 }
 
@@ -246,13 +246,17 @@ _WITH_SYMBOLS: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def _operator(name: str, swapped: bool) -> Callable[[Known, Any], Any]:
+    known = _OPERATIONS[name]
+
     def operate(self: Known, other: Any) -> Any:
+        if type(other) is float or type(other) is Known:
+            return known(other, self) if swapped else known(self, other)
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
         if not issubclass(type(other), NUMBERS):  # by type(), as a symbol refuses isinstance
             return NotImplemented
-        return _OPERATIONS[name](*(each if type(each) is Known else float(each) for each in pair))
+        return known(*(each if type(each) is Known else float(each) for each in pair))
 
     return operate
 
@@ -271,6 +275,12 @@ def _operand(value: Any) -> Any:
     made = np.empty((), dtype=object)
     made[()] = value
     return made
+
+
+def array_of(values: Iterable[float]) -> Any:
+    """An array of floats, or of objects where some know their parameters."""
+    values = list(values)
+    return np.array(values, dtype=object if any(type(each) is Known for each in values) else float)
 
 
 def number(value: Any) -> float:

@@ -32,7 +32,7 @@ class LaneCode:
     """Writes the code of a mechanism, whose numbers depend on parameters as `record` has it."""
 
     def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any):
-        self.numbers = Coefficients()
+        self.numbers = Coefficients(apart=True)
         self.equations = equations = StraightLine(system, choice, parameters)
         self.solution = Solution(self.equations)
         self.n, self.n_rows = system.n_q, system.n_c + system.n_a

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from twoloop.generate.known_numbers import array_of
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.evaluation.operations import N_COLUMNS, RESULT
 
@@ -38,7 +39,7 @@ def program_of(graph: Graph, n_inputs: int, results: Mapping[int, Form]) -> Prog
     return Program(
         np.array(rows, dtype=np.int64).reshape(-1, N_COLUMNS),
         np.array([i for i, _ in terms], dtype=np.int64),
-        np.array([c for _, c in terms], dtype=float),
-        np.array(constants, dtype=float).reshape(-1, 2),
+        array_of(c for _, c in terms),
+        array_of(c for pair in constants for c in pair).reshape(-1, 2),
         len(node),
     )

@@ -5,14 +5,14 @@ quantities that depend on time and coordinates ("early"); Q may depend on veloci
 G^T lam + M a are written as few products: terms that share a factor are one product.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.known_numbers import Known
+from twoloop.generate.known_numbers import array_of
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
@@ -243,15 +243,9 @@ def _sums(forms: list[Form], place: dict[int, int]) -> Sums:
     more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
     return Sums(
         np.array([each[0][0] for each in terms], dtype=np.int64),
-        _numbers(each[0][1] for each in terms),
-        _numbers(form.constant for form in forms),
+        array_of(each[0][1] for each in terms),
+        array_of(form.constant for form in forms),
         np.array([each[0] for each in more], dtype=np.int64),
         np.array([each[1] for each in more], dtype=np.int64),
-        _numbers(each[2] for each in more),
+        array_of(each[2] for each in more),
     )
-
-
-def _numbers(values: Iterable[float]) -> Array:
-    """An array of floats, or of objects where some know their parameters."""
-    values = list(values)
-    return np.array(values, dtype=object if any(type(each) is Known for each in values) else float)

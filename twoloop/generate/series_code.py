@@ -20,9 +20,9 @@ from twoloop.generate import llvm_code, series_groups
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import ONE, SLACK, ZERO, Emitter, Quantities
 from twoloop.generate.llvm_text import Module, Value, integer
-from twoloop.generate.series import SeriesProgram
+from twoloop.generate.series import SeriesProgram, series_program
 from twoloop.generate.series_groups import WIDTH, Group, Groups, rounded
-from twoloop.generate.straight_code import OwnCode, write_own
+from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
 from twoloop.generate.straight_line import Solution
 from twoloop.kernels.compile.caches import Newest, digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
@@ -338,7 +338,7 @@ class CompiledSeries(NamedTuple):
     functions: OwnFunctions
     code: SeriesCode
     n_factors: int  # numbers that are kept
-    numbers: Array  # what they read
+    numbers: Any  # what they read, or formulas for it
 
     def memory_size(self, order: int) -> int:
         """Length of `memory` for series of this order."""
@@ -352,16 +352,23 @@ class CompiledSeries(NamedTuple):
 _MADE = Newest()
 
 
-def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
-    """The code of a program, and of the solution of an order, compiled; its machine code is kept on disk.
+def compiled_series(code: OwnCode) -> CompiledSeries:
+    """The code of a system's program, and of the solution of an order, compiled; its machine code is kept on disk.
 
     Raises
     ------
     ValueError
         If it would take too long to compile.
     """
+    own = code.shared
+    made: CompiledSeries = own.family.remembered(("series", own.equations.choice), lambda: _compiled(own))
+    return made._replace(numbers=code.evaluate(made.numbers))
+
+
+def _compiled(own: SharedCode) -> CompiledSeries:
     from twoloop.kernels.data.common import KIT
 
+    program = series_program(own.equations.system, own.family.parameters)
     if program.n_operations > LARGEST:
         raise ValueError(
             f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
@@ -389,7 +396,7 @@ def compiled_series(program: SeriesProgram, own: OwnCode) -> CompiledSeries:
     made = _MADE.get(key)
     if made is None:
         _MADE[key] = made = own_functions("series", _stamp(), key, write)
-    return CompiledSeries(made, code, solution.n_kept, numbers.values)
+    return CompiledSeries(made, code, solution.n_kept, numbers.formulas)
 
 
 @cache

@@ -14,7 +14,7 @@ from twoloop.generate import llvm_code
 from twoloop.generate.llvm_code import SLACK, Emitter
 from twoloop.generate.llvm_text import Module, Value, integer
 from twoloop.generate.series_groups import WIDTH
-from twoloop.generate.straight_code import OwnCode, conditions_hold, results_of
+from twoloop.generate.straight_code import OwnCode, SharedCode, conditions_hold, results_of
 from twoloop.kernels.compile.caches import Newest, digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
@@ -27,7 +27,7 @@ class StageCode:
     `scratch` holds, from an aligned place on, [q, v] at the beginning of the step and [v, a] of each stage.
     """
 
-    def __init__(self, own: OwnCode, n_stages: int):
+    def __init__(self, own: SharedCode, n_stages: int):
         self.equations, self.numbers, self.n_stages = own.equations, own.numbers, n_stages
         self.n = own.equations.system.n_q
         self.blocks = -(-2 * self.n // WIDTH)
@@ -133,10 +133,11 @@ class CompiledStages(NamedTuple):
 _MADE = Newest()
 
 
-def compiled_stages(own: OwnCode, n_stages: int) -> CompiledStages:
+def compiled_stages(of_one: OwnCode, n_stages: int) -> CompiledStages:
     """The code for a mechanism and a method of so many stages, compiled; its machine code is kept on disk."""
     from twoloop.kernels.data.common import KIT
 
+    own = of_one.shared
     key, code = f"{own.digest} {n_stages}", StageCode(own, n_stages)
     parts: dict[str, Callable[..., Any]] = {
         "begin_stages": code.begin,

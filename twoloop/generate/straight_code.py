@@ -5,20 +5,21 @@ hundred of them. The code is kept on disk as that of the kernels.
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
-from functools import cache
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, straight_line
 from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.families import Family, alone, family_of
 from twoloop.generate.llvm_code import Emitter, Quantities
 from twoloop.generate.llvm_text import DOUBLE, Module, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Choice, Outputs, StraightLine
-from twoloop.generate.traced_values import Check, unchecked
+from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.compile.caches import Newest, digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
@@ -142,23 +143,27 @@ def write_function(
 _MADE = Newest()
 
 
-class OwnCode:
-    """Functions made for the equations of a system, compiled, or read from the disk.
+class SharedCode:
+    """Functions made for the equations of a family of systems, compiled, or read from the disk.
+
+    Parameters
+    ----------
+    equations : StraightLine
+    family : Family
 
     Attributes
     ----------
-    equations : StraightLine
     numbers : Coefficients
-        What they read.
+        Of the equations.
     digest : str
-        Of all that they depend on, the values of these apart.
+        Of all that the functions depend on, the values of these apart.
     functions : OwnFunctions
     projects : bool
         Whether they project, or give accelerations alone.
     """
 
-    def __init__(self, equations: StraightLine):
-        self.equations, self.numbers = equations, Coefficients()
+    def __init__(self, equations: StraightLine, family: Family):
+        self.equations, self.family, self.numbers = equations, family, Coefficients()
         structure = repr(list(_described(equations, self.numbers)))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         self.projects = equations.closer is not None and equations.nearer is not None
@@ -166,6 +171,11 @@ class OwnCode:
         if made is None:
             _MADE[self.digest] = made = own_functions("equations", _stamp(), self.digest, self._write)
         self.functions: OwnFunctions = made
+
+    def of(self, system: ConstrainedSystem) -> "OwnCode":
+        """The code and what it reads for the parameters of one of the systems."""
+        evaluate = self.family.evaluator(system.parameters)
+        return OwnCode(self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate)
 
     @property
     def inner(self) -> Dispatcher:
@@ -185,6 +195,15 @@ class OwnCode:
         return list(outputs), str(module)
 
 
+class OwnCode(NamedTuple):
+    """The code of a family, for one system."""
+
+    shared: SharedCode
+    numbers: Array  # that it reads
+    traced: Traced
+    evaluate: Callable[[Any], Array]  # what other formulas of the family are for this system
+
+
 def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:
     """The same of one that kernels know by its name."""
     from twoloop.kernels.data.common import KIT
@@ -200,13 +219,24 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
     ValueError
         If its equations cannot be had.
     """
-    try:
-        choice = system.remembered_at("choice", t0, (q0,), lambda: Choice.at(system, t0, q0))
-        made: OwnCode = system.remembered(("code", choice), lambda: OwnCode(StraightLine(system, choice)))
-        check(made.equations.traced)
-    except Untraceable as error:
-        raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
-    return made
+    families = (alone,) if system.called_in_python else (family_of, alone)
+    for family_for in families:  # a callback may do with formulas what it does not with numbers
+        try:
+            choice = system.remembered_at("choice", t0, (q0,), lambda: Choice.at(system, t0, q0))
+            make = partial(_code_of, system, family_for, choice)
+            made: OwnCode = system.remembered(("code", family_for, choice), make)
+            check(made.traced)
+            return made
+        except Untraceable as error:
+            reason = error
+    raise ValueError(f"compiled=True needs equations that can be written down; {reason}. Leave it out") from reason
+
+
+def _code_of(system: ConstrainedSystem, family_for: Callable[[ConstrainedSystem], Family], choice: Choice) -> OwnCode:
+    family = family_for(system)
+    make = partial(StraightLine, system, choice, family.parameters)
+    shared: SharedCode = family.remembered(("code", choice), lambda: SharedCode(make(), family))
+    return shared.of(system)
 
 
 def _described(equations: StraightLine, numbers: Coefficients) -> Iterable[Any]:

@@ -5,6 +5,7 @@ arguments (a global that numba froze when it compiled it) is not what it was tra
 at states spread over the time of the run and about its start, later at states of the run itself.
 """
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -62,6 +63,14 @@ class Traced:
         entries = (forms[kind][place] for kind, place in self.places)
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
+
+    def of(self, system: ConstrainedSystem, evaluate: Callable[[Any], Array]) -> "Traced":
+        """The same of another system, for whose parameters `evaluate` gives the numbers."""
+        other = copy.copy(self)
+        constants, coefficients = evaluate(self.program.constants), evaluate(self.program.coefficients)
+        other.program = self.program._replace(constants=constants, coefficients=coefficients)
+        other.name, other.trusted, other._kit = system.name, False, None
+        return other
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
         """Compare at states about the start, spread over the time of a run.

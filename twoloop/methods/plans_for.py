@@ -15,7 +15,13 @@ Plans = tuple[Plan, dict[int, Plan]]  # of steps, and of parts of steps, by kind
 
 
 def plans_for(
-    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: OwnCode | None, check: Check
+    system: ConstrainedSystem,
+    method: Method,
+    rtol: float,
+    atol: float,
+    fixed: bool,
+    code: OwnCode | None,
+    check: Check,
 ) -> Plans:
     """The plans of a run.
 
@@ -24,7 +30,7 @@ def plans_for(
     ValueError
         If the method cannot run the system, or does not go with code made for it.
     """
-    key = (id(method), rtol, atol, fixed, None if code is None else code.equations.choice)
+    key = (id(method), rtol, atol, fixed, None if code is None else code.shared.equations.choice)
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
     made = kept.get(key)
     if made is None:
@@ -58,11 +64,11 @@ def _made(
         raise ValueError(
             f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{constant}"
         )
-    plan = replace(_with_code(plan, code), traced=(*plan.traced, code.equations.traced))
+    plan = replace(_with_code(plan, code), traced=(*plan.traced, code.traced))
     if plan.substitute is not None:
         plan = replace(plan, substitute=_with_code(plan.substitute, code))
     return plan, interiors
 
 
 def _with_code(plan: Plan, code: OwnCode) -> Plan:
-    return replace(plan, inner=code.inner, own=(code.functions, *plan.own), numbers=code.numbers.values)
+    return replace(plan, inner=code.shared.inner, own=(code.shared.functions, *plan.own), numbers=code.numbers)

@@ -138,7 +138,7 @@ class Taylor:
         interior = replace(plan, options=kept, memory=plan.memory.copy())
         if self.code is None:
             return replace(plan, interior=interior)
-        code = compiled_series(program, self.code)
+        code = compiled_series(self.code)
         options = plan.options.copy()
         options[series.N_FACTORS] = code.n_factors
         return replace(

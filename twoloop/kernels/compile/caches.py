@@ -83,10 +83,10 @@ def compile_kept(
     return dispatcher
 
 
-class Newest(dict[str, Any]):
+class Newest(dict[Any, Any]):
     """What was made for single mechanisms, by digests: the newest MOST_HELD, as a sweep makes one for each run."""
 
-    def __setitem__(self, key: str, made: Any) -> None:
+    def __setitem__(self, key: Any, made: Any) -> None:
         super().__setitem__(key, made)
         for old in list(self)[:-MOST_HELD]:
             self.pop(old, None)

@@ -1,0 +1,99 @@
+"""What is traced of callbacks once, for all systems that share them: numbers in it are formulas in the parameters.
+
+Parameters that are whole numbers stay what they are, as these may be counts, places or switches, and zeros and ones
+leave operations out; what is equal, but for its sign, stays equal. So systems of one family differ in other numbers.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.known_numbers import Record
+from twoloop.kernels.compile.caches import Newest
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+APART = 0.03  # of a parameter, at most: how far the generic one that takes its place in what is traced is from it
+
+_FAMILIES = Newest()
+
+
+class Family:
+    """What is made of the callbacks of some systems.
+
+    Parameters
+    ----------
+    parameters : ndarray (n_p,)
+        Of one of the systems.
+    classes : sequence of int
+        Which of its numbers each parameter is, from 1 on, negative for a negative one; 0: it stays what it is.
+
+    Attributes
+    ----------
+    parameters : ndarray of float and Known (n_p,)
+        With which callbacks are traced.
+    """
+
+    def __init__(self, parameters: Array, classes: Sequence[int]):
+        self._classes = np.array(classes, dtype=np.int64)
+        numbers = self.numbers(parameters)
+        away = np.random.default_rng(7).uniform(-APART, APART, len(numbers))
+        self._record = Record((numbers * (1.0 + away)).tolist(), range(len(numbers)))
+        self.parameters = parameters.astype(object)
+        for place in np.flatnonzero(self._classes).tolist():
+            which = int(self._classes[place])
+            known = self._record.parameters[abs(which) - 1]
+            self.parameters[place] = known if which > 0 else -known
+        self._made: dict[Any, Any] = {}
+
+    def numbers(self, parameters: Array) -> Array:
+        """The numbers, one for each class, of a system's parameters."""
+        _, first = np.unique(np.abs(self._classes), return_index=True)
+        return np.abs(parameters[first[self._classes[first] != 0]])
+
+    def evaluator(self, parameters: Array) -> Callable[[Any], Array]:
+        """A function that gives arrays of numbers, some of which may be formulas, for a system's parameters."""
+        value = self._record.on(self.numbers(parameters))
+
+        def evaluate(array: Any) -> Array:
+            if array.dtype != object:
+                return array
+            with np.errstate(all="ignore"):
+                return np.array([value(each) for each in array.ravel()], dtype=np.float64).reshape(array.shape)
+
+        return evaluate
+
+    def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
+        """What `make` makes of the callbacks, once."""
+        if what not in self._made:
+            self._made[what] = make()
+        return self._made[what]
+
+
+def family_of(system: ConstrainedSystem) -> Family:
+    """The family of a system of compiled callbacks: what others find around them may change."""
+    parameters = system.parameters
+    classes = _classes(parameters.tolist())
+    fixed = [x for x, which in zip(parameters.tolist(), classes, strict=True) if which == 0]
+    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, *classes, *fixed)
+    known: Family | None = _FAMILIES.get(key)
+    if known is None:
+        _FAMILIES[key] = known = Family(parameters, classes)
+    return known
+
+
+def alone(system: ConstrainedSystem) -> Family:
+    """A family of a system with these parameters only, all of which are plain numbers."""
+    return Family(system.parameters, [0] * system.parameters.size)
+
+
+def _classes(parameters: Sequence[float]) -> list[int]:
+    known: dict[float, int] = {}
+    classes = []
+    for x in parameters:
+        which = 0 if x.is_integer() else known.setdefault(abs(x), len(known) + 1)
+        classes.append(which if x > 0.0 else -which)
+    return classes
