@@ -76,7 +76,7 @@ def run_from(system, q0, v0, compiled):
     plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
     if compiled:
         own = own_code(system, 0.0, q0)
-        plan = replace(plan, inner=own.inner, own=(own.functions,), numbers=own.numbers.values)
+        plan = replace(plan, inner=own.shared.inner, own=(own.shared.functions,), numbers=own.numbers)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
 
 
