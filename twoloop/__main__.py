@@ -87,7 +87,7 @@ def solve(given: argparse.Namespace) -> None:
         method=given.method,
         rtol=given.rtol,
         atol=given.atol,
-        compiled=given.compiled,
+        compiled=given.compiled or "auto",
         progress=sys.stderr.isatty(),
     )
     counts = result.stats
@@ -131,7 +131,9 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--method", default="auto", choices=list(PRESETS), metavar="NAME", help=", ".join(PRESETS))
     one.add_argument("--rtol", type=float, default=1e-8, help="default: 1e-8")
     one.add_argument("--atol", type=float, default=1e-8, help="default: 1e-8")
-    one.add_argument("--compiled", action="store_true", help="make machine code of the equations first")
+    one.add_argument(
+        "--compiled", action="store_true", help="make machine code of the equations, of large mechanisms too"
+    )
     one.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     one.add_argument("--out", nargs="+", default=[], metavar="FILE", help=f"files, by ending: {', '.join(ENDINGS)}")
     return made

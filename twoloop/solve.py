@@ -23,9 +23,9 @@ from twoloop.checks.arguments import (
 from twoloop.checks.consistency import check_start
 from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
-from twoloop.generate.straight_code import own_code
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.layout import give_back
+from twoloop.methods.code_for import Compiled, check_compiled, code_for
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import PRESETS
@@ -61,7 +61,7 @@ def solve_dae(
     progress: bool | None = None,
     time_limit: float | None = None,
     check_derivatives: bool = True,
-    compiled: bool = False,
+    compiled: Compiled = "auto",
 ) -> Result:
     """Integrate a constrained mechanical system by a two-loop procedure.
 
@@ -124,12 +124,13 @@ def solve_dae(
         Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
         tangents at a few states of runs with exact derivatives, or with differences where callbacks do not run on
         symbols; of a system of compiled callbacks in runs that go where none has been, and the 2nd, 4th, 8th, ....
-    compiled : bool
+    compiled : bool or "auto"
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
         "DOP853" and "Adams": two to eight times as fast, after 0.1 to 6 s, which grow with the mechanism, once for
-        equations of the same structure, as the code is kept on disk and reads its numbers. For other parameters the
-        equations are only written down again, in hundredths of a second for a planar linkage. The callbacks must not
+        equations of the same structure, as the code is kept on disk and reads its numbers. The callbacks must not
         branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.
+        "auto" (default): for small mechanisms with compiled callbacks, whose code takes up to a third of a second. This
+        depends on the mechanism and the method alone: the same call gives the same numbers whatever ran before.
 
     Returns
     -------
@@ -147,7 +148,7 @@ def solve_dae(
     event_functions = None if events is None else check_events(events)
     if progress is not None:
         check_flag("progress", progress)
-    check_flag("compiled", compiled)
+    compiled = check_compiled(compiled)
     check_flag("check_derivatives", check_derivatives)
     chosen = check_method(method)
     t0, t1 = check_span(t_span)
@@ -194,8 +195,9 @@ def solve_dae(
 
         given = system
         system, derived = standing_for(given, check)
-        code = own_code(system, t0, q0, check) if compiled else None
-        plan, interiors = plans_for(system, chosen, float(rtol), float(atol.min()), step_size is not None, code, check)
+        fixed = step_size is not None
+        code = code_for(system, chosen, fixed, compiled, t0, q0, check)
+        plan, interiors = plans_for(system, chosen, float(rtol), float(atol.min()), fixed, code, check)
         if derived:
             plan = replace(plan, traced=(*plan.traced, *derived))
         run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)

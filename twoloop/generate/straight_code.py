@@ -234,8 +234,11 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
 
 def _code_of(system: ConstrainedSystem, family_for: Callable[[ConstrainedSystem], Family], choice: Choice) -> OwnCode:
     family = family_for(system)
-    make = partial(StraightLine, system, choice, family.parameters)
-    shared: SharedCode = family.remembered(("code", choice), lambda: SharedCode(make(), family))
+
+    def make() -> SharedCode:
+        return SharedCode(StraightLine(system, choice, family.parameters), family)
+
+    shared: SharedCode = family.remembered(("code", choice), make)
     return shared.of(system)
 
 

@@ -1,0 +1,67 @@
+"""Which runs get code made for their mechanism: those that ask for it, and of small ones where it is left open."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import shown
+from twoloop.generate.series import series_program
+from twoloop.generate.straight_code import OwnCode, own_code
+from twoloop.generate.traced_values import Check
+from twoloop.generate.tracing import Untraceable
+from twoloop.methods.plan import Method
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+Compiled = bool | Literal["auto"]
+
+WITH_CODE = ("auto", "Taylor", "DOP853", "Adams")
+SMALL = 80  # operations of the series of its motion: the code takes up to a third of a second to build
+
+
+def check_compiled(value: Compiled) -> Compiled:
+    """Return `value`, or say what it must be."""
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, str) and value == "auto":
+        return value
+    raise (ValueError if isinstance(value, str) else TypeError)(
+        f"compiled must be True, False or 'auto'; given {shown(value)} of type {type(value).__name__}"
+    )
+
+
+def code_for(
+    system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled, t0: float, q0: Array, check: Check
+) -> OwnCode | None:
+    """The code for a run, if it gets any.
+
+    What is left open depends on the system and the method alone, so that the same call gives the same numbers whatever
+    ran before it.
+
+    Raises
+    ------
+    ValueError
+        If code is asked for and cannot be had.
+    """
+    if compiled is True:
+        return own_code(system, t0, q0, check)
+    if compiled is False or fixed or method.name not in WITH_CODE or not is_small(system):
+        return None
+    try:
+        return own_code(system, t0, q0, check)
+    except ValueError:
+        return None
+
+
+def is_small(system: ConstrainedSystem) -> bool:
+    """Whether its callbacks are compiled, run on symbols, and make few operations."""
+
+    def look() -> bool:
+        try:
+            n_operations: int = system.remembered("series", lambda: series_program(system)).n_operations
+        except Untraceable:
+            return False
+        return n_operations <= SMALL
+
+    return not system.called_in_python and bool(system.remembered("small", look))
