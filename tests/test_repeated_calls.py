@@ -11,7 +11,7 @@ import pytest
 from tests.problems import pendulum
 from twoloop import ConstraintWarning, mechanisms, solve_dae
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
-from twoloop.generate.families import alone
+from twoloop.generate.families import family_of
 from twoloop.generate.straight_code import SharedCode
 from twoloop.generate.straight_line import Choice, StraightLine
 from twoloop.generate.traced_values import unchecked
@@ -157,7 +157,9 @@ def test_a_plan_is_that_of_the_choice_of_its_code():
     choice = Choice.at(problem.system, 0.0, problem.q0)
     numbers = []
     for each in (choice, replace(choice, least=10.0 * choice.least), choice):
-        code = SharedCode(StraightLine(problem.system, each), alone(problem.system)).of(problem.system)
+        family = family_of(problem.system)
+        shared = SharedCode(StraightLine(problem.system, each, family.parameters), family)
+        code = shared.of(problem.system, family.evaluator(problem.system.parameters))
         code.traced.trusted = True
         plan, _ = plans_for(problem.system, PRESETS["DOP853"], 1e-6, 1e-6, False, code, unchecked)
         numbers.append(plan.numbers)

@@ -1,14 +1,15 @@
 """What C_q, C_t and Gamma must be, exactly: to be compared with what is given, by no differences."""
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.scales import sizes
+from twoloop.generate.families import Family, of_family
 from twoloop.generate.traced_equations import OF_ROWS, Equations
-from twoloop.generate.traced_values import Traced
+from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem
 
@@ -19,40 +20,43 @@ NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
 TIME = 0.1  # s
 
 
-def exact_derivatives(system: ConstrainedSystem) -> Traced | None:
+def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
     """What the callbacks of a system should give, by those that they are derivatives of.
 
-    None: there are no constraints or too many, or they cannot be traced.
+    None: there are no constraints or too many, or they cannot be traced, or `check` refuses what they were traced to.
     """
     if system.n_q * (system.n_c + system.n_a) > MOST:
         return None
-    made: Traced | None = system.remembered("derivatives", lambda: _made(system))
+    try:
+        made: Traced = of_family(system, "derivatives", partial(_traced, system), check)
+    except Untraceable:
+        return None
     return made
 
 
-def _made(system: ConstrainedSystem) -> Traced | None:
-    equations = Equations(system)
+def _traced(system: ConstrainedSystem, family: Family) -> Traced:
+    equations = Equations(system, family.parameters)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
-    try:
-        forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
-        # of which the others are derivatives, if they are what they were traced to
-        forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
-    except Untraceable:
-        return None
+    forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
+    # of which the others are derivatives, if they are what they were traced to
+    forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return Traced(system, equations.graph, forms)
 
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to."""
-    made = exact_derivatives(system)
-    if made is None:
-        return False
     places = [(t + share * TIME, q + share * _factors(1, len(q))[0] * sizes(q)) for share in NEAR]
-    try:
-        with np.errstate(all="ignore"):
-            return made.wrong(system, generic_states([(*place, v) for place in places])) is None
-    except Exception:  # outside what the callbacks are made for
-        return False
+
+    def check(made: Traced) -> None:
+        try:
+            with np.errstate(all="ignore"):
+                wrong = made.wrong(system, generic_states([(*place, v) for place in places]))
+        except Exception as error:  # outside what the callbacks are made for
+            raise Untraceable(str(error)) from error
+        if wrong is not None:
+            raise Untraceable(wrong)
+
+    return exact_derivatives(system, check) is not None
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:

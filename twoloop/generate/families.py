@@ -5,16 +5,19 @@ leave operations out; what is equal, but for its sign, stays equal. So systems o
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.known_numbers import Record
+from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.caches import Newest
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
+Evaluator = Callable[[Any], Array]  # of an array of numbers, some of which may be formulas, for one system
 
 APART = 0.03  # of a parameter, at most: how far the generic one that takes its place in what is traced is from it
 
@@ -54,8 +57,8 @@ class Family:
         _, first = np.unique(np.abs(self._classes), return_index=True)
         return np.abs(parameters[first[self._classes[first] != 0]])
 
-    def evaluator(self, parameters: Array) -> Callable[[Any], Array]:
-        """A function that gives arrays of numbers, some of which may be formulas, for a system's parameters."""
+    def evaluator(self, parameters: Array) -> Evaluator:
+        """What evaluates formulas for a system's parameters."""
         value = self._record.on(self.numbers(parameters))
 
         def evaluate(array: Any) -> Array:
@@ -73,6 +76,39 @@ class Family:
         return self._made[what]
 
 
+def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any], check: Callable[[Any], None]) -> Any:
+    """What `make` makes of the callbacks of a family, for one of its systems: what its method `of` gives.
+
+    Where it cannot be traced with formulas, or `check` refuses it (a callback may do with these what it does not with
+    numbers), the system gets a family of its own.
+
+    Raises
+    ------
+    Untraceable
+        If it cannot be made of the system, or is refused.
+    """
+    for family_for in (_alone,) if system.called_in_python else (family_of, _alone):
+        family = system.remembered(("family", family_for), partial(family_for, system))
+        made = system.remembered((what, family_for), partial(_made_for, system, family, what, make))
+        try:
+            if isinstance(made, Untraceable):
+                raise made
+            check(made)
+            return made
+        except Untraceable as error:
+            reason = error
+    raise reason
+
+
+def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callable[[Family], Any]) -> Any:
+    """What a system gets of a family, or why it cannot be had."""
+    try:
+        shared = family.remembered(what, partial(make, family))
+    except Untraceable as error:
+        return error.with_traceback(None)
+    return shared.of(system, system.remembered(("numbers", family), partial(family.evaluator, system.parameters)))
+
+
 def family_of(system: ConstrainedSystem) -> Family:
     """The family of a system of compiled callbacks: what others find around them may change."""
     parameters = system.parameters
@@ -85,7 +121,7 @@ def family_of(system: ConstrainedSystem) -> Family:
     return known
 
 
-def alone(system: ConstrainedSystem) -> Family:
+def _alone(system: ConstrainedSystem) -> Family:
     """A family of a system with these parameters only, all of which are plain numbers."""
     return Family(system.parameters, [0] * system.parameters.size)
 

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.known_numbers import array_of
 from twoloop.generate.traced_equations import Equations
-from twoloop.generate.traced_values import Traced
+from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE
 from twoloop.problem.system import ConstrainedSystem
@@ -89,10 +90,40 @@ class SeriesProgram:
         """Number of operations, products of G v and G^T lam + M a among them."""
         return len(self.early.first.column) + len(self.late.first.column)
 
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
+        """The program for a system of the family, with numbers in the place of formulas."""
+
+        def sums(given: Sums) -> Sums:
+            coefficient, constant = evaluate(given.coefficient), evaluate(given.constant)
+            more_coefficient = evaluate(given.more_coefficient)
+            return given._replace(coefficient=coefficient, constant=constant, more_coefficient=more_coefficient)
+
+        early, late = (Table(each.groups, sums(each.first), sums(each.second)) for each in (self.early, self.late))
+        rows, balance = sums(self.rows), sums(self.balance)
+        assert self.traced is not None
+        traced = self.traced.of(system, evaluate)
+        return replace(self, early=early, late=late, rows=rows, balance=balance, traced=traced)
+
     @property
     def n_nodes(self) -> int:
         """Number of quantities."""
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
+
+
+def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:
+    """The program of a system, by its family; `check` raises where the callbacks are not in it.
+
+    Raises
+    ------
+    Untraceable
+        As of `series_program`.
+    """
+
+    def make(family: Family) -> SeriesProgram:
+        return series_program(system, family.parameters)
+
+    made: SeriesProgram = of_family(system, "series", make, lambda program: check(program.traced))
+    return made
 
 
 def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesProgram:

@@ -368,7 +368,8 @@ def compiled_series(code: OwnCode) -> CompiledSeries:
 def _compiled(own: SharedCode) -> CompiledSeries:
     from twoloop.kernels.data.common import KIT
 
-    program = series_program(own.equations.system, own.family.parameters)
+    system, family = own.equations.system, own.family
+    program = family.remembered("series", lambda: series_program(system, family.parameters))
     if program.n_operations > LARGEST:
         raise ValueError(
             f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "

@@ -5,8 +5,8 @@ hundred of them. The code is kept on disk as that of the kernels.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, straight_line
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.families import Family, alone, family_of
+from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.llvm_code import Emitter, Quantities
 from twoloop.generate.llvm_text import DOUBLE, Module, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
@@ -172,9 +172,8 @@ class SharedCode:
             _MADE[self.digest] = made = own_functions("equations", _stamp(), self.digest, self._write)
         self.functions: OwnFunctions = made
 
-    def of(self, system: ConstrainedSystem) -> "OwnCode":
-        """The code and what it reads for the parameters of one of the systems."""
-        evaluate = self.family.evaluator(system.parameters)
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "OwnCode":
+        """The code, and what it reads for one of the systems."""
         return OwnCode(self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate)
 
     @property
@@ -201,7 +200,7 @@ class OwnCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # that it reads
     traced: Traced
-    evaluate: Callable[[Any], Array]  # what other formulas of the family are for this system
+    evaluate: Evaluator  # of other formulas of the family
 
 
 def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:
@@ -219,27 +218,16 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
     ValueError
         If its equations cannot be had.
     """
-    families = (alone,) if system.called_in_python else (family_of, alone)
-    for family_for in families:  # a callback may do with formulas what it does not with numbers
-        try:
-            choice = system.remembered_at("choice", t0, (q0,), lambda: Choice.at(system, t0, q0))
-            make = partial(_code_of, system, family_for, choice)
-            made: OwnCode = system.remembered(("code", family_for, choice), make)
-            check(made.traced)
-            return made
-        except Untraceable as error:
-            reason = error
-    raise ValueError(f"compiled=True needs equations that can be written down; {reason}. Leave it out") from reason
+    try:
+        choice = system.remembered_at("choice", t0, (q0,), lambda: Choice.at(system, t0, q0))
 
+        def make(family: Family) -> SharedCode:
+            return SharedCode(StraightLine(system, choice, family.parameters), family)
 
-def _code_of(system: ConstrainedSystem, family_for: Callable[[ConstrainedSystem], Family], choice: Choice) -> OwnCode:
-    family = family_for(system)
-
-    def make() -> SharedCode:
-        return SharedCode(StraightLine(system, choice, family.parameters), family)
-
-    shared: SharedCode = family.remembered(("code", choice), make)
-    return shared.of(system)
+        made: OwnCode = of_family(system, ("code", choice), make, lambda code: check(code.traced))
+    except Untraceable as error:
+        raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
+    return made
 
 
 def _described(equations: StraightLine, numbers: Coefficients) -> Iterable[Any]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.scales import sizes
+from twoloop.generate.families import Evaluator
 from twoloop.generate.programs import program_of
 from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.kernels.compile.linking import direct
@@ -64,8 +65,8 @@ class Traced:
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
 
-    def of(self, system: ConstrainedSystem, evaluate: Callable[[Any], Array]) -> "Traced":
-        """The same of another system, for whose parameters `evaluate` gives the numbers."""
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
+        """The same of another system of the family."""
         other = copy.copy(self)
         constants, coefficients = evaluate(self.program.constants), evaluate(self.program.coefficients)
         other.program = self.program._replace(constants=constants, coefficients=coefficients)

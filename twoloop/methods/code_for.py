@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import shown
-from twoloop.generate.series import series_program
+from twoloop.generate.series import series_for
 from twoloop.generate.straight_code import OwnCode, own_code
 from twoloop.generate.traced_values import Check
 from twoloop.generate.tracing import Untraceable
@@ -56,12 +56,9 @@ def code_for(
 
 def is_small(system: ConstrainedSystem) -> bool:
     """Whether its callbacks are compiled, run on symbols, and make few operations."""
-
-    def look() -> bool:
-        try:
-            n_operations: int = system.remembered("series", lambda: series_program(system)).n_operations
-        except Untraceable:
-            return False
-        return n_operations <= SMALL
-
-    return not system.called_in_python and bool(system.remembered("small", look))
+    if system.called_in_python:
+        return False
+    try:
+        return series_for(system).n_operations <= SMALL
+    except Untraceable:
+        return False

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_size
-from twoloop.generate.series import SeriesProgram, series_program
+from twoloop.generate.series import SeriesProgram, series_for
 from twoloop.generate.series_code import compiled_series
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
@@ -97,8 +97,7 @@ class Taylor:
             If its callbacks do not run on symbols, or `check` finds that they give something else.
         """
         try:
-            program = system.remembered("series", lambda: series_program(system))
-            check(program.traced)
+            program = series_for(system, check)
         except Untraceable as error:
             raise ValueError(
                 f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
