@@ -104,8 +104,7 @@ def sweep(
         Of all runs, s. None: that of each problem.
     **options
         Of `solve_dae`: method, rtol, t_eval, events, time_limit, ... With check_derivatives=False, once the derivatives
-        are known to be right, short runs take a little less time. compiled=True compiles once for all parameters, and
-        writes the equations down for each, which takes hundredths of a second for a planar linkage.
+        are known to be right, short runs take a little less time.
 
     Returns
     -------
