@@ -27,6 +27,7 @@ RANKED = (
     *("violation_q", "violation_v", "energy"),
 )
 FEWEST = 3  # repetitions that an interval asks for
+NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
@@ -204,6 +205,19 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
                 drawn[:] = np.nan
             found[str(solver)] = float(_cost(costs, place)), _cost(drawn, place)
     return found
+
+
+def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
+    """The runs of one case that miss an error by a factor of less than NEARLY, on the motion of the reference."""
+    errors = _errors(rows)
+    return rows[(errors > target) & (errors <= NEARLY * target) & ~astray(rows) & rows["call_s"].notna()]
+
+
+def near_misses(rows: pd.DataFrame, target: float) -> Costs:
+    """What the runs take that miss an error by little, each run by itself."""
+    runs = nearly_there(rows, target)
+    costs = zip(runs["call_s"].astype(float), resampled(runs), strict=True)
+    return {f"near miss {k}": cost for k, cost in enumerate(costs)}
 
 
 def _least(side: Costs) -> tuple[float, Array]:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench import tables
+from studies.bench import headline, tables
 from studies.bench.render import number, render
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
 from studies.bench.store import KeptRows
@@ -231,3 +231,29 @@ def test_sentences_of_the_goals_follow_the_findings():
     asked_less = beam | {"ahead": False, "ida_unasked": [1e-4]}
     assert "**Undecided**: ahead of IDA" in stated(1.0, goals=made | {"stiff": [asked_less]})
     assert "none of ours gets there" in stated(1.0, goals=made | {"long": long | {"call_s": None}})
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "near_us", "near_them", "verdict"),
+    [
+        (1.0, 2.0, None, None, "ahead"),
+        (1.0, 2.0, None, (1.2, 1.9), "ahead"),  # nearly there, and slower as well
+        (1.0, 2.0, None, (1.2, 0.9), "undecided"),
+        (1.0, 2.0, None, (1.2, 1.0), "undecided"),  # as fast
+        (1.0, 2.0, None, (1.3, 0.1), "ahead"),  # too far from the error
+        (1.0, 2.0, (1.2, 0.1), (1.2, 0.9), "undecided"),  # the winner's own near misses do not count
+        (2.0, 1.0, None, None, "behind"),
+        (2.0, 1.0, (1.2, 1.9), None, "behind"),
+        (2.0, 1.0, (1.2, 0.9), None, "undecided"),
+        (2.0, 1.0, (1.3, 0.1), None, "behind"),
+        (None, 1.0, (1.2, 0.1), None, "missed"),
+    ],
+)
+def test_a_win_and_a_loss_hold_against_near_misses_too(ours, theirs, near_us, near_them, verdict):
+    error, lines = 1e-6, []
+    for solver, family, good, near in (("auto", "two-loop", ours, near_us), ("heyoka", "heyoka", theirs, near_them)):
+        runs = [(0.01, good)] if good else []  # more than a decade better: nothing is interpolated
+        runs += [(near[0], near[1])] if near else []
+        lines += [(solver, family, "compiled", times * error, seconds) for times, seconds in runs]
+    found = headline.of_error(rows(*lines), error)
+    assert found["auto"]["verdict"] == found[headline.BEST]["verdict"] == verdict
