@@ -142,8 +142,9 @@ def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
 
 def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] | None:
     """The cheapest run that misses an error by little and takes much less time than one that does not."""
-    missing = tables.nearly_there(runs, error)
-    if missing.empty:
+    near = tables.nearly_there(runs, error)
+    near = near[CHEAPER * near["call_s"] < call_s]
+    if near.empty:
         return None
-    run = missing.loc[missing["call_s"].astype(float).idxmin()]
-    return {"error": float(run["error_q"]), "call_s": float(run["call_s"])} if CHEAPER * run["call_s"] < call_s else None
+    run = near.loc[near["call_s"].astype(float).idxmin()]
+    return {"error": float(run["error_q"]), "call_s": float(run["call_s"])}

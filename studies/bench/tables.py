@@ -380,11 +380,3 @@ def failures(rows: pd.DataFrame) -> list[list[str]]:
         if [row["solver"], setting, status, message] not in lines:
             lines.append([row["solver"], setting, status, message])
     return lines
-
-
-def unfinished(rows: pd.DataFrame) -> list[str]:
-    """ "solver (setting, setting)" of the runs that did not reach the end, for a sentence; the CSV has the messages."""
-    settings: dict[str, list[str]] = {}
-    for solver, setting, *_ in failures(rows):
-        settings.setdefault(solver, []).append(setting)
-    return [f"{solver} ({', '.join(dict.fromkeys(each))})" for solver, each in settings.items()]

@@ -119,7 +119,7 @@ def energy(**changed):
 
 def screen(tmp_path, cases=(), standings=None, **others):
     found = {"cases": list(cases), "default": "SunRadau5"}
-    put = {"n": 21, "least": 8, "all": 3, "mechanisms": 23, "counts": 1.05}
+    put = {"n": 21, "least": 8, "all": 3, "mechanisms": 23, "counts": 1.05, "nearly": 1.25}
     found |= {"rivals": {"standings": standings, "put": put}} if standings else {}
     for path in tmp_path.glob("*.json"):
         path.unlink()
@@ -264,7 +264,6 @@ def test_classes_come_in_their_order_and_the_long_one_from_the_energy():
 
 TABLE3 = {"one_constant": False, "irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0]}
 VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a", "d"], "only_others": [], "none_right": ["b", "c"]}
-VALID["misses"] = {"inexact": 2, "wrong": 4, "said so": 0, "not run": 1, "limit": 3}
 VALID |= {"n_singular": 0, "n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
 
 
@@ -278,10 +277,7 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert (
-        "right on 17, only ours on 2, only others on 0, none on 2. Runs of others where only ours are right: 2" in text
-    )
-    assert "ours are right: 2 inexact, 4 wrong, 3 stopped by our time limit, 1 not run. Wrong runs" in text
+    assert "right on 17, only ours on 2, only others on 0, none on 2. Wrong runs" in text
     assert "1 of 500 of ours, 57 of 300 of others" in text
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
     planted = {
