@@ -75,9 +75,6 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     largest = runs[runs["error_tip"].notna()].groupby("solver")[["error_tip", "floor"]].max()
     found["unresolved"] = sorted(str(solver) for solver in largest.index[largest["error_tip"] <= largest["floor"]])
     found |= _longest_step(ranked, w_max)
-    best = [None if line["best"] is None else line["best"]["solver"] for line in found["at"]]
-    found["one_best"] = best[0] is not None and len(set(best)) == 1
-    found["newmark"] = newmark_over_paper(runs)
     changes = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
     below_mesh = [error for error in TARGETS if error < changes[MESH]]
     return found | {"changes": changes.to_dict(), "below_mesh": below_mesh}
@@ -96,23 +93,6 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     if PAPER in seconds:
         found["paper_over_best"] = seconds[PAPER] / min(seconds.values())
     return found
-
-
-def newmark_over_paper(runs: pd.DataFrame) -> dict[str, Any]:
-    """Time of the paper's Newmark procedures over that of its Runge-Kutta procedure, and what each then errs by.
-
-    Of each the cheapest run counts that is at least as good as an error. Runge-Kutta has none as bad, as its steps are
-    short for another reason: `apart` says whether its loosest run errs by less than a tenth of any of Newmark's.
-    """
-    paper, halves = (runs[runs["solver"].isin(names)] for names in ((PAPER,), (NEWMARK, QUARTER)))
-    over = {error: tables.as_good(halves, error) / tables.as_good(paper, error) for error in TARGETS}
-    least, loosest = (float(x) for x in (halves["error_tip"].min(), paper["error_tip"].max()))
-    return {
-        "at": [{"error": error, "over": ratio} for error, ratio in over.items() if np.isfinite(ratio)],
-        "loosest": loosest,
-        "apart": bool(10.0 * loosest < least),
-        "all_better": bool(halves["error_tip"].max() <= min(TARGETS)),
-    }
 
 
 def _longest_step(runs: pd.DataFrame, w_max: float) -> dict[str, Any]:

@@ -63,7 +63,6 @@ OTHERS = (
 # for seconds: no quick runs
 COMPILED = (OWN_CODE, HEYOKA, CVODE_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")
 DRAWN = (DEFAULT, OWN_CODE, NEWMARK, IRK_LINE, OWN_EXPLICIT, TAYLOR, HEYOKA, CVODE_C, IDA_C)
-LISTED = (*DRAWN[:4], "SunRadau5", *DRAWN[4:], ADAMS, "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
@@ -289,7 +288,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """The tables of the report, of which the times are printed, too."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(_compared(first), TARGETS, LISTED)]
+    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(_compared(first), TARGETS, DRAWN)]
     ready = {"work": table(["solver", *map(power, TARGETS)], costs), "counts": counts(first)}
     for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         ready[name] = grid(first, group)

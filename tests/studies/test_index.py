@@ -191,11 +191,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     said = "None of 150 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-12, misleads "
     assert said in front(tmp_path, [case()], **told)
     text = screen(tmp_path, [case()], **told)
-    assert said in text and "on 2 mechanisms, with parameters not used during development (*held out*)" in text
-    assert "used (*first*), and on 20 other traps ([honesty]" in text
-    assert "| `auto`, the default | 30 | 1 | 0 | 50 | 0 | 0 |\n| `auto, compiled` | 30 | 1 | 3 | 50 | 3 | 0 |\n" in text
-    assert "| SciPy's LSODA and BDF | 30 | 1 | 4 | 50 | 4 | 0 |\n" in text
-    assert "In 2 of the runs of `auto` the integrator stepped over a 1 ms pulse. `auto, compiled` was run under" in text
+    assert said in text
     old = {name: {"n": 30, "wrong": 1, "unasked": 0, "gross": 1} for name in ("default", "compiled", "ours", "others")}
     assert "**Trust**" not in screen(tmp_path, [case()], honesty=honesty | {"held_out": {"trust": old}})
     assert "**Trust**" not in front(tmp_path, [case()])
@@ -284,15 +280,12 @@ def test_what_can_be_trusted_is_counted(tmp_path):
         "n": 73,
         "missed": ["x"],
         "by": by,
-        "mutants": {"n": 40, "seen": 33, "kernels": {"adams": {}, "bdf": {}}},
     }
     text = screen(tmp_path, planted_errors=planted)
-    assert (
-        "- Of 73 faults that we planted in models, solvers and reports `solve_dae` itself refuses or stops 20; " in text
+    said = (
+        "- Of 73 faults that we planted in models, solvers and reports `solve_dae` itself refuses or stops 20; no check"
     )
-    assert "30 show only against a known motion; 2 by too many evaluations" in text
-    assert "20 are caught by our test suite; no check of those run catches 1: x. Of 40 random changes to" in text
-    assert "the kernels of adams and bdf our tests see 33. [Planted errors]" in text
+    assert f"{said} of those run catches 1: x ([planted errors](planted_errors.md))." in text
 
 
 def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):

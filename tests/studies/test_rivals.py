@@ -199,7 +199,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
             4.0,
             [
                 "**Missed**: our best nowhere",
-                "behind in 10 pairs and in 1 below that (of all these in 11 behind `heyoka`)",
+                "behind in 10 pairs and in 1 below that (mostly `heyoka`, 11)",
             ],
             ["**Reached**: our"],
         ),
