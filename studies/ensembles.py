@@ -30,9 +30,11 @@ TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
-LOOKS = {  # the solver, and its family, whose colour and marker each has in all figures
-    ENSEMBLE: ("Taylor, compiled", "two-loop"),
-    SINGLE: ("auto, compiled", "two-loop"),
+LOOKS: dict[
+    str, tuple[str, str, bool]
+] = {  # whose colour and marker each has: solver, family, whether it keeps the constraints
+    ENSEMBLE: ("Taylor, compiled", "two-loop", True),
+    SINGLE: ("auto, compiled", "two-loop", True),
     HEYOKA: ("heyoka", "heyoka", False),
     DIFFRAX: ("Dopri8, diffrax", "diffrax", False),
 }

@@ -177,7 +177,6 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
         "fewer": sum(not tables.missed(own, 0.0) for own in put),
         "far": adaptive.FAR,
         "running": adaptive.RUNNING,
-        "outclassed": adaptive.OUTCLASSED,
         "limit": rivals.TIME_LIMIT,
     }
 

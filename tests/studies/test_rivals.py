@@ -182,7 +182,7 @@ def stated(own, heyoka=2.0, python=9.0, **changed):
         "rivals": rivals.findings_of(table),
     }
     found |= {"goals": goals.findings_of([], table.assign(case="other"), table)}
-    found |= {"asked": {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "outclassed": 10.0, "limit": 1.0}}
+    found |= {"asked": {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "limit": 1.0}}
     return render("work_precision", found | changed, {}, stamp="", quick=False)
 
 
