@@ -30,7 +30,15 @@ TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
-OWN, WAYS = (ENSEMBLE, SINGLE), (ENSEMBLE, SINGLE, HEYOKA, DIFFRAX)
+LOOKS: dict[
+    str, tuple[str, str, bool]
+] = {  # whose colour and marker each has: solver, family, whether it keeps the constraints
+    ENSEMBLE: ("Taylor, compiled", "two-loop", True),
+    SINGLE: ("auto, compiled", "two-loop", True),
+    HEYOKA: ("heyoka", "heyoka", False),
+    DIFFRAX: ("Dopri8, diffrax", "diffrax", False),
+}
+OWN, WAYS = (ENSEMBLE, SINGLE), tuple(LOOKS)
 LINKAGES = "random four-bar linkages"
 STARTS = {  # mechanisms whose runs differ by their velocities at the start, and how long they run
     "andrews": 0.03,
@@ -239,20 +247,19 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """CPU time of a run over the largest error, a panel a mechanism; dashed: heyoka in compact mode."""
+    """CPU time of a run over the largest error, a panel a mechanism; dotted: heyoka in compact mode."""
     made = rows[(rows["group"] == GROUP) & rows["tol"].notna() & (rows["n_failed"] == 0)]
     cases = list(dict.fromkeys(made["case"]))
     width = 3.4 * len(cases) + 1.2
     of_panels: dict[str, Any] = {"figsize": (width, 4.2), "layout": "constrained", "squeeze": False, "sharey": True}
     figure, panels = plt.subplots(1, len(cases), **of_panels)
     compact = [each["case"] for each in found["compact"]]
-    colors = dict(zip(WAYS, (figures.BLUE, figures.RED, "black", "gray"), strict=True))
     for axes, case in zip(panels[0], cases, strict=True):
         for way, own in made[made["case"] == case].groupby("way", sort=False):
             line = own.groupby("tol")[["error_worst", "run_s"]].median()
-            look: dict[str, Any] = {"color": colors[way], "label": way, "ms": 3.5, "marker": "o"}
+            look = figures.style(*LOOKS[way]) | {"label": way}
             if way == HEYOKA and case in compact:
-                look |= {"label": f"{way}, compact mode", "linestyle": "--", "markerfacecolor": "white"}
+                look |= {"label": f"{way}, compact mode", "linestyle": ":"}
             axes.plot(line["error_worst"], 1e6 * line["run_s"], **look)
         axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
         axes.grid(alpha=0.3)

@@ -154,6 +154,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     sizes = [float(row["violation_q"]) for row in others]
     listed = line_up[line_up["violation_q"].notna()].set_index("solver", drop=False)
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
+    failed = rows["status"] != "REACHED_END"
     ranked = [ranking for target in TARGETS if len(ranking := tables.ranking(along, target))]
     return {
         "t_end": float(rows["t_end"].iloc[0]),
@@ -184,6 +185,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index],
         "targets": TARGETS,
         "cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3])),
+        "n_failed": int(failed.sum()),
+        "n_failed_ours": int((failed & (rows["family"] == "two-loop")).sum()),
         "pairs": [found for names in PAIRS if (found := pair(along, *names))],
     }
 

@@ -17,22 +17,32 @@ OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
 BEST = "best of ours"
 STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
 PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
-NEARLY, CHEAPER = 1.25, 1.5  # by which a run misses an error, and takes less time, where that is to be said
+CHEAPER = 1.5  # by which a run that nearly gets there takes less time, where that is to be said
 FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of which counts
 SCIPY = "SciPy's best"
 
 
 def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
     """How each of the three stands on one case at one error, by the best of each; `rows`: medians, of all solvers."""
-    ours = rows["family"] == "two-loop"
+    ours, found = rows["family"] == "two-loop", {}
     own, others = tables.costs_at(rows[ours], error), tables.costs_at(rows[~ours], error, doubt=True)
-    sides = {DEFAULT: _only(own, DEFAULT), OWN_CODE: _only(own, OWN_CODE), BEST: own}
-    found = {
-        name: _told(side) | {"rival": _told(others)} | tables.compared(side, others) for name, side in sides.items()
-    }
-    for standing in found.values():
-        if standing["verdict"] == "alone" and not asked(rows[~ours], error):
-            standing["verdict"] = "unasked"
+    near = tables.near_misses(rows[~ours], error)
+    for name in (DEFAULT, OWN_CODE, BEST):
+        side, which = (own, ours) if name == BEST else (_only(own, name), rows["solver"] == name)
+        compared = _compared(side, others, tables.near_misses(rows[which], error), near)
+        if compared["verdict"] == "alone" and not asked(rows[~ours], error):
+            compared["verdict"] = "unasked"
+        found[name] = _told(side) | {"rival": _told(others)} | compared
+    return found
+
+
+def _compared(own: tables.Costs, others: tables.Costs, *near: tables.Costs) -> dict[str, Any]:
+    """`tables.compared`, undecided where near misses of the slower side, of ours or of others, would not be slower."""
+    found, (near_own, near_others) = tables.compared(own, others), near
+    courtesy = {"ahead": (own, others | near_others), "behind": (own | near_own, others)}
+    sides = courtesy.get(found["verdict"])
+    if sides and tables.compared(*sides)["verdict"] != found["verdict"]:
+        found["verdict"] = "undecided"
     return found
 
 
@@ -132,9 +142,9 @@ def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
 
 def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] | None:
     """The cheapest run that misses an error by little and takes much less time than one that does not."""
-    errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
-    missing = runs[(errors > error) & (errors <= NEARLY * error) & (times * CHEAPER < call_s)]
-    if missing.empty:
+    near = tables.nearly_there(runs, error)
+    near = near[CHEAPER * near["call_s"] < call_s]
+    if near.empty:
         return None
-    run = missing.loc[missing["call_s"].astype(float).idxmin()]
+    run = near.loc[near["call_s"].astype(float).idxmin()]
     return {"error": float(run["error_q"]), "call_s": float(run["call_s"])}

@@ -27,6 +27,7 @@ RANKED = (
     *("violation_q", "violation_v", "energy"),
 )
 FEWEST = 3  # repetitions that an interval asks for
+NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
@@ -206,6 +207,19 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     return found
 
 
+def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
+    """The runs of one case that miss an error by a factor of less than NEARLY, on the motion of the reference."""
+    errors = _errors(rows)
+    return rows[(errors > target) & (errors <= NEARLY * target) & ~astray(rows) & rows["call_s"].notna()]
+
+
+def near_misses(rows: pd.DataFrame, target: float) -> Costs:
+    """What the runs take that miss an error by little, each run by itself."""
+    runs = nearly_there(rows, target)
+    costs = zip(runs["call_s"].astype(float), resampled(runs), strict=True)
+    return {f"near miss {k}": cost for k, cost in enumerate(costs)}
+
+
 def _least(side: Costs) -> tuple[float, Array]:
     """The time of the cheapest, and the least of each draw; NaN if the cheapest was run too few times to be drawn.
 
@@ -366,11 +380,3 @@ def failures(rows: pd.DataFrame) -> list[list[str]]:
         if [row["solver"], setting, status, message] not in lines:
             lines.append([row["solver"], setting, status, message])
     return lines
-
-
-def unfinished(rows: pd.DataFrame) -> list[str]:
-    """ "solver (setting, setting)" of the runs that did not reach the end, for a sentence; the CSV has the messages."""
-    settings: dict[str, list[str]] = {}
-    for solver, setting, *_ in failures(rows):
-        settings.setdefault(solver, []).append(setting)
-    return [f"{solver} ({', '.join(dict.fromkeys(each))})" for solver, each in settings.items()]

@@ -14,7 +14,7 @@ from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Study, rows_of
-from studies.bench.tables import setting, unfinished, where
+from studies.bench.tables import setting, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,
@@ -157,7 +157,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "gauss": gauss,
         "radau": radau,
         "radau_over_sun": abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None,
-        "radau_controlled": bool((controlled["solver"] == RADAU).any()),
         "canonical": canonical,
         "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
         "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
@@ -168,9 +167,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "n_controlled": len(controlled),
         "controlled_steady": [told(run) | {"case": run["case"]} for _, run in steady.iterrows()],
         "lasting": dict(Counter(fixed[kinds["lasting"]]["verdict"].map(_fate))),
-        "newmark": {name: told(pick(rows, motion, NEWMARK)) for name, motion in both.items()},
         "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
-        "failed": unfinished(rows),
+        "failed": int((rows["status"] != "REACHED_END").sum()),
         "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
     }
 

@@ -173,11 +173,9 @@ def catcher(caught_by: str) -> str:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     missed = rows[rows["caught_by"] == NONE]
-    caught = (rows["caught_by"] != NONE).groupby(rows["place"], sort=False)
-    places = {str(place): {"n": len(own), "caught": int(own.sum())} for place, own in caught}
     who = rows[rows["caught_by"] != NONE]["caught_by"].map(catcher)
     by = {each: int((who == each).sum()) for each in (ITSELF, KNOWN, BOUNDS, TESTS)}
-    return {"n": len(rows), "missed": missed["fault"].tolist(), "by": by, "places": places, "tolerance": TOLERANCE}
+    return {"n": len(rows), "missed": missed["fault"].tolist(), "by": by, "tolerance": TOLERANCE}
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
@@ -188,8 +186,8 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
     output.save_findings(found)
     by_file = rows["caught_by"].str.removeprefix("tests/").str.split("::").str[0]  # the rows have the test, too
     caught = rows.groupby(["place", by_file], sort=False)["fault"]
-    cells = [[str(place), "; ".join(names), str(by)] for (place, by), names in caught]
-    ready = {"faults": table(["in", "faults", "caught by"], cells)}
+    cells = [[str(place), str(by), len(names), names.iloc[0]] for (place, by), names in caught]
+    ready = {"faults": table(["fault in", "caught by", "faults", "for example"], cells)}
     output.write("planted_errors.md", render("planted_errors", found, ready, stamp=line, quick=output.call.quick))
 
 

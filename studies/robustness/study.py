@@ -12,6 +12,7 @@ import pandas as pd
 
 from studies.bench.apart import apart
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
+from studies.bench.render import power
 from studies.bench.sharp_motion import RIGHT, SAID, SILENT
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
@@ -166,6 +167,21 @@ def limits_of(own: pd.DataFrame) -> dict[str, Any]:
     return found | {"said": sorted({str(x) for x in own[own["outcome"] == SAID]["status"]})}
 
 
+def alike(limits: dict[str, dict[str, dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Lines of a table, one for all methods with the same limits of each group."""
+    methods: dict[tuple[str, ...], list[str]] = {}
+    for name in next(iter(limits.values())):
+        methods.setdefault(tuple(_said(own[name]) for own in limits.values()), []).append(name)
+    return [{"methods": ", ".join(names), "limits": list(line)} for line, names in methods.items()]
+
+
+def _said(line: dict[str, Any]) -> str:
+    if line["low"] is None or line["high"] is None:
+        return "–"
+    beyond = f" ({', '.join(line['said']).lower()})" if line["said"] else ""
+    return f"{power(line['low'])} … {power(line['high'])}{beyond}"
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says."""
     drawn, long = rows[rows["group"] == "linkage"], rows[rows["group"] == "long"]
@@ -182,11 +198,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         for (name, kind), own in drawn.groupby(["method", "what"], sort=False)
     ]
     found["silent"] = silent[["group", "what", "value", "method", "error", "allowed"]].to_dict("records")
-    found["scales"] = [
-        {"method": name, "group": group, **limits_of(own)}
+    limits = {
+        group: {name: limits_of(own) for name, own in rows[rows["group"] == group].groupby("method", sort=False)}
         for group in ("size", "density", "ratio")
-        for name, own in rows[rows["group"] == group].groupby("method", sort=False)
-    ]
+    }
+    found["scales"] = alike(limits)
     found["long"] = []
     for _, row in long[long["value"] == long["value"].max()].iterrows():
         shorter = long[(long["method"] == row["method"]) & (long["value"] < row["value"])].iloc[0]
@@ -196,7 +212,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found["long"].append(line)
     found["long_grow"] = [line["method"] for line in found["long"] if line["grows"]]
     found["most_bytes"] = max(line["bytes"] for line in found["long"])
-    sizes = [line for line in found["scales"] if line["group"] == "size"]
+    sizes = list(limits["size"].values())
     ends = [(line["low"], line["high"]) for line in sizes if line["low"] is not None and line["high"] is not None]
     lows, highs = zip(*ends, strict=True) if len(ends) == len(sizes) else ((np.inf,), (0.0,))
     found["sizes"] = [max(lows), min(highs)] if max(lows) <= min(highs) else None

@@ -63,7 +63,6 @@ OTHERS = (
 # for seconds: no quick runs
 COMPILED = (OWN_CODE, HEYOKA, CVODE_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")
 DRAWN = (DEFAULT, OWN_CODE, NEWMARK, IRK_LINE, OWN_EXPLICIT, TAYLOR, HEYOKA, CVODE_C, IDA_C)
-LISTED = (*DRAWN[:4], "SunRadau5", *DRAWN[4:], ADAMS, "Exudyn, GeneralizedAlpha")  # in the table; all are in the CSV
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
@@ -201,11 +200,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             bad = cells[cells[what].astype(bool)]["err_out"].unique()
             found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
     found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
-    # of Newmark's evaluations, and of the printed times, from the tolerance before the last to the last
-    last = [machine(first, "Table 3: Newmark", ERR_IN, err_out) for err_out in TOLERANCES[-2:]]
-    counts = [np.nan if cell is None else float(cell["n_evaluations"]) for cell in last]
-    paper = [float(PAPER_NEWMARK[-1][k] or np.nan) for k in (-2, -1)]
-    found["newmark_growth"] = {"ours": counts[1] / counts[0], "paper": paper[1] / paper[0]}
     found["ratio_s"] = by_repetition(newmark, irk)
     found["newmark_in_two_groups"] = in_two_groups(newmark["times"])
     found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
@@ -216,13 +210,23 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["newmark_dearer_everywhere"] = bool(over and min(over) > 1.0)
     found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
     found["explicit"] = _explicit(first)
-    default = first[(first["solver"] == DEFAULT) & first["error_q"].notna()]
-    found["default_explicit"] = bool(
-        len(default) and all(tables.used(run) == "explicit" for _, run in default.iterrows())
-    )
+    found |= _of_default(first)
     failed = rows[rows["status"] != "REACHED_END"]
-    found |= {"failed": tables.unfinished(failed), "failed_two_loop": bool((failed["family"] == "two-loop").any())}
+    found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
     return found | causes(first)
+
+
+def _of_default(first: pd.DataFrame) -> dict[str, Any]:
+    """From which tolerance down the default takes the steps of the Taylor series, and whether it is explicit beside."""
+    default, series = (
+        first[(first["solver"] == name) & first["error_q"].notna()].sort_values("tol") for name in (DEFAULT, TAYLOR)
+    )
+    both = default.merge(series, on="tol", suffixes=("", "_series"))
+    alike = (both["n_steps"] == both["n_steps_series"]) & (both["error_q"] == both["error_q_series"])
+    same = both["tol"][alike.cummin().astype(bool)]
+    looser = default[default["tol"] > same.max()] if len(same) else default
+    explicit = len(looser) > 0 and all(tables.used(run) == "explicit" for _, run in looser.iterrows())
+    return {"series_from": float(same.max()) if len(same) else None, "default_explicit": explicit}
 
 
 def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
@@ -284,7 +288,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """The tables of the report, of which the times are printed, too."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(_compared(first), TARGETS, LISTED)]
+    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(_compared(first), TARGETS, DRAWN)]
     ready = {"work": table(["solver", *map(power, TARGETS)], costs), "counts": counts(first)}
     for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         ready[name] = grid(first, group)

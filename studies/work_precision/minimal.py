@@ -66,7 +66,7 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     released = set(by_series["case"]) if len(by_series) else set()
     found["level"] = sorted(released) if released and released <= LEVEL else []
     found["wrong_by"] = [
-        {"solver": str(name), "n": len(own), "tightest": float(own["tol"].min())}
+        {"solver": str(name), "n": len(own)}
         for name, own in (wrong.groupby("solver", sort=False) if len(wrong) else ())
     ]
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}

@@ -92,23 +92,14 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
                 continue
             turned = both[both[["verdict_one", "verdict_other"]].apply(lambda x: set(x) == {"ahead", "behind"}, axis=1)]
             apart = np.exp(np.abs(np.log(both["ratio_one"] / both["ratio_other"])))
-            furthest = both.loc[apart.idxmax()]
             line = {
                 "processors": [one, other],
-                "same_code": bool((both["commit_one"] == both["commit_other"]).all()),
                 "time": time,
                 "n": len(both),
                 "turned": turned[PLACE].to_dict("records"),
             }
-            found.append(
-                line
-                | {
-                    "apart": float(apart.median()),
-                    "nine_tenths": float(apart.quantile(0.9)),
-                    "most": float(apart.max()),
-                }
-                | {"most_at": {"case": str(furthest["case"]), "error": float(furthest["error"])}}
-            )
+            line["same_code"] = bool((both["commit_one"] == both["commit_other"]).all())
+            found.append(line | {"apart": float(apart.median()), "most": float(apart.max())})
             break
     return found
 

@@ -190,12 +190,12 @@ def residual(rows: pd.DataFrame) -> float | None:
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many of the rivals our adapters could put to the mechanisms, and the ratio from which a lead counts."""
+    """How many of the rivals our adapters could put to the mechanisms, and the factors by which standings are told."""
     others = rows[rows["family"] != "two-loop"]
     there = tables.put(others).groupby("case")["solver"].nunique()
     there, n = there.reindex(rows["case"].unique(), fill_value=0), int(others["solver"].nunique())
     found = {"n": n, "least": int(there.min()), "all": int((there == n).sum()), "mechanisms": len(there)}
-    return found | {"counts": tables.LEAST}
+    return found | {"counts": tables.LEAST, "nearly": tables.NEARLY}
 
 
 def aims(geometries: Iterable[pd.DataFrame]) -> list[dict[str, Any]]:

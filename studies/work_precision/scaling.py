@@ -150,15 +150,14 @@ def exponent(n: Any, cost: Any) -> float | None:
 
 
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """By family and method: how the cost of a step grows with the size, what an evaluation takes at the largest."""
+    """By family and method: how the cost of a step grows with the size."""
     found = []
     for (family, method), own in rows.groupby(["case", "solver"], sort=False):
-        middle = own.groupby("n")[["step_us", "evaluation_us"]].median().dropna(subset=["step_us"])
+        middle = own.groupby("n")[["step_us"]].median().dropna()
         if middle.empty:
             found.append({"family": family, "method": method, "sizes": [], "failed": str(own["message"].iloc[0])})
             continue
         sizes = [int(n) for n in middle.index]
         line: dict[str, Any] = {"family": family, "method": method, "sizes": [sizes[0], sizes[-1]], "failed": ""}
-        line["step_exponent"] = exponent(sizes, middle["step_us"])
-        found.append(line | {"evaluation_us": float(middle["evaluation_us"].iloc[-1])})
+        found.append(line | {"step_exponent": exponent(sizes, middle["step_us"])})
     return found

@@ -16,7 +16,7 @@ from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, row_of
-from studies.bench.render import listed, number, render
+from studies.bench.render import number, render
 from studies.bench.solvers import (
     COMPARED,
     COMPARED_OWN,
@@ -40,7 +40,6 @@ IDA = ("IDA from C", "IDA, ")  # how its lines begin; CVODE is of the same famil
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
-LONG = "long motions"  # what the report calls the cases at length
 PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
@@ -129,23 +128,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def measured_on(rows: pd.DataFrame) -> list[dict[str, str | int]]:
-    """On which processors, and at which commits where these are not the report's, how many mechanisms were measured."""
-    own = rows[rows["group"] == rivals.GROUP].drop_duplicates("case").reindex(columns=["processor", "commit"])
-    counts = own.fillna("").value_counts(sort=False)
-    return [{"processor": str(p), "commit": str(c), "n": int(n)} for (p, c), n in counts.items()]
-
-
-def parts_measured_on(rows: pd.DataFrame) -> list[dict[str, str]]:
-    """The same of all other rows, by group, and by case where a group is of several."""
-    others = rows[rows["group"] != rivals.GROUP].reindex(columns=["group", "case", "processor", "commit"]).fillna("")
-    found = []
-    for group, own in others.groupby("group", sort=False):
-        places = own.groupby(["processor", "commit"], sort=False)["case"].unique()
-        for (processor, commit), of in places.items():
-            named = f"{LONG if group == GROUP else group}{f' ({listed(of)})' if len(places) > 1 else ''}"
-            found.append({"part": named, "processor": str(processor), "commit": str(commit)})
-    return found
+def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
+    """At how many commits, and on which processors, the rows were measured."""
+    made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
+    return {"commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
 
 
 def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
@@ -164,11 +150,11 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings = findings_of(medians, known) | {"rivals": found}
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
     findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    findings |= {"fitted": scaling.FITTED, "rigid": scaling.RIGID}
+    findings["fitted"] = scaling.FITTED
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
     findings["unrolled"] = LARGEST_UNROLLED
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
-    findings["measured"], findings["measured_parts"] = measured_on(rows), parts_measured_on(rows)
+    findings["measured"] = measured_on(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
@@ -191,7 +177,6 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
         "fewer": sum(not tables.missed(own, 0.0) for own in put),
         "far": adaptive.FAR,
         "running": adaptive.RUNNING,
-        "outclassed": adaptive.OUTCLASSED,
         "limit": rivals.TIME_LIMIT,
     }
 

@@ -67,42 +67,19 @@ def found_of(tmp_path, made, quick=False):
 def test_the_advice_turns_with_the_rows(tmp_path):
     found = found_of(tmp_path, rows())["cases"][1]
     assert [at["error"] for at in found["at"]] == [1e-2, 1e-3, 1e-4] == list(TARGETS)
-    assert found["one_best"] and found["at"][0]["best"]["solver"] == NEWTON
+    assert found["at"][0]["best"]["solver"] == NEWTON
     assert found["at"][0]["ours"]["call_s"] == pytest.approx(0.79, abs=0.01)
     assert found["at"][0]["others"]["call_s"] == pytest.approx(1.59, abs=0.02)
-    newmark = found["newmark"]
-    assert [at["error"] for at in newmark["at"]] == list(TARGETS) and all(at["over"] < 1.0 for at in newmark["at"])
-    assert not newmark["apart"] and not newmark["all_better"]
     made = rows()
     made.loc[made["solver"] == IDA_C_ORDER_2, "call_s"] /= 100.0
     made.loc[made["solver"] == PAPER, "call_s"] /= 100.0
     found = found_of(tmp_path, made)["cases"][1]
-    assert found["one_best"] and found["at"][0]["best"]["solver"] == IDA_C_ORDER_2
+    assert found["at"][0]["best"]["solver"] == IDA_C_ORDER_2
     assert not found["at"][0]["best"]["ours"]
-    assert [at["over"] >= 1.0 for at in found["newmark"]["at"]] == [True] * len(TARGETS)
     made = rows()
     made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "call_s"] = 1e-3
     found = found_of(tmp_path, made)["cases"][1]
     assert [at["best"]["solver"] for at in found["at"]] == [IDA_C_ORDER_2, IDA_C_ORDER_2, NEWTON]
-    made = rows()
-    loosest = made["error_tip"] > 1e-3
-    made.loc[(made["solver"] == PAPER) & loosest & (made["case"] == STIFF), "call_s"] = 0.1
-    found = found_of(tmp_path, made)["cases"][1]
-    over = {at["error"]: at["over"] for at in found["newmark"]["at"]}
-    assert over == pytest.approx({1e-2: 200.0, 1e-3: 0.2, 1e-4: 0.2})
-
-
-@pytest.mark.usefixtures("unsaved")
-def test_errors_that_are_not_equal_are_said_and_a_solver_with_runs_is_asked(tmp_path):
-    made = rows()
-    ran = made["group"] == "run"
-    made.loc[ran & (made["solver"] == PAPER), "error_tip"] = 1.1e-9
-    made.loc[ran & (made["solver"] == QUARTER) & (made["case"] == STIFF), "error_tip"] *= 1e-3
-    made.loc[ran & (made["solver"] == NEWMARK) & (made["case"] == STIFF), "error_tip"] *= 1e-3
-    found = found_of(tmp_path, made)["cases"][1]["newmark"]
-    assert found["apart"] and found["all_better"] and found["loosest"] == 1.1e-9
-    text = (tmp_path / "beam.md").read_text()
-    assert "(all its runs are better); the errors are not equal" in text and "errs by 1.1e-9 m" in text
 
 
 def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
@@ -160,8 +137,8 @@ def test_failures_and_what_is_not_there_are_told(tmp_path):
     without = made[made["solver"] != IDA_C]
     numbers = ["error_q", "error_tip", "call_s", "n_evaluations", "n_steps", "h_median"]
     peer = peer.assign(**dict.fromkeys(numbers, np.nan))
-    assert found_of(tmp_path, pd.concat([peer, without], ignore_index=True))["cases"][0]["failed"] == [f"{IDA_C} (all)"]
-    assert found_of(tmp_path, made)["cases"][0]["failed"] == []
+    assert found_of(tmp_path, pd.concat([peer, without], ignore_index=True))["cases"][0]["failed"] == 1
+    assert found_of(tmp_path, made)["cases"][0]["failed"] == 0
     with pytest.raises(StudyError, match="lack those of group 'along'"):
         findings_of(made[made["group"] != "along"])
 
@@ -171,8 +148,8 @@ def test_exudyn_is_judged_by_its_own_motion_and_not_ranked(tmp_path):
     made = rows()
     made.loc[made["solver"] == EXUDYN, "call_s"] = 1e-6
     found = found_of(tmp_path, made)
-    assert found["cases"][0]["at"][0]["best"]["solver"] != EXUDYN and found["exudyn"] == ["1e-6", "1e-6"]
-    assert found_of(tmp_path, made[made["solver"] != EXUDYN])["exudyn"] == []
+    assert found["cases"][0]["at"][0]["best"]["solver"] != EXUDYN and found["exudyn"]
+    assert not found_of(tmp_path, made[made["solver"] != EXUDYN])["exudyn"]
 
 
 @pytest.mark.usefixtures("unsaved")

@@ -92,7 +92,7 @@ def test_ratios_beside_compact_mode_are_told_apart():
     assert "compact" not in said(times)
     (figure,) = ensembles.figures_of(made, found).values()
     lines = [{line.get_label(): line.get_linestyle() for line in axes.lines} for axes in figure.axes]
-    assert lines == [{ENSEMBLE: "-", HEYOKA: "-"}, {ENSEMBLE: "-", f"{HEYOKA}, compact mode": "--"}]
+    assert lines == [{ENSEMBLE: "-", HEYOKA: "--"}, {ENSEMBLE: "-", f"{HEYOKA}, compact mode": ":"}]
     assert len({axes.get_ylim() for axes in figure.axes}) == 1
     plt.close(figure)
 

@@ -239,7 +239,7 @@ def test_a_refusal_is_no_run(message):
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert "| the default, compiled | 0 | 0 | 0 | 1 | 0 | 0 |" in text and "1 of the default, compiled," in text
+    assert "| the default, compiled | 0 | 0 | 0 | 1 | 0 | 0 |" in text and "1 of the default, compiled." in text
 
 
 def test_what_a_refusal_says_is_what_is_said():
@@ -286,7 +286,7 @@ def test_forces_held_out_are_others_and_counted_apart():
     apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
     found, text = told_of_forces(pd.concat([rows_of_forces(), apart], ignore_index=True))
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "| auto | gust | pendulum | 1e-9 |" in text and "have a seed of their own" in text
+    assert "| auto | gust | pendulum | 1e-9 |" in text and "with a seed of their own" in text
 
 
 def test_checks_of_the_input_are_counted_apart():

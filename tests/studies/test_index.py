@@ -119,7 +119,7 @@ def energy(**changed):
 
 def screen(tmp_path, cases=(), standings=None, **others):
     found = {"cases": list(cases), "default": "SunRadau5"}
-    put = {"n": 21, "least": 8, "all": 3, "mechanisms": 23, "counts": 1.05}
+    put = {"n": 21, "least": 8, "all": 3, "mechanisms": 23, "counts": 1.05, "nearly": 1.25}
     found |= {"rivals": {"standings": standings, "put": put}} if standings else {}
     for path in tmp_path.glob("*.json"):
         path.unlink()
@@ -191,11 +191,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     said = "None of 150 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-12, misleads "
     assert said in front(tmp_path, [case()], **told)
     text = screen(tmp_path, [case()], **told)
-    assert said in text and "on 2 mechanisms, with parameters not used during development (*held out*)" in text
-    assert "used (*first*), and on 20 other traps ([honesty]" in text
-    assert "| `auto`, the default | 30 | 1 | 0 | 50 | 0 | 0 |\n| `auto, compiled` | 30 | 1 | 3 | 50 | 3 | 0 |\n" in text
-    assert "| SciPy's LSODA and BDF | 30 | 1 | 4 | 50 | 4 | 0 |\n" in text
-    assert "In 2 of the runs of `auto` the integrator stepped over a 1 ms pulse. `auto, compiled` was run under" in text
+    assert said in text
     old = {name: {"n": 30, "wrong": 1, "unasked": 0, "gross": 1} for name in ("default", "compiled", "ours", "others")}
     assert "**Trust**" not in screen(tmp_path, [case()], honesty=honesty | {"held_out": {"trust": old}})
     assert "**Trust**" not in front(tmp_path, [case()])
@@ -264,7 +260,6 @@ def test_classes_come_in_their_order_and_the_long_one_from_the_energy():
 
 TABLE3 = {"one_constant": False, "irk_over": [8.0, 15.0], "newmark_over": [25.0, 30.0]}
 VALID = {"n": 21, "tight": 1e-10, "only_ours": ["a", "d"], "only_others": [], "none_right": ["b", "c"]}
-VALID["misses"] = {"inexact": 2, "wrong": 4, "said so": 0, "not run": 1, "limit": 3}
 VALID |= {"n_singular": 0, "n_wrong": {"ours": 1, "others": 57}, "n_ended": {"ours": 500, "others": 300}}
 
 
@@ -278,25 +273,19 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert (
-        "right on 17, only ours on 2, only others on 0, none on 2. Runs of others where only ours are right: 2" in text
-    )
-    assert "ours are right: 2 inexact, 4 wrong, 3 stopped by our time limit, 1 not run. Wrong runs" in text
+    assert "right on 17, only ours on 2, only others on 0, none on 2. Wrong runs" in text
     assert "1 of 500 of ours, 57 of 300 of others" in text
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
     planted = {
         "n": 73,
         "missed": ["x"],
         "by": by,
-        "mutants": {"n": 40, "seen": 33, "kernels": {"adams": {}, "bdf": {}}},
     }
     text = screen(tmp_path, planted_errors=planted)
-    assert (
-        "- Of 73 faults that we planted in models, solvers and reports `solve_dae` itself refuses or stops 20; " in text
+    said = (
+        "- Of 73 faults that we planted in models, solvers and reports `solve_dae` itself refuses or stops 20; no check"
     )
-    assert "30 show only against a known motion; 2 by too many evaluations" in text
-    assert "20 are caught by our test suite; no check of those run catches 1: x. Of 40 random changes to" in text
-    assert "the kernels of adams and bdf our tests see 33. [Planted errors]" in text
+    assert f"{said} of those run catches 1: x ([planted errors](planted_errors.md))." in text
 
 
 def test_a_study_that_has_not_run_is_said_to_be_missing(tmp_path):

@@ -68,7 +68,7 @@ def test_a_run_that_ends_with_a_wrong_state_is_told():
     assert found["mechanisms"][0]["at"][0]["rival"]["call_s"] == 1.0
     said = (
         "Of their 4 runs at tolerances of 1e-3 and tighter 2 end with success and an error above 0.10: "
-        "1 of `heyoka, minimal coordinates` "
+        "1 of `heyoka, minimal coordinates`"
     )
     assert said in stated(1.0, minimal=found)
     assert minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0

@@ -88,7 +88,7 @@ def text_of(seen_by, why=""):
     found = mutants.findings_of(pd.DataFrame([line]))
     for survivor in found["survivors"]:
         survivor["why"] = why
-    whole = {"n": 1, "missed": [], "places": {}, "tolerance": 1e-10, "mutants": found | {"made": "stamp"}}
+    whole = {"n": 1, "missed": [], "tolerance": 1e-10, "mutants": found | {"made": "stamp"}}
     whole["by"] = {"solve_dae": 1, "known motion": 0, "bounds": 0, "tests": 0}
     return render("planted_errors", whole, {"faults": ""}, stamp="stamp", quick=False)
 

@@ -129,8 +129,8 @@ def test_sentences_turn_with_the_rows():
     assert "With all methods none of 1 runs is silently wrong, of 1 random mechanisms under sharp forces (half" in good
     assert "- None of 1 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-4, mis" in good
     assert "misleads the default; no other project's solver was run there." in good
-    assert "up to 1e-5 m or rad for a linkage, up to 0.50 under sharp forces (at a tolerance of 1e-4)." in good
-    assert "An error may be as large as 0.50 at 1e-4 (0.50 in the median) m or rad" in good
+    assert "so errors of up to 1e-5 m or rad are allowed." in good
+    assert "| error allowed, largest | 0.50 |" in good and "| BDF | 1e-6 … 1e3 | 1e-6 … 1e3 | 1e-6 … 1e3 |" in good
     assert "1 runs that count as right there are off by more than 1e-2." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
