@@ -1,8 +1,8 @@
-"""The headline of the comparisons: the default, the compiled default, the best of ours afterwards, against all rivals.
+"""The headline of the comparisons: the default, with code, without it, the best of ours afterwards, against all rivals.
 
-In this order: a user gets the first, with one argument the second, and the third by choosing among our methods when all
-have been run. Each is compared with the best of the same rivals, on each mechanism at each error, by the time of the
-whole call.
+In this order: a user who changes nothing gets the first, which is the second on small mechanisms and the third on
+others, and the last by choosing among our methods when all have been run. Each is compared with the best of the same
+rivals, on each mechanism at each error, by the time of the whole call.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,7 +14,8 @@ from studies.bench import tables
 from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
-BEST = "best of ours"
+GIVEN, BEST = "the default", "best of ours"
+WHOSE = (GIVEN, OWN_CODE, DEFAULT, BEST)
 STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
 PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
 CHEAPER = 1.5  # by which a run that nearly gets there takes less time, where that is to be said
@@ -22,13 +23,17 @@ FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of
 SCIPY = "SciPy's best"
 
 
-def of_error(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
-    """How each of the three stands on one case at one error, by the best of each; `rows`: medians, of all solvers."""
+def of_error(rows: pd.DataFrame, error: float, given: str = DEFAULT) -> dict[str, dict[str, Any]]:
+    """How each of WHOSE stands on one case at one error, by the best of each.
+
+    `rows`: medians, of all solvers; `given`: the solver that the default is on this case.
+    """
     ours, found = rows["family"] == "two-loop", {}
     own, others = tables.costs_at(rows[ours], error), tables.costs_at(rows[~ours], error, doubt=True)
     near = tables.near_misses(rows[~ours], error)
-    for name in (DEFAULT, OWN_CODE, BEST):
-        side, which = (own, ours) if name == BEST else (_only(own, name), rows["solver"] == name)
+    for name in WHOSE:
+        solver = given if name == GIVEN else name
+        side, which = (own, ours) if name == BEST else (_only(own, solver), rows["solver"] == solver)
         compared = _compared(side, others, tables.near_misses(rows[which], error), near)
         if compared["verdict"] == "alone" and not asked(rows[~ours], error):
             compared["verdict"] = "unasked"
@@ -63,7 +68,7 @@ def _only(costs: tables.Costs, name: str) -> tables.Costs:
 
 
 def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:
-    """Of many pairs of mechanism and error, in how many each of the three is ahead, behind, undecided, alone, missing.
+    """Of many pairs of mechanism and error, in how many each of WHOSE is ahead, behind, undecided, alone, missing.
 
     `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
     unbeaten the mechanisms, of n_mechanisms, at no error of which it is behind or missing where others get to.
@@ -71,7 +76,7 @@ def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[
     mechanisms = [list(own) for own in found]
     pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
     made = []
-    for name in (DEFAULT, OWN_CODE, BEST):
+    for name in WHOSE:
         verdicts = [each[name]["verdict"] for each in pairs]
         line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
         by_mechanism = [{each[name]["verdict"] for each in own} for own in mechanisms]
@@ -108,7 +113,7 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     if rows.empty:
         return None
     first = firsts[(firsts["case"] == case) & firsts["first_call_s"].notna()] if "first_call_s" in firsts else firsts
-    own = {name: rows["solver"] == name for name in (DEFAULT, OWN_CODE, HEYOKA)}
+    own = {name: rows["solver"] == name for name in (OWN_CODE, DEFAULT, HEYOKA)}
     sundials = {name: (rows["family"] == "SUNDIALS") & rows["solver"].str.startswith(name) for name in FROM_C}
     lines = []
     for name, which in (own | sundials | {SCIPY: rows["family"] == "SciPy"}).items():

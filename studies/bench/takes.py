@@ -23,15 +23,18 @@ OTHER_KINDS = {*KINDS, "singular", "stiff"}  # of which the table says more
 
 def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
     """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
-    rows = []
+    rows, made = [], found.get("work_precision", {})
+    with_code = set(made.get("rivals", {}).get("with_code", []))
     for group in groups:
+        coded = with_code.issuperset(entry["name"] for entry in group)
         motions = "; ".join(f"{entry['name']}, {number(entry['t_end'])} s" for entry in group)
         what = f"{group[0]['class']} ({motions})"
-        picks = [f"{call(pick['solver'])} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]]
+        picks = [
+            f"{call(pick['solver'], coded)} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]
+        ]
         open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
         rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
-    made = found.get("work_precision", {})
     often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
     mechanisms = made.get("rivals", {}).get("mechanisms", [])
     rows += _of_short_calls([each for each in mechanisms if each.get("tags") and not OTHER_KINDS & {*each["tags"]}])
@@ -45,7 +48,7 @@ def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, s
     cheapest.pop("", None)
     if not cheapest:
         return []
-    parts = [f"{call(solver)} on {n}" for solver, n in cheapest.most_common()]
+    parts = [f"{call(solver, True)} on {n}" for solver, n in cheapest.most_common()]  # smooth ones are small
     n, what = len(mechanisms), "smooth, rigid, in calls of a few milliseconds"
     return [{"what": what, "take": f"of {n} mechanisms, the cheapest at most errors: {', '.join(parts)}"}]
 
@@ -114,7 +117,7 @@ def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
     sooner = [line for line in paying if always is None or (line["never"] and _latest(line) < _latest(always))]
     told = [always] if always else []
     parts = [_by_run(line) for line in [*told, *sorted(sooner, key=_latest)]]
-    return [f"breaks even with `{DEFAULT}`, at an error of 1e-8: {'; '.join(parts)}"]
+    return [f"breaks even with `compiled=False`, at an error of 1e-8: {'; '.join(parts)}"]
 
 
 def _by_run(line: Mapping[str, Any]) -> str:
@@ -138,10 +141,15 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:
     return [f"in one call {', '.join(parts)}"] if any(by_way) else []
 
 
-def call(solver: str) -> str:
-    """How a user asks for a solver of the reports: the argument of `solve_dae` where there is one."""
+def call(solver: str, coded: bool = False) -> str:
+    """How a user asks for a solver of the reports: the argument of `solve_dae` where there is one.
+
+    `coded`: on mechanisms for which the default makes code.
+    """
     name, _, compiled = solver.removesuffix(SUFFIX).partition(", ")
     if name not in PRESETS or compiled not in ("", "compiled"):
         return f"`{solver}`"
-    words = [] if name == "auto" else [f'method="{name}"']
-    return f"`{', '.join([*words, *(['compiled=True'] if compiled else [])]) or 'auto'}`"
+    if name == DEFAULT and bool(compiled) is coded:
+        return "the default"
+    words = [] if name == DEFAULT else [f'method="{name}"']
+    return f"`{', '.join([*words, f'compiled={bool(compiled)}'])}`"

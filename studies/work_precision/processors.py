@@ -31,7 +31,10 @@ def standings(rows: pd.DataFrame, column: str) -> Standings:
     """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
     medians = tables.medians(rows.assign(call_s=rows[column]))
     cases = medians.groupby("case", sort=False)
-    return [(str(case), error, headline.of_error(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
+    pairs = product(cases, rivals.DECADES)
+    return [
+        (str(case), error, headline.of_error(own, error, rivals.given_on(str(case)))) for (case, own), error in pairs
+    ]
 
 
 def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFrame:
@@ -47,7 +50,7 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
         found = known if known and time == WHOLE_CALL else standings(rows, column)
         for case, error, standing in found:
             for who, at in standing.items():
-                if at["verdict"] in ("ahead", "behind", "undecided"):
+                if who != headline.GIVEN and at["verdict"] in ("ahead", "behind", "undecided"):
                     at_commit = made_at.get(case) or (commit[1] if commit else "")
                     line = {"processor": made_on[case], "commit": at_commit}
                     line |= {"time": time, "case": case, "error": error}

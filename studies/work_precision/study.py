@@ -57,7 +57,7 @@ def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     """The cheapest of ours, of others and of IDA on one case at one error, and how the default does."""
     ranked = tables.ranking(rows, error)
     found: dict[str, Any] = {"error": error, "ida": None, "default_over": None}
-    found["standing"] = headline.of_error(rows, error)
+    found["standing"] = rivals.standing(rows, error)
     ida = [own for _, own in tables.put(rows[rows["solver"].str.startswith(IDA)]).groupby("solver")]
     found["ida_missed"] = bool(ida) and all(tables.missed(own, error) for own in ida)
     found["ida_tightest"] = max((t for t in map(tables.tightest, ida) if t == t), default=None)
