@@ -31,10 +31,7 @@ def standings(rows: pd.DataFrame, column: str) -> Standings:
     """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
     medians = tables.medians(rows.assign(call_s=rows[column]))
     cases = medians.groupby("case", sort=False)
-    pairs = product(cases, rivals.DECADES)
-    return [
-        (str(case), error, headline.of_error(own, error, rivals.given_on(str(case)))) for (case, own), error in pairs
-    ]
+    return [(str(case), error, rivals.standing(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
 
 
 def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFrame:
