@@ -21,6 +21,10 @@ ROUNDING = 1e-14  # of coefficients
 
 DONE, NOT_CONVERGED, SINGULAR, TOO_SMALL = range(4)
 EVALUATIONS, FACTORIZATIONS, SWEEPS, NEWTON, STEPS, REFUSED, DIVERGED, PARTITIONS, N_COUNTERS = range(9)
+COUNTERS = (  # those, as `Statistics` calls them
+    *("n_evaluations", "n_factorizations", "n_outer", "n_inner", "n_accepted"),
+    *("n_rejected_error", "n_rejected_convergence", "n_partitions"),
+)
 T, H, LONGEST, HOLD, MU, N_PLACES = range(6)  # places in `where`: the step-size control, and the largest |mu|
 
 

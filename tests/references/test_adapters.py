@@ -152,7 +152,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(name):
 def test_the_accurate_start_of_gear_is_within_the_limit():
     result = solve_gear(*start(PROBLEM, 1.0), 0.01, 3, start="accurate", time_limit=1e-9)
     assert result.status is Status.SOLVER_FAILED
-    assert "The accurate start was stopped at t = 0 by time_limit = 1e-09 s" in result.message
+    assert "The accurate start failed. DOP853 was stopped at t = 0 by time_limit = 1e-09 s" in result.message
 
 
 def test_gear_goes_on_where_the_last_call_ended():
@@ -161,20 +161,10 @@ def test_gear_goes_on_where_the_last_call_ended():
         assert np.array_equal(free.q, limited.q) and np.array_equal(free.lam, limited.lam)
 
 
-def test_a_reference_past_its_limit_is_an_error():
-    beam = very_flexible_beam()
-    with pytest.raises(RuntimeError, match=r"was stopped at t = 0 by time_limit = 1e-09 s"):
-        reduced_motion(beam, [1.0], 1e-8, time_limit=1e-9)
-    with pytest.raises(RuntimeError, match=r"was stopped at t = 0\.\d+ by time_limit = 0\.05 s"):
-        reduced_motion(beam, [100.0], 1e-12, time_limit=0.05)
-
-
 def test_the_clock_starts_when_a_limit_is_made():
-    assert not TimeLimit(None).passed() and TimeLimit(None).left() is None
-    limit = TimeLimit(100.0)
-    assert not limit.passed() and 99.0 < limit.left() <= 100.0
+    assert not TimeLimit(None).passed() and not TimeLimit(100.0).passed()
     over = TimeLimit(1e-9)
-    assert over.passed() and over.exceeded and 0.0 < over.left() <= 1e-9
+    assert over.passed() and over.exceeded
 
 
 # --- the longest step
@@ -317,8 +307,8 @@ def test_too_few_parameters_are_reported_as_such(entry):
 
 
 WRONG = [
-    ({"system": PROBLEM}, TypeError, r"given the Problem 'four-bar .*': give problem\.system"),
-    ({"system": "pendulum"}, TypeError, "system must be a ConstrainedSystem; given 'pendulum' of type str"),
+    ({"system": PROBLEM}, TypeError, r"given a Problem: give its system, problem\.system"),
+    ({"system": "pendulum"}, TypeError, "system must be a ConstrainedSystem .*; given 'pendulum'"),
     ({"t_span": (1.0, 0.0)}, ValueError, "t_span must be"),
     ({"q0": np.zeros(3)}, ValueError, "q0 must have shape"),
     ({"v0": np.full(9, np.nan)}, ValueError, "v0 must be finite"),
@@ -350,30 +340,29 @@ def test_wrong_tolerances_are_named(name, tol):
 @pytest.mark.parametrize(
     ("solve", "changed", "words"),
     [
-        (solve_index1, {"method": ["DOP853"]}, r"method must be one of DOP853, .*Pr8, Pr9; given \['DOP853'\]"),
-        (solve_index1, {"stabilisation": "glue"}, "stabilisation must be one of none, baumgarte, projection"),
+        (solve_index1, {"method": ["DOP853"]}, r"method must be 'DOP853', .*'Pr8' or 'Pr9'; given \['DOP853'\]"),
+        (solve_index1, {"stabilisation": "glue"}, "stabilisation must be 'none', 'baumgarte' or 'projection'"),
         (solve_index1, {"stabilisation": "projection", "method": "LSODA"}, "one-step method, DOP853 or RK45"),
         (solve_index1, {"alpha": 5.0}, "alpha belongs to stabilisation='baumgarte'"),
         (solve_index1, {"stabilisation": "baumgarte", "alpha": -1.0}, "alpha must be positive"),
-        (solve_ida, {"form": None}, "form must be one of index1, stabilised; given None"),
-        (solve_ida, {"max_order": 6}, "max_order must be at most 5"),
+        (solve_ida, {"form": None}, "form must be 'index1' or 'stabilised'; given None"),
+        (solve_ida_c, {"max_order": 6}, "max_order must be at most 5"),
         (solve_ida_c, {"max_order": 0}, "max_order must be at least 1"),
-        (solve_ida_c, {"error_test": []}, r"error_test must be one of all, states, positions; given \[\]"),
-        (solve_cvode_c, {"method": "adams"}, "method must be one of Adams, BDF; given 'adams'"),
+        (solve_ida_c, {"error_test": []}, r"error_test must be 'all', 'states' or 'positions'; given \[\]"),
+        (solve_cvode_c, {"method": "adams"}, "method must be 'Adams' or 'BDF'; given 'adams'"),
         (solve_cvode_c, {"projected": True}, r"projected needs method 'BDF'.*; given 'Adams'"),
-        (solve_fully_implicit, {"method": "Gauss"}, "method must be one of Radau, Radau9, BDF; given 'Gauss'"),
+        (solve_fully_implicit, {"method": "Gauss"}, "method must be 'Radau', 'Radau9' or 'BDF'; given 'Gauss'"),
         (solve_gear, {"step": 0.0}, "step must be positive"),
         (solve_gear, {"step": 0.3}, "step must go a whole number of times into t_span, whose length is 1.0; given 0.3"),
         (solve_gear, {"step": 3.0}, "step must go a whole number of times"),
         (solve_gear, {"step": 0.01, "order": 0}, "order must be at least 1"),
         (solve_gear, {"step": 0.01, "order": 7}, "order must be at most 6"),
-        (solve_gear, {"step": 0.01, "start": "push"}, "start must be one of ramp, accurate; given 'push'"),
-        (solve_gear, {"step": 0.01, "newton_tol": -1.0}, "newton_tol must be positive"),
+        (solve_gear, {"step": 0.01, "start": "push"}, "start must be 'ramp' or 'accurate'; given 'push'"),
         (solve_gear, {"step": 0.01, "t_eval": [0.015]}, "t_eval must hold multiples of step"),
     ],
 )
 def test_wrong_options_are_named(solve, changed, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         solve(*start(PROBLEM, 1.0), **changed)
 
 
@@ -387,7 +376,7 @@ def test_adapters_of_one_mechanism_name_wrong_arguments(solve):
         ({"n_steps": 10.0}, TypeError, "n_steps must be an int"),
         ({"store_every": 3}, ValueError, "multiple of store_every = 3"),
         ({"time_limit": -1.0}, ValueError, "time_limit must be positive"),
-        ({"solver": None}, ValueError, "solver must be one of GeneralizedAlpha, TrapezoidalIndex2, HHT"),
+        ({"solver": "RK"}, ValueError, "solver must be 'GeneralizedAlpha', 'TrapezoidalIndex2' or 'HHT'"),
     ):
         with pytest.raises(error, match=words):
             solve(**{"problem": problem, "t_end": 1.0, "n_steps": 10, **changed})
@@ -396,8 +385,6 @@ def test_adapters_of_one_mechanism_name_wrong_arguments(solve):
 def test_references_name_wrong_arguments():
     with pytest.raises(TypeError, match=r"problem must be a beam of ancf_beam.*given ConstrainedSystem"):
         reduced_motion(PROBLEM.system, [1.0], 1e-8)
-    with pytest.raises(ValueError, match="time_limit must be positive"):
-        reduced_motion(very_flexible_beam(), [1.0], 1e-8, time_limit=0.0)
     with pytest.raises(ValueError, match="times must be a list of finite times"):
         trajectory(PROBLEM.parameters, [0.0, np.nan])
 
