@@ -154,10 +154,10 @@ def _governor(problem: Problem) -> Model:
     for (mass, inertia), (q, v) in zip(bodies, _states(problem), strict=True):
         model.body(mass, inertia, q, v)
     model.joint(GROUND, 0, (0.0, 0.0, 0.0), frame(Z), REVOLUTE)
-    model.joint(0, 1, (0.0, 0.0, HEIGHT), frame(x=Z), PRISMATIC)
+    model.joint(0, 1, (0.0, 0.0, HEIGHT), np.roll(frame(Z), 1, axis=1), PRISMATIC)  # along z
     for body, side in ((2, 0.5 * CUBE), (3, -0.5 * CUBE)):
         hinge = np.array([side, 0.0, LENGTH])
-        model.joint(0, body, hinge, frame(z=Y), REVOLUTE)
+        model.joint(0, body, hinge, frame(Y), REVOLUTE)
         middle = hinge + 0.5 * LENGTH * model.places[body][1][:, 0]
         model.spring(1, (side, 0.0, HEIGHT), body, middle, STIFFNESS, DAMPING, SLACK)
     return model
