@@ -43,6 +43,7 @@ def start(problem, t_end=None):
 RIGHT = {
     **{"heyoka": 5e-6, "CVODE from C, Adams": 5e-6, "CVODE from C, BDF": 1e-5, "CVODE": 2e-6, "Pr9": 1e-9},
     **{"IDAS": 5e-6, "collocation": 2e-7, "Dopri8": 2e-8, "CVODES": 1e-5, "gear": 0.05, "Radau9 of solve_dae": 1e-7},
+    **{"IDA, index1": 1.1e-5, "IDA, stabilised": 3e-6, "IDA from C": 2.4e-5},
 }
 
 
@@ -55,7 +56,7 @@ def test_a_rival_is_right_on_the_four_bar_and_measured(name):
     assert result.q.shape == result.v.shape == result.a.shape == (9, result.t.size) and result.lam.shape[0] == 8
     residual = PROBLEM.system.mass(0.0, result.q[:, -1].copy()) @ result.a[:, -1]
     residual += PROBLEM.system.jacobian(0.0, result.q[:, -1].copy()).T @ result.lam[:, -1]
-    off = 0.1 if "solve_dae" in name else 1e-8
+    off = 0.1 if name.startswith(("IDA, ", "IDA f")) or "solve_dae" in name else 1e-8  # derivatives of unknowns
     assert np.allclose(residual, PROBLEM.system.force(0.0, result.q[:, -1].copy(), result.v[:, -1].copy()), atol=off)
     assert 0.0 < result.stats.cpu_time < 60.0
 
@@ -153,12 +154,6 @@ def test_the_accurate_start_of_gear_is_within_the_limit():
     result = solve_gear(*start(PROBLEM, 1.0), 0.01, 3, start="accurate", time_limit=1e-9)
     assert result.status is Status.SOLVER_FAILED
     assert "The accurate start failed. DOP853 was stopped at t = 0 by time_limit = 1e-09 s" in result.message
-
-
-def test_gear_goes_on_where_the_last_call_ended():
-    for order in (1, 5, 6):
-        free, limited = (solve_gear(*start(PROBLEM, 1.0), 1e-3, order, time_limit=limit) for limit in (None, 600.0))
-        assert np.array_equal(free.q, limited.q) and np.array_equal(free.lam, limited.lam)
 
 
 def test_the_clock_starts_when_a_limit_is_made():
@@ -393,11 +388,3 @@ def test_a_missing_package_is_told(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "solve_dae.integrate", None)
     with pytest.raises(RuntimeError, match=r"solve_dae is not installed.*pip install 'twoloop\[peers\]'"):
         solve_fully_implicit(*start(PROBLEM, 1.0))
-
-
-@pytest.mark.parametrize(("method", "bound"), [("Radau", 3e-5), ("Radau9", 1e-7), ("BDF", 1e-3)])
-def test_solve_dae_agrees_with_the_truth_and_keeps_its_steps(method, bound):
-    times, solve = [0.0, 5.0, 10.0], ADAPTERS[f"{method} of solve_dae"]
-    result, every = solve(*start(PROBLEM, 10.0), t_eval=times), solve(*start(PROBLEM, 10.0))
-    assert result.success and np.abs(result.q - trajectory(PROBLEM.parameters, times)[0]).max() < bound
-    assert np.array_equal(every.h, result.h) and every.t.size == every.h.size + 1

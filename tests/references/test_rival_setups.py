@@ -6,7 +6,6 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from references.casadi.integrators import solve_cvodes, solve_idas
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials import cvode_c
 from references.sundials.cvode_c import solve_cvode_c
@@ -38,15 +37,6 @@ def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipl
     made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("states", "positions")}
     assert 1e-9 < error(FOUR_BAR, made["states"]) < 2e-4
     assert made["positions"].stats.n_accepted < 0.8 * made["states"].stats.n_accepted
-
-
-def test_cvodes_of_casadi_is_cvodes_and_right():
-    pytest.importorskip("casadi")
-    result = run(solve_cvodes, PENDULUM, 1e-9, 1e-9, t_end=2.0)
-    assert 1e-13 < np.abs(result.q[:, -1] - PENDULUM.q0).max() < 1e-5
-    assert result.message.startswith("CVODES of CasADi reached the end")
-    assert result.stats.cpu_time > 0.0
-    assert result.stats.n_accepted != run(solve_idas, PENDULUM, 1e-9, 1e-9, t_end=2.0).stats.n_accepted
 
 
 @callback("mass")
