@@ -55,7 +55,7 @@ OUTPUTS = 1001  # instants of the default t_eval of solvers that do not store th
 
 CAUSES = "Look for a discontinuity, a singular position or a value that is not finite near this time, or try"
 ADVICE = f"{CAUSES} other tolerances or another method."
-TOLERANCES = {"rtol", "atol", "tol"}
+POSITIVE = {"rtol", "atol", "tol", "step", "max_step"}  # options that are numbers above 0, where they are given
 
 
 def cpu_time() -> float:
@@ -190,10 +190,7 @@ class Task:
 
     def longest(self, max_step: float | None) -> float:
         """The longest step that a solver may take: what is asked for, or the whole run."""
-        if max_step is None:
-            return self.t1 - self.t0
-        check_positive("max_step", max_step)
-        return min(float(max_step), self.t1 - self.t0)
+        return min(math.inf if max_step is None else max_step, self.t1 - self.t0)
 
     def result(self, name: str, t: Array, rows: Array, failure: str = "", *, h: Any = None, **counts: Any) -> Result:
         """The Result of a solver of this name.
@@ -271,7 +268,7 @@ def adapter(*, velocity_rows: bool = True, **checks: bool) -> Callable[[Callable
         def checked(system: Any, t_span: Any, q0: Any, v0: Any, *rest: Any, **options: Any) -> Any:
             shared = {name: options.pop(name, None) for name in ("t_eval", "time_limit")}
             given = known.bind(None, *rest, **options).arguments
-            for name in TOLERANCES & given.keys():
+            for name in [name for name in POSITIVE & given.keys() if given[name] is not None]:
                 check_positive(name, given[name])
                 given[name] = float(given[name])
             given["task"] = check_task(system, t_span, q0, v0, **shared, **checks)

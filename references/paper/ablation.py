@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from references.driver import Task, TimeLimit, adapter
 from references.paper import ablation_kernels as kernels
-from twoloop.checks.arguments import check_choice, check_positive
+from twoloop.checks.arguments import check_choice
 from twoloop.kernels.data.common import GAMMA_GIVEN, Kit
 from twoloop.methods.tableaux import Tableau
 from twoloop.result.result import Result
@@ -84,8 +84,6 @@ def solve_variant(
     check_choice("variant", variant, tuple(VARIANTS))
     if (step is None) == (tol is None):
         raise ValueError(f"give either step, for fixed steps, or tol; given step={step!r}, tol={tol!r}")
-    if step is not None:
-        check_positive("step", step)
     system, span, which = task.system, task.t1 - task.t0, list(VARIANTS).index(variant)
     if not system.functions.flags[GAMMA_GIVEN]:
         raise ValueError(f"system must have gamma; given {system.name!r} without it")

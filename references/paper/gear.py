@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from references.driver import Task, TimeLimit, adapter, user_call
 from references.equations.linear import compiled_now, lu_factor, lu_solve
 from references.scipy.index1 import solve_index1
-from twoloop.checks.arguments import check_choice, check_positive, check_size, check_times
+from twoloop.checks.arguments import check_choice, check_size, check_times
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
 from twoloop.result.result import Result
 
@@ -94,7 +94,6 @@ def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") 
     coefficient, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
     Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] then has a condition number that does not grow as h becomes small.
     """
-    check_positive("step", step)
     system, n, t0, length = task.system, task.system.n_q, task.t0, task.t1 - task.t0
     n_steps = round(length / step)
     if n_steps < 1 or abs(length / step - n_steps) > WHOLE:
