@@ -80,7 +80,7 @@ def solve_exudyn(
         error, given = (ValueError, problem.name) if isinstance(problem, Problem) else (TypeError, problem)
         raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit, spectral_radius)
-    model, ours = model_of(problem), _as_they_are
+    model, ours = model_of(problem), None
     reference = np.concatenate(model.reference)
     if problem.name == bricard().name:
         ours = _with_matrices
@@ -173,10 +173,6 @@ def _bricard(problem: Problem) -> Model:
         after = hinge if hinge < 5 else GROUND
         model.joint(hinge - 1 if hinge else GROUND, after, corner, frame(axis), REVOLUTE)
     return model
-
-
-def _as_they_are(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-    return q, v, a
 
 
 def _with_matrices(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:

@@ -81,12 +81,17 @@ def add_sensors(mbs: Any, node: int) -> list[int]:
 
 
 def run(
-    mbs: Any, sensors: Sequence[list[int]], reference: Array, steps: Steps, ours: Ours, dependent_rows: bool = False
+    mbs: Any,
+    sensors: Sequence[list[int]],
+    reference: Array,
+    steps: Steps,
+    ours: Ours | None,
+    dependent_rows: bool = False,
 ) -> Result:
     """Solve an assembled system whose nodes have these sensors and reference coordinates.
 
-    `ours` makes coordinates, velocities and accelerations of a problem of those of Exudyn. With dependent rows, which
-    Exudyn's usual linear solver cannot treat, a dense one leaves out what is singular.
+    `ours` makes coordinates, velocities and accelerations of a problem of those of Exudyn; None: they are Exudyn's.
+    With dependent rows, which Exudyn's usual linear solver cannot treat, a dense one leaves out what is singular.
     """
     task, n_steps, solver, store_every, radius = steps
     settings = _settings(task.t1, n_steps, store_every)
@@ -108,7 +113,8 @@ def run(
     elif failure:
         message = f"Exudyn failed in the step to t = {did.currentTime:.10g}: {failure}. Take more steps."
     counts = {"n_accepted": made, "n_outer": did.newtonStepsCount, "n_factorizations": did.newtonJacobiCount}
-    rows = np.concatenate([*ours(q + reference[:, None], v, a), np.full((task.n_c, t.size), np.nan)])
+    q += reference[:, None]
+    rows = np.concatenate([*((q, v, a) if ours is None else ours(q, v, a)), np.full((task.n_c, t.size), np.nan)])
     h = np.full(t.size - 1, did.currentStepSize) if store_every == 1 else None
     return task.result("Exudyn", t, rows, message, h=h, **counts)
 

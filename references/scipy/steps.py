@@ -74,7 +74,8 @@ class Steps:
             self.stored.append((self.t0, self.start))
         try:
             self.solver = self.make(self.limit)
-            while self.solver.status == "running" and not self.failure and not self._has_all():
+            wanted = self.times.size if self.times is not None and self.times.size else np.inf  # of stored states
+            while self.solver.status == "running" and not self.failure and len(self.stored) < wanted:
                 self.failure = self._attempt()
                 if not self.failure:
                     self._accept()
@@ -103,10 +104,6 @@ class Steps:
         failed = f"{name} failed after t = {self.ends[-1]:.10g}: {self.failure.rstrip('.')}. {advice}"
         return failed if self.failure else ""
 
-    def _has_all(self) -> bool:
-        """Whether the output times of a run that is for them alone are stored."""
-        return bool(self.times is not None and 0 < self.times.size == len(self.stored))
-
     def _state(self) -> Array:
         solver = self.solver
         return np.concatenate([solver.y, solver.yp]) if hasattr(solver, "yp") else solver.y.copy()
@@ -126,7 +123,10 @@ class Steps:
     def _accept(self) -> None:
         """Project and store what a step gave."""
         solver, t = self.solver, float(self.solver.t)
-        due = [] if self.times is None else self._due(t)
+        due: list[float] = []
+        if self.times is not None:
+            first, last = np.searchsorted(self.times, [self.ends[-1], t], side="right")
+            due = self.times[first:last].tolist()
         inside = [moment for moment in due if moment != t]
         if inside:
             # before the projection: the interpolant belongs to the solver's own y and f
@@ -145,12 +145,6 @@ class Steps:
         self.ends.append(t)
         if self.times is None or len(due) > len(inside):
             self.stored.append((t, y))
-
-    def _due(self, t: float) -> list[float]:
-        """Output times after the last step's end and up to t."""
-        assert self.times is not None
-        first, last = np.searchsorted(self.times, [self.ends[-1], t], side="right")
-        return [float(moment) for moment in self.times[first:last]]
 
     def _projected(self, t: float, y: Array) -> bool:
         if self.project is None or self.project(t, y):
