@@ -6,7 +6,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from references.casadi.integrators import solve_collocation
 from references.equations import expressions
 from references.equations.expressions import Expressions, NotSymbolic, functions_of
 from references.equations.least_norm import accelerations
@@ -110,13 +109,6 @@ def test_systems_without_expressions_are_refused():
     )
     with pytest.raises(ValueError, match="are Python functions, not compiled ones"):
         solve_cvode_c(plain, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
-
-
-def test_a_number_of_steps_that_is_none_is_named():
-    problem = four_bar()
-    start = problem.system, (0.0, 1.0), problem.q0, problem.v0
-    with pytest.raises(ValueError, match="n_steps"):
-        solve_collocation(*start, 0)
 
 
 @callback("force")

@@ -168,19 +168,6 @@ def test_frames_are_rotations_with_the_last_column_given():
 
 # --- the spectral radius, and why there are no steps by error control
 
-TOP = PROBLEMS["heavy top"]
-
-
-def top_at(radius):
-    return solve_exudyn(TOP, 0.2, 200, spectral_radius=radius)
-
-
-def test_the_radius_reaches_the_solver_and_the_default_is_exudyns():
-    default, same, other = top_at(None), top_at(exudyn_run.SPECTRAL_RADIUS), top_at(0.6)
-    assert default.success and other.success
-    np.testing.assert_array_equal(default.q, same.q)
-    assert 1e-12 < np.abs(default.q - other.q).max() < 1e-2
-
 
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_runs_with_another_radius(name):

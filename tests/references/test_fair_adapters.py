@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from references.casadi import integrators as casadi_integrators
-from references.casadi.integrators import FLAGS, PLAIN, solve_collocation, solve_cvodes, solve_idas
+from references.casadi.integrators import FLAGS, PLAIN, solve_cvodes, solve_idas
 from references.diffrax import dopri8 as diffrax_dopri8
 from references.driver import Task, TimeLimit, user_call
-from references.paper.four_bar_minimal import trajectory
 from references.scipy import fully_implicit, index1
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode import solve_cvode
@@ -44,20 +43,6 @@ def test_adams_of_cvodes_is_another_method_and_right():
     assert status == "REACHED_END" and made.stats.n_accepted == adams.stats.n_accepted and name in RIVALS
     with pytest.raises(ValueError, match="method must be 'BDF' or 'Adams'; given 'adams'"):
         solve_cvodes(*start(PENDULUM, 2.0), method="adams")
-
-
-def test_collocation_is_that_of_gauss():
-    """At Radau's points the same steps have twelve times the error."""
-    pytest.importorskip("casadi")
-    result = solve_collocation(*start(FOUR_BAR, FOUR_BAR.reference.t), 200)
-    assert 1e-9 < np.abs(result.q[:, -1] - FOUR_BAR.reference.q).max() < 8e-7
-
-
-def test_one_output_before_the_end_is_the_state_then():
-    pytest.importorskip("casadi")
-    result = solve_idas(*start(FOUR_BAR, 1.0), 1e-9, 1e-9, t_eval=[0.5])
-    assert result.t.tolist() == [0.5]
-    assert np.abs(result.q - trajectory(FOUR_BAR.parameters, [0.5])[0]).max() < 1e-5
 
 
 @pytest.mark.parametrize(("compiler", "flags"), [("cc", FLAGS), ("false", PLAIN)])
