@@ -35,7 +35,7 @@ MAX_NEWTON = 10
 NEWTON_TOL = 1e-12  # the last correction of a coordinate, relative to max(1, |q|)
 SLOW = 0.1  # a correction that is not this much smaller than the last one asks for a new Newton matrix
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |q|)
-FIRST_STEPS = 100  # of the first call of the compiled loop, when there is a time limit
+FIRST_STEPS = 100  # of the first call of the compiled loop
 CALL = 0.05  # s; the steps of a call are doubled until one takes that long, for a call itself costs some 0.1 ms
 WHOLE = 1e-6  # how far, in steps, the length of t_span may be from a whole number of them
 

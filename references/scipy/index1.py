@@ -28,7 +28,7 @@ from twoloop.result.result import Result
 Array = NDArray[np.float64]
 
 METHODS: dict[str, type[OdeSolver]] = {"DOP853": DOP853, "RK45": RK45, "LSODA": LSODA, "Radau": Radau, "BDF": BDF}
-PAIRS = ("Pr8", "Pr9")  # explicit Runge-Kutta pairs of extensisq (P. J. Prince), of orders 8(7) and 9(8)
+PAIR = "Pr9"  # explicit Runge-Kutta pair of extensisq (P. J. Prince), of orders 9(8)
 IMPLICIT = ("LSODA", "Radau", "BDF")  # wholly, or where the problem is stiff
 ONE_STEP = ("DOP853", "RK45")  # explicit, and nothing of them but y and f outlives a step: they can be projected
 STABILISATIONS = {
@@ -57,9 +57,9 @@ def solve_index1(
 
     Parameters
     ----------
-    method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr8", "Pr9"}
-        The solver of `scipy.integrate`, or of extensisq (`PAIRS`: on the four-bar the best of its pairs from 1e-5 down,
-        Pr9 at tight tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
+    method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr9"}
+        The solver of `scipy.integrate`, or of extensisq (`PAIR`: on the four-bar the best of its pairs at tight
+        tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
         can be had as expressions of up to `straight_line.MOST_OPERATIONS`, without Baumgarte's terms; else they
         difference the right-hand side.
     stabilisation : {"none", "baumgarte", "projection"}
@@ -90,7 +90,7 @@ def solve_index1(
         right-hand side, those for a difference Jacobian and after a projection included, those for the interpolant not;
         n_factorizations, SciPy's LU count, for "Radau" and "BDF".
     """
-    check_choice("method", method, (*METHODS, *PAIRS))
+    check_choice("method", method, (*METHODS, PAIR))
     check_choice("stabilisation", stabilisation, tuple(STABILISATIONS))
     projected, damped = stabilisation == "projection", stabilisation == "baumgarte"
     if projected and method not in ONE_STEP:

@@ -334,7 +334,7 @@ def test_wrong_tolerances_are_named(name, tol):
 @pytest.mark.parametrize(
     ("solve", "changed", "words"),
     [
-        (solve_index1, {"method": ["DOP853"]}, r"method must be 'DOP853', .*'Pr8' or 'Pr9'; given \['DOP853'\]"),
+        (solve_index1, {"method": ["DOP853"]}, r"method must be 'DOP853', .*'BDF' or 'Pr9'; given \['DOP853'\]"),
         (solve_index1, {"stabilisation": "glue"}, "stabilisation must be 'none', 'baumgarte' or 'projection'"),
         (solve_index1, {"stabilisation": "projection", "method": "LSODA"}, "one-step method, DOP853 or RK45"),
         (solve_index1, {"alpha": 5.0}, "alpha belongs to stabilisation='baumgarte'"),
