@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from references.driver import check_system
 from references.equations.rows import independent_rows
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.traced_equations import Equations, only
@@ -20,7 +19,7 @@ from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.kernels.data.common import GAMMA_GIVEN
 from twoloop.kernels.evaluation import operations
-from twoloop.problem.system import ConstrainedSystem
+from twoloop.problem.system import ConstrainedSystem, check_system
 
 Array = NDArray[np.float64]
 Functions = Mapping[str, Callable[[Any], Any]]  # those of FUNCTIONS that the package has, by name

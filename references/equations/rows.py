@@ -6,20 +6,16 @@ and solve_dae; those of solvers that take expressions do it in `references.equat
 others at the start may become independent later, so every row left out is checked at the end of the run.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import lru_cache, wraps
-from typing import Any, Concatenate, ParamSpec
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from twoloop import ConstrainedSystem, Result, Status, callback
+from twoloop import ConstrainedSystem, callback
 
 Array = NDArray[np.float64]
-Rest = ParamSpec("Rest")
-Solve = Callable[Concatenate[ConstrainedSystem, tuple[float, float], Any, Rest], Result]
 
 RANK = 1e-9  # of a row, which follows from those before it where it differs from what they span by less
 HOLDS = 1e-6  # of the largest coordinate, 1 at least: how far a position may be from a row that was left out ...
@@ -54,37 +50,56 @@ def with_all_rows(system: ConstrainedSystem) -> ConstrainedSystem:
     return _with_rows(system, tuple(range(system.n_c + system.n_a)), 0)
 
 
-def on_independent_rows(solve: Solve[Rest]) -> Solve[Rest]:
-    """Let a solver have the rows of C_q that do not follow from others at the start.
+class IndependentRows:
+    """The rows of C_q that do not follow from others at the start, for a solver that is to have no others.
 
-    The multipliers of all rows are then those of least norm which give the same forces. A start that violates a row
-    left out raises ValueError; a run that violates one at its end has failed.
+    Attributes
+    ----------
+    system : ConstrainedSystem
+        With these rows only; the one given, where they are all.
+
+    Raises
+    ------
+    ValueError
+        If the start violates a row left out.
     """
 
-    @wraps(solve)
-    def solve_independent(
-        system: ConstrainedSystem, t_span: tuple[float, float], q0: Any, *rest: Rest.args, **options: Rest.kwargs
-    ) -> Result:
-        kept = _independent(system, t_span, q0)
-        if kept is None:
-            return solve(system, t_span, q0, *rest, **options)
-        start = float(t_span[0]), np.asarray(q0, dtype=np.float64)
-        if broken := _broken(system, kept, *start):
-            raise ValueError(
-                f"q0 must satisfy all constraints of {system.name!r}: row(s) {broken} of C_q follow from others at t = "
-                f"{start[0]:g}, and contradict them. Correct these constraints, or leave them out"
-            )
-        some = _with_rows(system, kept, system.n_a)
-        result = solve(some, t_span, q0, *rest, **options)
-        if result.t.size and (broken := _broken(system, kept, float(result.t[-1]), result.q[:, -1])):
-            message = (
-                f"Row(s) {broken} of C_q follow from others at t = {start[0]:g}, were left out, and do not hold at the "
-                f"end, t = {result.t[-1]:g}: start where they are independent. {result.message}"
-            )
-            result = replace(result, status=Status.SOLVER_FAILED, message=message)
-        return replace(result, lam=_of_all_rows(system, some, result))
+    def __init__(self, system: ConstrainedSystem, t0: float, q0: Array):
+        self.all, self.system, self.t0 = system, system, t0
+        self.kept = independent_rows(system.jacobian(t0, q0)) if system.n_c else ()
+        if len(self.kept) < system.n_c:
+            self.system = _with_rows(system, self.kept, system.n_a)
+            if broken := self._broken(t0, q0):
+                raise ValueError(
+                    f"q0 must satisfy all constraints of {system.name!r}: row(s) {broken} of C_q follow from others at "
+                    f"t = {t0:g}, and contradict them. Correct these constraints, or leave them out"
+                )
 
-    return solve_independent
+    def failure(self, t: float, q: Array) -> str:
+        """What is wrong with the end of a run, at which rows that were left out do not hold; "" where they do."""
+        broken = self._broken(t, np.ascontiguousarray(q)) if np.isfinite(q).all() else []  # the solver says so
+        if not broken:
+            return ""
+        return (
+            f"Row(s) {broken} of C_q follow from others at t = {self.t0:g}, were left out, and do not hold at the end, "
+            f"t = {t:g}: start where they are independent. "
+        )
+
+    def _broken(self, t: float, q: Array) -> list[int]:
+        """Rows that were left out and do not hold at (t, q)."""
+        lengths = np.linalg.norm(self.all.jacobian(t, q), axis=1)
+        distances = np.abs(self.all.constraint(t, q)) / np.where(lengths > 0.0, lengths, 1.0)
+        limit = HOLDS * max(1.0, float(np.abs(q).max())) + BEYOND * float(distances[list(self.kept)].max(initial=0.0))
+        return [int(k) for k in np.flatnonzero(distances > limit) if k not in self.kept]
+
+    def multipliers(self, t: Array, q: Array, lam: Array) -> Array:
+        """Those of all rows (n_c + n_a, n_t): with C_q = T C_r, of all with T^T lam = lam_r those of least norm."""
+        forces, n_c = np.full((self.all.n_c, t.size), np.nan), len(self.kept)
+        for k in np.flatnonzero(np.isfinite(q).all(axis=0)):
+            at = float(t[k]), np.ascontiguousarray(q[:, k])
+            T = np.linalg.lstsq(self.system.jacobian(*at).T, self.all.jacobian(*at).T, rcond=None)[0].T
+            forces[:, k] = np.linalg.lstsq(T.T, lam[:n_c, k], rcond=None)[0]
+        return np.concatenate([forces, lam[n_c:]])
 
 
 def independent_rows(jacobian: Array) -> tuple[int, ...]:
@@ -100,60 +115,26 @@ def independent_rows(jacobian: Array) -> tuple[int, ...]:
     return tuple(rows)
 
 
-def _independent(system: Any, t_span: Any, q0: Any) -> tuple[int, ...] | None:
-    """Such rows; None where all are, or where the solver will refuse the arguments."""
-    if not isinstance(system, ConstrainedSystem) or np.shape(q0) != (system.n_q,) or np.shape(t_span) != (2,):
-        return None
-    q = np.asarray(q0, dtype=np.float64)
-    if system.n_c == 0 or not np.isfinite(q).all():
-        return None
-    kept = independent_rows(system.jacobian(float(t_span[0]), q))
-    return None if len(kept) == system.n_c else kept
-
-
-def _broken(system: ConstrainedSystem, kept: tuple[int, ...], t: float, q: Array) -> list[int]:
-    """Rows that were left out and do not hold at (t, q)."""
-    q = np.ascontiguousarray(q)
-    if not np.isfinite(q).all():
-        return []  # the solver says so
-    lengths = np.linalg.norm(system.jacobian(t, q), axis=1)
-    distances = np.abs(system.constraint(t, q)) / np.where(lengths > 0.0, lengths, 1.0)
-    limit = HOLDS * max(1.0, float(np.abs(q).max())) + BEYOND * float(distances[list(kept)].max(initial=0.0))
-    return [int(k) for k in np.flatnonzero(distances > limit) if k not in kept]
-
-
 @lru_cache(maxsize=64)
 def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...], n_a: int) -> ConstrainedSystem:
     """The system with these rows, of C and below them of A, as rows of C; and, as they are, n_a rows of A."""
-    f, left_out = system.functions, ("kinematics", "reaction_by_q") if n_a == system.n_a else NOT_WITH_MORE_ROWS
+    f, more = system.functions, n_a < system.n_a
+    left_out = NOT_WITH_MORE_ROWS if more else ("kinematics", "reaction_by_q")
     given = {kind: function for kind, function in system.given.items() if kind not in left_out}
-    below = None if n_a == system.n_a else (f.nonholonomic, f.nonholonomic_rate, f.nonholonomic_gamma)
-    made = _rows(kept, system.n_c, system.n_a - n_a, *(getattr(f, kind) for kind in ROWS), below)
-    given |= {kind: made[kind] for kind in ROWS if kind in given or below is not None}
-    return ConstrainedSystem(
-        n_q=system.n_q,
-        n_c=len(kept),
-        n_a=n_a,
-        parameters=f.p,
-        constant_mass=system.constant_mass,
-        name=system.name,
-        **given,
-    )
+    below = (f.nonholonomic, f.nonholonomic_rate, f.nonholonomic_gamma) if more else ()
+    made = _rows(kept, system.n_c, system.n_a - n_a, tuple(getattr(f, kind) for kind in ROWS), below)
+    given |= {kind: made[kind] for kind in ROWS if kind in given or more}
+    sizes: dict[str, Any] = {"n_q": system.n_q, "n_c": len(kept), "n_a": n_a, "constant_mass": system.constant_mass}
+    return ConstrainedSystem(**sizes, parameters=f.p, name=system.name, **given)
 
 
 @lru_cache(maxsize=64)
 def _rows(
-    kept: tuple[int, ...],
-    m: int,
-    n_a: int,
-    constraint: Dispatcher,
-    jacobian: Dispatcher,
-    constraint_rate: Dispatcher,
-    gamma: Dispatcher,
-    below: tuple[Dispatcher, Dispatcher, Dispatcher] | None,
+    kept: tuple[int, ...], m: int, n_a: int, of_c: tuple[Dispatcher, ...], of_a: tuple[Dispatcher, ...]
 ) -> dict[str, Dispatcher]:
     """The callbacks of the rows that are kept, of m of C and below them n_a of A."""
-    nonholonomic, nonholonomic_rate, nonholonomic_gamma = below or (jacobian, constraint_rate, gamma)
+    constraint, jacobian, constraint_rate, gamma = of_c
+    nonholonomic, nonholonomic_rate, nonholonomic_gamma = of_a or of_c[1:]
 
     @callback("constraint")
     def some_constraints(t, q, p, C):  # type: ignore[no-untyped-def]
@@ -190,13 +171,3 @@ def _rows(
             Qd[i] = of_all[kept[i]]
 
     return dict(zip(ROWS, (some_constraints, some_rows, some_rates, some_gammas), strict=True))
-
-
-def _of_all_rows(system: ConstrainedSystem, some: ConstrainedSystem, result: Result) -> Array:
-    """Multipliers (n_c + n_a, n_t) of all rows: with C_q = T C_r, of all with T^T lam = lam_r those of least norm."""
-    forces = np.full((system.n_c, result.t.size), np.nan)
-    for k in np.flatnonzero(np.isfinite(result.q).all(axis=0)):
-        t, q = float(result.t[k]), np.ascontiguousarray(result.q[:, k])
-        T = np.linalg.lstsq(some.jacobian(t, q).T, system.jacobian(t, q).T, rcond=None)[0].T
-        forces[:, k] = np.linalg.lstsq(T.T, result.lam[: some.n_c, k], rcond=None)[0]
-    return np.concatenate([forces, result.lam[some.n_c :]])

@@ -9,39 +9,31 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from references.equations.expressions import FUNCTIONS, Expressions, Written, expressions_at, functions_of
 from references.equations.linear import OPTIONS
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 COMMUTES = "+*"
 MOST_OPERATIONS = 3000  # of a Jacobian: numba takes two or three milliseconds for each
 
 
 class Program:
-    """Lines of a program, each an operation on two values or a function of one; the same one is written once."""
+    """Operations on two values and functions of one, each of which is written once, and their names."""
 
     def __init__(self) -> None:
-        self.lines: list[str] = []
         self.names: dict[tuple[str, ...], str] = {}
-        self.operations = 0
 
     def value(self, *what: str) -> "Value":
         """The value of (left, operator, right) or of (function, argument)."""
-        if what not in self.names:
-            self.names[what] = name = f"x{len(self.lines)}"
-            self.lines.append(f"{name} = {' '.join(what) if len(what) == 3 else '{}({})'.format(*what)}")
-            self.operations += 1
-        return Value(self, self.names[what])
+        return Value(self, self.names.setdefault(what, f"x{len(self.names)}"))
 
-    def functions(self) -> dict[str, Callable[["Value"], "Value"]]:
-        """The functions that `Expressions` asks for."""
-        return {name: lambda x, name=name: self.value(name, x.name) for name in FUNCTIONS.values()}  # type: ignore[misc]
+    @property
+    def lines(self) -> list[str]:
+        """Those of its code."""
+        texts = (" ".join(what) if len(what) == 3 else "{}({})".format(*what) for what in self.names)
+        return [f"{name} = {text}" for name, text in zip(self.names.values(), texts, strict=True)]
 
 
 class Value:
@@ -76,12 +68,8 @@ class Value:
         return self._with("-", 0.0, True)
 
 
-def program_of(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Program, list[str]]:
+def program_of(equations: Expressions) -> tuple[Program, list[str]]:
     """The program of the accelerations, of the values t, q0, q1, ..., v0, v1, ..., and the names of its results."""
-    return _program(Expressions(system, t0, q0, v0))
-
-
-def _program(equations: Expressions) -> tuple[Program, list[str]]:
     program = Program()
     made = _written(equations, program).each(equations.solution[: equations.system.n_q])
     return program, [_name(each) for each in made]
@@ -90,39 +78,32 @@ def _program(equations: Expressions) -> tuple[Program, list[str]]:
 def _written(equations: Expressions, program: Program) -> Written:
     """What writes forms into a program, of the values t, q0, q1, ..., v0, v1, ..."""
     names = ["t", *(f"{letter}{i}" for letter in "qv" for i in range(equations.system.n_q))]
-    return Written(equations.traced.graph, program.functions(), [Value(program, name) for name in names])
-
-
-def straight_line(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> Callable[..., Any]:
-    """(t, y, rate) -> None: y' of y = [q, v] into `rate`, compiled; kept for the next call with the same start."""
-    return _compiled(system, t0, q0.tobytes(), v0.tobytes())
-
-
-def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> Callable[..., Any] | None:
-    """(t, y, columns) -> None: what is not zero of d y'[i]/d y[k] into columns[k, i], compiled; kept.
-
-    None where that takes more than `MOST_OPERATIONS`, as on mechanisms of a dozen coordinates and more.
-    """
-    return _compiled_jacobian(system, t0, q0.tobytes(), v0.tobytes())
+    functions = {name: lambda x, name=name: program.value(name, x.name) for name in FUNCTIONS.values()}  # type: ignore[misc]
+    return Written(equations.traced.graph, functions, [Value(program, name) for name in names])
 
 
 @lru_cache(maxsize=256)
-def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
+def straight_line(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
+    """(t, y, rate) -> None: y' of y = [q, v] into `rate`, compiled; q0, v0: the bytes of the start."""
     n = system.n_q
-    program, names = _program(expressions_at(system, t0, q0, v0))
+    program, names = program_of(expressions_at(system, t0, q0, v0))
     results = [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
     return _machine_code(system, "rate", program, results)
 
 
 @lru_cache(maxsize=256)
-def _compiled_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
+def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
+    """(t, y, columns) -> None: what is not zero of d y'[i]/d y[k] into columns[k, i], compiled.
+
+    None where that takes more than `MOST_OPERATIONS`, as on mechanisms of a dozen coordinates and more.
+    """
     n, program = system.n_q, Program()
     equations = expressions_at(system, t0, q0, v0)
     written = _written(equations, program)
     results = [f"columns[{n + i}, {i}] = 1.0" for i in range(n)]
     for k, column in enumerate(equations.derivatives()):
         made = written.each(column)
-        if program.operations > MOST_OPERATIONS:
+        if len(program.names) > MOST_OPERATIONS:
             return None
         places = [(i, _name(each)) for i, each in enumerate(made) if isinstance(each, Value) or each != 0.0]
         results += [f"columns[{k}, {n + i}] = {name}" for i, name in places]

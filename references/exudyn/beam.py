@@ -9,7 +9,6 @@ approach. How closely, tests/references/test_exudyn_beam.py says.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import exudyn as exu
@@ -27,9 +26,9 @@ from exudyn.itemInterface import (
 )
 from numpy.typing import NDArray
 
-from references.driver import check_choice, check_problem
+from references.driver import check_problem
 from references.exudyn.run import add_sensors, check_steps, run
-from twoloop.checks.arguments import check_size
+from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Problem
 from twoloop.result.result import Result
 
@@ -47,7 +46,6 @@ def solve_exudyn_beam(
     n_steps: int,
     model: str = "cable",
     *,
-    n_elements: int | None = None,
     solver: str = "GeneralizedAlpha",
     store_every: int = 1,
     time_limit: float | None = None,
@@ -61,8 +59,6 @@ def solve_exudyn_beam(
     t_end, n_steps, solver, store_every, time_limit : see `references.exudyn.mechanisms.solve_exudyn`
     model : {"cable", "shear"}
         `MODELS` describes each in a line fit for a table. The first converges far faster with the mesh.
-    n_elements : int, optional
-        Number of equal elements. None: that of the problem.
 
     Returns
     -------
@@ -72,29 +68,26 @@ def solve_exudyn_beam(
         well. `lam` (2, n_t) is NaN too. All else as in `references.exudyn.mechanisms.solve_exudyn`.
     """
     check_problem(problem, "youngs_modulus", "a beam of twoloop.mechanisms.ancf_beam")
-    steps = check_steps(t_end, n_steps, solver, store_every, time_limit)
-    check_choice("model", model, MODELS)
-    p = problem.parameters
-    n_elements = p["n_elements"] if n_elements is None else check_size("n_elements", n_elements, 1)
-    _container, mbs, sensors, reference = _model(p, model, n_elements)
-    result = run(mbs, sensors, reference.ravel(), 2, steps)
-    q, v, a = (_ours(coordinates, n_elements) for coordinates in (result.q, result.v, result.a))
-    return replace(result, q=q, v=v, a=a)
+    steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit)
+    check_choice("model", model, tuple(MODELS))
+    _container, mbs, sensors, reference = _model(problem.parameters, model)
+    n_nodes = len(reference)
+    kept = 4 if model == "cable" else 2  # of x, y, slopes the first model has all, the second x, y and an angle
+
+    def among_six(coordinates: Array) -> Array:
+        """Exudyn's coordinates of the nodes among six a node."""
+        ours = np.full((n_nodes, 6, coordinates.shape[1]), np.nan)
+        ours[:, :kept] = coordinates.reshape(n_nodes, -1, coordinates.shape[1])[:, :kept]
+        return ours.reshape(-1, coordinates.shape[1])
+
+    return run(mbs, sensors, reference.ravel(), steps, lambda q, v, a: (among_six(q), among_six(v), among_six(a)))
 
 
-def _ours(coordinates: Array, n_elements: int) -> Array:
-    """Exudyn's coordinates of the nodes among six a node."""
-    nodes = coordinates.reshape(n_elements + 1, -1, coordinates.shape[1])
-    ours = np.full((n_elements + 1, 6, coordinates.shape[1]), np.nan)
-    kept = 4 if nodes.shape[1] == 4 else 2  # of x, y, slopes the first model has all, the second x, y and an angle
-    ours[:, :kept] = nodes[:, :kept]
-    return ours.reshape(-1, coordinates.shape[1])
-
-
-def _model(p: dict[str, Any], model: str, n_elements: int) -> tuple[Any, Any, list[list[int]], Array]:
+def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Array]:
     """Exudyn's container, the system in it, the sensors [node][output], and the reference coordinates [node]."""
     container = exu.SystemContainer()
     mbs = container.AddSystem()
+    n_elements = p["n_elements"]
     length = p["length"] / n_elements
     node_type, straight = (NodePoint2DSlope1, [1.0, 0.0]) if model == "cable" else (NodeRigidBody2D, [0.0])
     reference = np.array([[k * length, 0.0, *straight] for k in range(n_elements + 1)])

@@ -5,7 +5,6 @@ Euler parameters, as ours have, but for the bars of A04, whose rotation matrices
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -32,7 +31,6 @@ def solve_exudyn(
     solver: str = "GeneralizedAlpha",
     *,
     spectral_radius: float | None = None,
-    alpha: float | None = None,
     store_every: int = 1,
     time_limit: float | None = None,
 ) -> Result:
@@ -57,14 +55,11 @@ def solve_exudyn(
         "HHT": alpha_m = 0, alpha_f = -alpha, gamma = (1 - 2 alpha)/2, beta = (1 - alpha)^2/4 (Hilber, Hughes and
         Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292). Exudyn has no setting for it: its settings know alpha_m
         and alpha_f through r only, and r = 1/2, where alpha_m vanishes, is HHT with alpha = -1/3. For the others its
-        solver is started and its four coefficients are overwritten before the first step. This is the
-        formula of HHT-I3, not its step-size control.
+        solver is started and its four coefficients are overwritten before the first step, with MSC Adams' alpha of
+        -0.3. This is the formula of HHT-I3, not its step-size control.
     spectral_radius : float, optional
         Of "GeneralizedAlpha" alone, 0 (most damping) to 1 (none). None: 0.9, Exudyn's default. With 1 the index-3
         form is weakly unstable: on the four-bar linkage the run fails within seconds, whatever the step.
-    alpha : float, optional
-        Of "HHT" alone, -1/3 (most damping) to 0 (the trapezoidal rule, as unstable as a spectral radius of 1). None:
-        -0.3, the default of MSC Adams.
     store_every : int
         Store the start and every so many steps; `n_steps` must be a multiple of it.
     time_limit : float, optional
@@ -84,14 +79,14 @@ def solve_exudyn(
     if not isinstance(problem, Problem) or not has_model(problem):
         error, given = (ValueError, problem.name) if isinstance(problem, Problem) else (TypeError, problem)
         raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
-    steps = check_steps(t_end, n_steps, solver, store_every, time_limit, spectral_radius, alpha)
-    model, redundant = model_of(problem), problem.name.startswith(REDUNDANT)
+    steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit, spectral_radius)
+    model, ours = model_of(problem), None
     reference = np.concatenate(model.reference)
-    result = run(model.mbs, model.sensors, reference, problem.system.n_c, steps, redundant)
     if problem.name == bricard().name:
-        return _with_matrices(result)
-    tips = problem.name.startswith("A02") and len(problem.q0) != len(result.q)
-    return _with_tips(result, problem.parameters["n"]) if tips else result
+        ours = _with_matrices
+    elif problem.name.startswith("A02") and problem.q0.size != reference.size:
+        ours = _with_tips
+    return run(model.mbs, model.sensors, reference, steps, ours, problem.name.startswith(REDUNDANT))
 
 
 def model_of(problem: Problem) -> Model:
@@ -139,9 +134,10 @@ def _spatial_slider_crank(problem: Problem) -> Model:
     for name, (q, v) in zip(("crank", "rod", "slider"), _states(problem), strict=True):
         model.body(p["masses"][name], p["inertias"][name], q, v)
     (centre, rod), (slider, _) = model.places[1:]
-    model.joint(GROUND, 0, p["A"], frame(z=X), REVOLUTE)
+    model.joint(GROUND, 0, p["A"], frame(X), REVOLUTE)
     model.joint(0, 1, centre - 0.5 * p["rod"] * rod[:, 0], np.eye(3), SPHERICAL)
-    model.joint(1, 2, slider, frame(x=rod[:, 1], y=X), UNIVERSAL)
+    across = rod[:, 1]
+    model.joint(1, 2, slider, np.column_stack([across, X, np.cross(across, X)]), UNIVERSAL)
     model.joint(GROUND, 2, slider, np.eye(3), PRISMATIC)
     return model
 
@@ -157,11 +153,11 @@ def _governor(problem: Problem) -> Model:
     bodies = [(bar, box(bar, WIDTH, WIDTH, LENGTH)), (cube, box(cube, CUBE, CUBE, CUBE)), rod, rod]
     for (mass, inertia), (q, v) in zip(bodies, _states(problem), strict=True):
         model.body(mass, inertia, q, v)
-    model.joint(GROUND, 0, (0.0, 0.0, 0.0), frame(z=Z), REVOLUTE)
-    model.joint(0, 1, (0.0, 0.0, HEIGHT), frame(x=Z), PRISMATIC)
+    model.joint(GROUND, 0, (0.0, 0.0, 0.0), frame(Z), REVOLUTE)
+    model.joint(0, 1, (0.0, 0.0, HEIGHT), np.roll(frame(Z), 1, axis=1), PRISMATIC)  # along z
     for body, side in ((2, 0.5 * CUBE), (3, -0.5 * CUBE)):
         hinge = np.array([side, 0.0, LENGTH])
-        model.joint(0, body, hinge, frame(z=Y), REVOLUTE)
+        model.joint(0, body, hinge, frame(Y), REVOLUTE)
         middle = hinge + 0.5 * LENGTH * model.places[body][1][:, 0]
         model.spring(1, (side, 0.0, HEIGHT), body, middle, STIFFNESS, DAMPING, SLACK)
     return model
@@ -175,18 +171,26 @@ def _bricard(problem: Problem) -> Model:
         model.body(1.0, (2.0 * width, 1.0 / 12.0 + width, 1.0 / 12.0 + width), q, np.zeros(7))
     for hinge, (corner, axis) in enumerate(zip(CORNERS, AXES, strict=True)):
         after = hinge if hinge < 5 else GROUND
-        model.joint(hinge - 1 if hinge else GROUND, after, corner, frame(z=axis), REVOLUTE)
+        model.joint(hinge - 1 if hinge else GROUND, after, corner, frame(axis), REVOLUTE)
     return model
 
 
-def _with_matrices(result: Result) -> Result:
+def _with_matrices(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
     """Bars by their centres and rotation matrices in place of Euler parameters."""
-    q, v = [], []
-    for x, u in zip(result.q.reshape(5, 7, -1), result.v.reshape(5, 7, -1), strict=True):
-        q += [x[:3], *np.array([rotation_matrix(e).T for e in x[3:].T]).reshape(-1, 9).T[None]]
-        rates = [np.array(rotated_rate.py_func(*x[3:], *u[3:], *axis)) for axis in np.eye(3)]
-        v += [u[:3], *rates]
-    return replace(result, q=np.concatenate(q), v=np.concatenate(v), a=np.full((60, result.t.size), np.nan))
+    places, rates = [], []
+    for x, u in zip(q.reshape(5, 7, -1), v.reshape(5, 7, -1), strict=True):
+        places += [x[:3], *np.array([rotation_matrix(e).T for e in x[3:].T]).reshape(-1, 9).T[None]]
+        rates += [u[:3], *(np.array(rotated_rate.py_func(*x[3:], *u[3:], *axis)) for axis in np.eye(3))]
+    return np.concatenate(places), np.concatenate(rates), np.full((60, q.shape[1]), np.nan)
+
+
+def _with_tips(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+    """The tips of the n + 1 cranks in place of the 2 n + 1 bars."""
+    n, n_t = len(q) // 6, q.shape[1]
+    x, u = (each.reshape(-1, 3, n_t)[: n + 1, :2] for each in (q, v))
+    ground = np.column_stack([np.arange(n + 1.0), np.zeros(n + 1)])
+    tips, rates = ((2.0 * x - ground[:, :, None]).reshape(-1, n_t), (2.0 * u).reshape(-1, n_t))
+    return tips, rates, np.full_like(tips, np.nan)
 
 
 def _n_four_bar(problem: Problem) -> Model:
@@ -201,15 +205,6 @@ def _n_four_bar(problem: Problem) -> Model:
         model.pin(n + 1 + j, (-0.5, 0.0), j, (0.5, 0.0))
         model.pin(n + 1 + j, (0.5, 0.0), j + 1, (0.5, 0.0))
     return model
-
-
-def _with_tips(result: Result, n: int) -> Result:
-    """The tips of the cranks in place of the bars."""
-    ground = np.column_stack([np.arange(n + 1.0), np.zeros(n + 1)])
-    q, v = (x.reshape(-1, 3, result.t.size)[: n + 1, :2] for x in (result.q, result.v))
-    tips = 2.0 * q - ground[:, :, None]
-    shape = (2 * n + 2, result.t.size)
-    return replace(result, q=tips.reshape(shape), v=(2.0 * v).reshape(shape), a=np.full(shape, np.nan))
 
 
 def _slider_crank(problem: Problem) -> Model:

@@ -114,15 +114,9 @@ class Model:
         self.mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=markers))
 
 
-def frame(x: ArrayLike | None = None, y: ArrayLike | None = None, z: ArrayLike | None = None) -> Array:
-    """A rotation matrix with one or two columns given."""
-    columns = [None if each is None else np.asarray(each, dtype=float) for each in (x, y, z)]
-    given = [k for k, each in enumerate(columns) if each is not None]
-    k, one = given[0], columns[given[0]]
-    assert one is not None
-    if len(given) == 1:
-        across = np.cross(one, np.eye(3)[int(np.argmin(np.abs(one)))])
-        columns[(k + 1) % 3] = across / np.linalg.norm(across)
-    missing = next(k for k, each in enumerate(columns) if each is None)
-    columns[missing] = np.cross(columns[(missing + 1) % 3], columns[(missing + 2) % 3])  # type: ignore[arg-type]
-    return np.column_stack(columns)  # type: ignore[arg-type]
+def frame(z: ArrayLike) -> Array:
+    """A rotation matrix whose last column is given."""
+    z = np.asarray(z, dtype=float)
+    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])

@@ -7,7 +7,7 @@ cannot be solved" (1.13.6).
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import exudyn as exu
@@ -15,12 +15,13 @@ import numpy as np
 from exudyn.itemInterface import SensorNode
 from numpy.typing import NDArray
 
-from references.driver import TimeLimit, check_choice, check_time_limit, result_of, user_call
-from twoloop.checks.arguments import check_number, check_positive, check_size
+from references.driver import Task, TimeLimit, check_time_limit, user_call
+from twoloop.checks.arguments import check_choice, check_number, check_positive, check_size
+from twoloop.problem.problem import Problem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
+Ours = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 SPECTRAL_RADIUS = 0.9  # Exudyn's default
 ALPHA = -0.3  # of HHT; the default of MSC Adams, whose HHT integrator is the usual one on index 3
@@ -40,47 +41,37 @@ _OUTPUTS = (
 class Steps(NamedTuple):
     """The arguments that all models take, checked."""
 
-    t_end: float
+    task: Task
     n_steps: int
     solver: str
     store_every: int
-    time_limit: float | None
     radius: float
-    alpha: float
 
 
 def check_steps(
+    problem: Problem,
     t_end: float,
     n_steps: int,
     solver: str,
     store_every: int,
     time_limit: float | None,
     spectral_radius: float | None = None,
-    alpha: float | None = None,
 ) -> Steps:
-    """Return the arguments, with Exudyn's default of the radius and MSC Adams' of alpha, or say what is wrong."""
+    """Return the arguments, with Exudyn's default of the radius, or say what is wrong with one."""
     check_positive("t_end", t_end)
     check_time_limit(time_limit)
     n_steps, store_every = check_size("n_steps", n_steps, 1), check_size("store_every", store_every, 1)
     if n_steps % store_every != 0:
         raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
-    check_choice("solver", solver, SOLVERS)
-    radius = _option("spectral_radius", spectral_radius, SPECTRAL_RADIUS, (0.0, 1.0), "GeneralizedAlpha", solver)
-    strength = _option("alpha", alpha, ALPHA, (-1.0 / 3.0, 0.0), "HHT", solver)
-    return Steps(float(t_end), n_steps, solver, store_every, time_limit, radius, strength)
-
-
-def _option(
-    name: str, value: float | None, default: float, span: tuple[float, float], owner: str, solver: str
-) -> float:
-    """The value of an option that belongs to one solver, checked."""
-    if value is None:
-        return default
-    if solver != owner:
-        raise ValueError(f"{name} belongs to solver={owner!r}; given {name}={value!r} with solver={solver!r}")
-    if not span[0] <= check_number(name, value) <= span[1]:
-        raise ValueError(f"{name} must be between {span[0]:g} and {span[1]:g}; given {value!r}")
-    return float(value)
+    check_choice("solver", solver, tuple(SOLVERS))
+    radius = SPECTRAL_RADIUS if spectral_radius is None else check_number("spectral_radius", spectral_radius)
+    if spectral_radius is not None and solver != "GeneralizedAlpha":
+        raise ValueError(f"spectral_radius belongs to solver='GeneralizedAlpha'; given {radius!r} with {solver!r}")
+    if not 0.0 <= radius <= 1.0:
+        raise ValueError(f"spectral_radius must be between 0 and 1; given {radius!r}")
+    system = problem.system
+    task = Task(system, system.n_c, 0.0, float(t_end), problem.q0, problem.v0, None, time_limit)
+    return Steps(task, n_steps, solver, store_every, radius)
 
 
 def add_sensors(mbs: Any, node: int) -> list[int]:
@@ -90,21 +81,27 @@ def add_sensors(mbs: Any, node: int) -> list[int]:
 
 
 def run(
-    mbs: Any, sensors: Sequence[list[int]], reference: Array, n_c: int, steps: Steps, dependent_rows: bool = False
+    mbs: Any,
+    sensors: Sequence[list[int]],
+    reference: Array,
+    steps: Steps,
+    ours: Ours | None,
+    dependent_rows: bool = False,
 ) -> Result:
-    """Solve an assembled system whose nodes have these sensors and reference coordinates, with n_c constraints.
+    """Solve an assembled system whose nodes have these sensors and reference coordinates.
 
+    `ours` makes coordinates, velocities and accelerations of a problem of those of Exudyn; None: they are Exudyn's.
     With dependent rows, which Exudyn's usual linear solver cannot treat, a dense one leaves out what is singular.
     """
-    t_end, n_steps, solver, store_every, time_limit, radius, alpha = steps
-    settings = _settings(t_end, n_steps, store_every)
+    task, n_steps, solver, store_every, radius = steps
+    settings = _settings(task.t1, n_steps, store_every)
     if dependent_rows:
         settings.linearSolver.solverType = exu.LinearSolverType.EigenDense
         settings.linearSolver.ignoreSingularJacobian = True
     settings.timeIntegration.generalizedAlpha.spectralRadius = radius
-    limit = TimeLimit(time_limit)
-    with _silence(), user_call as clock:
-        failure = _solve_hht(mbs, settings, alpha, limit) if solver == "HHT" else _solve(mbs, settings, solver, limit)
+    limit = TimeLimit(task.time_limit)
+    with _silence(), user_call:
+        failure = _solve_hht(mbs, settings, limit) if solver == "HHT" else _solve(mbs, settings, solver, limit)
     tables = [[mbs.GetSensorStoredData(sensor) for sensor in node] for node in sensors]  # (n_t, 1 + n), time first
     t = tables[0][0][:, 0]
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
@@ -115,15 +112,11 @@ def run(
         message = limit.message("Exudyn", did.currentTime, "take fewer steps")
     elif failure:
         message = f"Exudyn failed in the step to t = {did.currentTime:.10g}: {failure}. Take more steps."
-    statistics = Statistics(
-        n_accepted=made,
-        n_outer=did.newtonStepsCount,
-        n_factorizations=did.newtonJacobiCount,
-        cpu_time=clock.seconds or 0.0,
-    )
-    columns = np.concatenate([q + reference[:, None], v, a, np.full((n_c, t.size), np.nan)])
+    counts = {"n_accepted": made, "n_outer": did.newtonStepsCount, "n_factorizations": did.newtonJacobiCount}
+    q += reference[:, None]
+    rows = np.concatenate([*((q, v, a) if ours is None else ours(q, v, a)), np.full((task.n_c, t.size), np.nan)])
     h = np.full(t.size - 1, did.currentStepSize) if store_every == 1 else None
-    return result_of(len(q), t, columns, f"Exudyn reached the end, t = {t[-1]:g}.", message, statistics, h)
+    return task.result("Exudyn", t, rows, message, h=h, **counts)
 
 
 def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
@@ -139,7 +132,7 @@ def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
     return ""
 
 
-def _solve_hht(mbs: Any, settings: Any, alpha: float, limit: TimeLimit) -> str:
+def _solve_hht(mbs: Any, settings: Any, limit: TimeLimit) -> str:
     """Run the generalized-alpha solver with HHT's coefficients; the text of a failure, or nothing."""
     if limit.seconds is not None:
         # Exudyn's own timeout does not know when a solver started by hand began; this call costs 0.4 us a step
@@ -147,8 +140,8 @@ def _solve_hht(mbs: Any, settings: Any, alpha: float, limit: TimeLimit) -> str:
     solver: Any = exu.MainSolverImplicitSecondOrder()
     mbs.sys["dynamicSolver"] = solver  # where SolveDynamic leaves it, too
     solver.InitializeSolver(mbs, settings)
-    solver.alphaM, solver.alphaF = 0.0, -alpha
-    solver.newmarkBeta, solver.newmarkGamma = 0.25 * (1.0 - alpha) ** 2, 0.5 - alpha
+    solver.alphaM, solver.alphaF = 0.0, -ALPHA
+    solver.newmarkBeta, solver.newmarkGamma = 0.25 * (1.0 - ALPHA) ** 2, 0.5 - ALPHA
     solver.factJacAlgorithmic = 1.0 - solver.alphaF  # (1 - alpha_f) / (1 - alpha_m)
     reached = solver.SolveSteps(mbs, settings)
     solver.FinalizeSolver(mbs, settings)

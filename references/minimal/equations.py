@@ -6,7 +6,7 @@ of the same names).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,8 +63,7 @@ def minimal(problem: Problem) -> Minimal:
 
 def _pendulum(problem: Problem) -> Minimal:
     """One angle from the downward vertical: th'' = -g / L sin th."""
-    length, gravity = problem.parameters["length"], problem.parameters["gravity"]
-    pull = gravity / length
+    pull = problem.parameters["gravity"] / problem.parameters["length"]
 
     def equations(functions: Any) -> Equations:
         sin = functions.sin
@@ -74,11 +73,7 @@ def _pendulum(problem: Problem) -> Minimal:
 
         return rates
 
-    def states(y: Array) -> tuple[Array, Array]:
-        s, c = np.sin(y[0]), np.cos(y[0])
-        return length * np.array([s, -c]), length * y[1] * np.array([c, s])
-
-    return Minimal(equations, _angles_of(problem, (0.0, 0.0)), states)
+    return _chain(problem, equations)
 
 
 def _double_pendulum(problem: Problem) -> Minimal:
@@ -87,8 +82,7 @@ def _double_pendulum(problem: Problem) -> Minimal:
     Lagrange: 2 th1'' + c th2'' = -s th2'^2 - 2 g/L sin th1 and c th1'' + th2'' = s th1'^2 - g/L sin th2, with c and s
     of th1 - th2.
     """
-    length, gravity = problem.parameters["length"], problem.parameters["gravity"]
-    pull = gravity / length
+    pull = problem.parameters["gravity"] / problem.parameters["length"]
 
     def equations(functions: Any) -> Equations:
         sin, cos = functions.sin, functions.cos
@@ -102,21 +96,23 @@ def _double_pendulum(problem: Problem) -> Minimal:
 
         return rates
 
+    return _chain(problem, equations)
+
+
+def _chain(problem: Problem, equations: Callable[[Any], Equations]) -> Minimal:
+    """Links of one length, hanging from the origin one below the other, by their angles from the downward vertical."""
+    length = problem.parameters["length"]
+
     def states(y: Array) -> tuple[Array, Array]:
-        s, c = length * np.sin(y[:2]), length * np.cos(y[:2])
-        x, z = np.cumsum(s, axis=0), np.cumsum(-c, axis=0)
-        xv, zv = np.cumsum(c * y[2:], axis=0), np.cumsum(s * y[2:], axis=0)
-        return np.array([x[0], z[0], x[1], z[1]]), np.array([xv[0], zv[0], xv[1], zv[1]])
+        angles, rates = np.split(y, 2)
+        s, c = length * np.sin(angles), length * np.cos(angles)
+        q, v = (np.cumsum(each, axis=1).swapaxes(0, 1) for each in ([s, -c], [c * rates, s * rates]))
+        return q.reshape(y.shape), v.reshape(y.shape)
 
-    return Minimal(equations, _angles_of(problem, (0.0, 0.0)), states)
-
-
-def _angles_of(problem: Problem, pivot: Sequence[float]) -> tuple[float, ...]:
-    """Angles of a chain of links from the downward vertical and their rates, from points and their velocities."""
-    links = np.diff(np.vstack([pivot, problem.q0.reshape(-1, 2)]), axis=0)
-    speeds = np.diff(np.vstack([(0.0, 0.0), problem.v0.reshape(-1, 2)]), axis=0)
+    links, speeds = (np.diff(x.reshape(-1, 2), axis=0, prepend=0.0) for x in (problem.q0, problem.v0))
     turns = (-links[:, 1] * speeds[:, 0] + links[:, 0] * speeds[:, 1]) / (links**2).sum(axis=1)
-    return (*np.arctan2(links[:, 0], -links[:, 1]).tolist(), *turns.tolist())
+    start = (*np.arctan2(links[:, 0], -links[:, 1]).tolist(), *turns.tolist())
+    return Minimal(equations, start, states)
 
 
 def _slider_crank(problem: Problem) -> Minimal:

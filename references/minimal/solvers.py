@@ -9,19 +9,16 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import carray, cfunc, njit, types
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from references.driver import Task, check_task, imported
-from references.equations.ode import ode_result
 from references.heyoka import taylor
 from references.minimal.equations import Minimal, minimal
 from references.sundials import cvode_c
-from references.sundials.library import library
 from twoloop.checks.arguments import check_positive
 from twoloop.mechanisms import Problem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -64,8 +61,9 @@ def solve_heyoka_minimal(
     """
     check_positive("tol", tol)
     own, task = _checked(problem, t_end, t_eval, time_limit)
-    given = np.array(own.start), (0.0, t_end), task.instants, time_limit, t_end
-    return _result(own, task, *taylor.integrate(_integrator(own, float(tol)), *given))
+    integrator = _integrator(own, float(tol))
+    name, times, rows, failure, steps = taylor.integrate(integrator, np.array(own.start), task, task.t1)
+    return task.result(name, times, _states(own, task, rows), failure, n_accepted=steps)
 
 
 def solve_cvode_minimal(
@@ -81,60 +79,49 @@ def solve_cvode_minimal(
 
     Parameters, errors and result are those of `solve_heyoka_minimal`, but for CVODE's two tolerances and its counters.
     """
-    own, task = _checked(problem, t_end, t_eval, time_limit, (rtol, atol))
+    check_positive("rtol", rtol)
+    check_positive("atol", atol)
+    own, task = _checked(problem, t_end, t_eval, time_limit)
     functions, start = cvode_c.Functions(_right_hand_side(own)), np.array(own.start)
-    made = cvode_c.integrate(functions, start, (0.0, t_end), "Adams", rtol, atol, task.instants, time_limit)
-    times, rows, failure, statistics = made
-    return _result(own, task, times, rows, failure, f"CVODE, Adams, reached the end, t = {t_end:g}.", statistics)
+    times, rows, failure, counts = cvode_c.integrate(functions, start, task, "Adams", rtol, atol)
+    return task.result("CVODE, Adams,", times, _states(own, task, rows), failure, **counts)
 
 
 def _checked(
-    problem: Problem,
-    t_end: float,
-    t_eval: ArrayLike | None,
-    time_limit: float | None,
-    tolerances: tuple[float, float] | None = None,
+    problem: Problem, t_end: float, t_eval: ArrayLike | None, time_limit: float | None
 ) -> tuple[Minimal, Task]:
+    """The equations of a problem, made once for that object, as what is built of them is kept by them; and the task."""
     if not isinstance(problem, Problem):
         raise TypeError(f"problem must be a Problem of twoloop.mechanisms; given {problem!r}")
-    span = 0.0, t_end
-    task = check_task(problem.system, span, problem.q0, problem.v0, t_eval, time_limit, tolerances, derivatives=False)
-    return _minimal(problem), task
-
-
-def _minimal(problem: Problem) -> Minimal:
-    """The equations of a problem, made once for that object, as what is built of them is kept by them."""
+    start = problem.system, (0.0, t_end), problem.q0, problem.v0
+    task = check_task(*start, t_eval, time_limit, derivatives=False)
     if id(problem) not in _KNOWN:
         _KNOWN[id(problem)] = problem, minimal(problem)
-    return _KNOWN[id(problem)][1]
+    return _KNOWN[id(problem)][1], task
 
 
 @lru_cache(maxsize=256)
 def _integrator(own: Minimal, tol: float) -> Any:
     package = imported("heyoka")
     symbols = package.make_vars(*(f"y{i}" for i in range(len(own.start))))
-    equations = list(zip(symbols, own.equations(package)(symbols), strict=True))
-    return package.taylor_adaptive(equations, list(own.start), tol=tol, fast_math=True, compact_mode=False)
+    motion = list(zip(symbols, own.equations(package)(symbols), strict=True))
+    return taylor.built(motion, list(own.start), 0.0, tol, unrolled=True)
 
 
 @lru_cache(maxsize=64)
 def _right_hand_side(own: Minimal) -> Any:
     """CVODE's right-hand side function."""
     rates, size = njit(error_model="numpy")(own.equations(math)), len(own.start)
-    array_of, pointer = library().N_VGetArrayPointer, types.voidptr
 
-    @cfunc(types.int32(types.float64, pointer, pointer, pointer), error_model="numpy")
-    def right_hand_side(t, y, rate, memory):  # type: ignore[no-untyped-def]
-        found, place = rates(carray(array_of(y), (size,))), carray(array_of(rate), (size,))
+    @njit(error_model="numpy")
+    def derivative(t, y, rate):  # type: ignore[no-untyped-def]
+        found = rates(y)
         for i in range(size):
-            place[i] = found[i]
-        return 0
+            rate[i] = found[i]
 
-    return right_hand_side
+    return cvode_c.right_hand_side(derivative, size)
 
 
-def _result(
-    own: Minimal, task: Task, times: Array, rows: Array, failure: str, end: str, statistics: Statistics
-) -> Result:
-    states = np.concatenate(own.states(rows.T)) if times.size else np.empty((2 * task.system.n_q, 0))
-    return ode_result(task.system, times, states, failure, end, statistics)
+def _states(own: Minimal, task: Task, rows: Array) -> Array:
+    """[q, v] (2 n_q, n_t) of [angles, rates] as rows."""
+    return np.concatenate(own.states(rows.T)) if len(rows) else np.empty((2 * task.system.n_q, 0))

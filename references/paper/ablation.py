@@ -6,18 +6,17 @@ What differs is what becomes of a stage's coordinates and of the end of a step: 
 """
 
 import time
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from references.driver import TimeLimit, check_choice, check_task, result_of
+from references.driver import Task, TimeLimit, adapter
 from references.paper import ablation_kernels as kernels
-from twoloop.checks.arguments import check_positive
+from twoloop.checks.arguments import check_choice
 from twoloop.kernels.data.common import GAMMA_GIVEN, Kit
 from twoloop.methods.tableaux import Tableau
-from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -41,25 +40,19 @@ REASONS = {
 }
 
 
+@adapter(velocity_rows=False)
 def solve_variant(
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
+    task: Task,
     variant: str,
     tableau: Tableau,
     *,
     step: float | None = None,
     tol: float | None = None,
-    loop_tol: float | None = None,
-    time_limit: float | None = None,
 ) -> tuple[Result, float]:
     """Integrate by a Runge-Kutta tableau with one of five ways to keep the constraints.
 
     Parameters
     ----------
-    system, t_span, q0, v0, time_limit : see `references.driver`
-        With `gamma`, and with constraints on positions that do not depend on one another.
     variant : str
         One of `VARIANTS`, which says what each does.
     tableau : Tableau
@@ -67,10 +60,10 @@ def solve_variant(
     step : float, optional
         A fixed step, s: the nearest that goes into t_span a whole number of times.
     tol : float, optional
-        Instead of a fixed step: rtol = atol of eqs. (26), (27), (31), by a step and two halves, the latter kept.
-    loop_tol : float, optional
-        Change of a stage, relative to max(1, |y|), at which the loop over the stages ends. None: 1e-4 tol, at least
-        1e-11, as with fixed steps.
+        Instead of a fixed step: rtol = atol of eqs. (26), (27), (31), by a step and two halves, the latter kept. The
+        loop over the stages ends at a change of 1e-4 tol, relative to max(1, |y|), at least 1e-11, as with fixed steps.
+    others : see `references.driver`
+        The system has `gamma`, and constraints on positions that do not depend on one another; no t_eval.
 
     Returns
     -------
@@ -88,61 +81,38 @@ def solve_variant(
     matrices of each stage; where the last stage is not the end of the step, the end is put onto the constraints as with
     projection (U. Ascher and L. Petzold, SIAM J. Numer. Anal. 28 (1991) 1097-1120), else the method loses its order.
     """
-    check_choice("variant", variant, VARIANTS)
+    check_choice("variant", variant, tuple(VARIANTS))
     if (step is None) == (tol is None):
         raise ValueError(f"give either step, for fixed steps, or tol; given step={step!r}, tol={tol!r}")
-    task = check_task(system, t_span, q0, v0, None, time_limit, takes_velocity_rows=False)
-    system, t0, t1 = task.system, task.t0, task.t1
-    check_positive("tol" if step is None else "step", tol if step is None else step)
+    system, span, which = task.system, task.t1 - task.t0, list(VARIANTS).index(variant)
     if not system.functions.flags[GAMMA_GIVEN]:
         raise ValueError(f"system must have gamma; given {system.name!r} without it")
     if np.linalg.matrix_rank(tableau.A) < tableau.stages:
         raise ValueError(f"tableau must have an invertible A; that of {tableau.name} is singular")
-    span, which = t1 - t0, list(VARIANTS).index(variant)
-    if loop_tol is None:
-        loop_tol = max(LOOP_SHARE * (tol or 0.0), LEAST_LOOP)
-    check_positive("loop_tol", loop_tol)
 
     n, m, s = system.n_q, system.n_c, tableau.stages
-    limit = TimeLimit(time_limit)
     order = FROZEN_ORDER if which == kernels.FROZEN else tableau.order
     coefficients = [np.ascontiguousarray(x) for x in (tableau.A, tableau.b, tableau.c, np.linalg.inv(tableau.A))]
     counters, where = np.zeros(kernels.N_COUNTERS, dtype=np.int64), np.zeros(kernels.N_PLACES)
-    n_steps = 0 if step is None else max(1, round(span / step))
-    where[kernels.T], where[kernels.H], where[kernels.LONGEST] = t0, span / n_steps if n_steps else FIRST * span, span
-    state = np.concatenate([task.y0, np.zeros(n + m)])
-    chunks = [np.empty((1, 1 + 3 * n + m))]
-    given = (n, m, s, which, order, *coefficients, t0, t1, n_steps, 0.0 if tol is None else float(tol), float(loop_tol))
-    began = time.process_time()
-    code = kernels.run(Kit(system.functions), *given, state, where, chunks[0], counters)  # a and lam of the start
-    while code == kernels.DONE and where[kernels.T] < t1 and not limit.passed():
+    n_steps, tol = 0 if step is None else max(1, round(span / step)), tol or 0.0
+    where[kernels.T], where[kernels.H] = task.t0, span / n_steps if n_steps else FIRST * span
+    where[kernels.LONGEST], loop_tol = span, max(LOOP_SHARE * tol, LEAST_LOOP)
+    state, chunks = np.concatenate([task.y0, np.zeros(n + m)]), [np.empty((1, 1 + 3 * n + m))]
+    given = n, m, s, which, order, *coefficients, task.t0, task.t1, n_steps, tol, loop_tol, state, where
+    limit, began = TimeLimit(task.time_limit), time.process_time()
+    code = kernels.run(Kit(system.functions), *given, chunks[0], counters)  # a and lam of the start
+    while code == kernels.DONE and where[kernels.T] < task.t1 and not limit.passed():
         chunks.append(np.empty((CHUNK, 1 + 3 * n + m)))
         before = counters[kernels.STEPS]
-        code = kernels.run(Kit(system.functions), *given, state, where, chunks[-1], counters)
+        code = kernels.run(Kit(system.functions), *given, chunks[-1], counters)
         chunks[-1] = chunks[-1][: counters[kernels.STEPS] - before]
-    cpu = time.process_time() - began
-    return _result(f"{tableau.name}, {variant}", n, chunks, code, counters, cpu, limit), float(where[kernels.MU])
-
-
-def _result(
-    name: str, n: int, chunks: list[Array], code: int, counters: NDArray[np.int64], cpu: float, limit: TimeLimit
-) -> Result:
-    rows = np.concatenate(chunks).T
-    t = float(rows[0, -1])
-    failure = ""
+    counts: dict[str, Any] = dict(zip(kernels.COUNTERS, counters.tolist(), strict=True))
+    counts["cpu_time"] = time.process_time() - began
+    rows, name = np.concatenate(chunks).T, f"{tableau.name}, {variant}"
+    t, failure = float(rows[0, -1]), ""
     if limit.exceeded:
         failure = limit.message(name, t, "take longer steps")
     elif code != kernels.DONE:
         failure = f"{name} failed after t = {t:.10g}: {REASONS[code]}. Take shorter steps."
-    statistics = Statistics(
-        n_accepted=int(counters[kernels.STEPS]),
-        n_rejected_error=int(counters[kernels.REFUSED]),
-        n_rejected_convergence=int(counters[kernels.DIVERGED]),
-        n_outer=int(counters[kernels.SWEEPS]),
-        n_inner=int(counters[kernels.NEWTON]),
-        n_evaluations=int(counters[kernels.EVALUATIONS]),
-        n_partitions=int(counters[kernels.PARTITIONS]),
-        n_factorizations=int(counters[kernels.FACTORIZATIONS]),
-        cpu_time=cpu,
-    )
-    return result_of(n, rows[0], rows[1:], f"{name} reached the end, t = {t:g}.", failure, statistics, np.diff(rows[0]))
+    result = task.result(name, rows[0], rows[1:], failure, h=np.diff(rows[0]), **counts)
+    return result, float(where[kernels.MU])

@@ -17,10 +17,14 @@ MOST_SWEEPS, MOST_NEWTON = 100, 10
 HOPELESS = 1e3  # times the first change of the stages: the loop diverges
 KEPT = 1e-9  # correction of q at which the constraints are solved: what is left is its square
 LEAST_STEP = 1e-12  # of the time span
-ROUNDING = 1e-14  # of coefficients
+ROUNDING = 1e-14  # of coefficients: where they differ by less, the last stage is the end of the step
 
 DONE, NOT_CONVERGED, SINGULAR, TOO_SMALL = range(4)
 EVALUATIONS, FACTORIZATIONS, SWEEPS, NEWTON, STEPS, REFUSED, DIVERGED, PARTITIONS, N_COUNTERS = range(9)
+COUNTERS = (  # those, as `Statistics` calls them
+    *("n_evaluations", "n_factorizations", "n_outer", "n_inner", "n_accepted"),
+    *("n_rejected_error", "n_rejected_convergence", "n_partitions"),
+)
 T, H, LONGEST, HOLD, MU, N_PLACES = range(6)  # places in `where`: the step-size control, and the largest |mu|
 
 
@@ -43,9 +47,6 @@ class _Space(NamedTuple):
     Kq: Any  # (s, n)
     Kv: Any  # (s, n)
     order: Any  # (n) of the columns of C_q, dependents first
-    rows: Any  # (m)
-    largest: Any  # (m)
-    P: Any  # (m, n) scratch of the partition
 
 
 @njit(error_model="numpy")
@@ -192,16 +193,14 @@ def _least_change(w, W, x):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy")
 def _partition(f, w, t, q, counters):  # type: ignore[no-untyped-def]
     """Choose the dependent coordinates by Gauss elimination with full pivoting; False if rows depend on one another."""
-    m, n = w.P.shape
-    w.P[:, :] = 0.0
-    f.jacobian(t, q, f.p, w.P)
+    m, n = w.Cq.shape
+    P = np.zeros((m, n))
+    f.jacobian(t, q, f.p, P)
     for j in range(n):
         w.order[j] = j
-    for i in range(m):
-        w.rows[i] = i
     counters[FACTORIZATIONS] += 1
     counters[PARTITIONS] += 1
-    return full_pivoting(w.P, w.order, w.rows, w.largest, 0, m, m) == m
+    return full_pivoting(P, w.order, np.arange(m), np.zeros(m), 0, m, m) == m
 
 
 @njit(error_model="numpy")
@@ -271,12 +270,6 @@ def _sweep(f, w, variant, A, c, inverse, t, h, q, v, loop_tol, counters):  # typ
 
 
 @njit(error_model="numpy")
-def _ends_in_a_stage(A, b):  # type: ignore[no-untyped-def]
-    """Whether the last stage is the end of the step."""
-    return np.abs(A[-1] - b).max() < ROUNDING
-
-
-@njit(error_model="numpy")
 def _step(  # type: ignore[no-untyped-def]
     f, w, variant, A, b, c, inverse, t, h, start, end, loop_tol, where, counters
 ):
@@ -303,7 +296,7 @@ def _step(  # type: ignore[no-untyped-def]
     kept = True
     if variant <= FROZEN:
         kept = _satisfy(f, w, t + h, q1, v1, KEPT, counters)
-    elif variant == PROJECTED or (variant == STABILISED and not _ends_in_a_stage(A, b)):
+    elif variant == PROJECTED or (variant == STABILISED and np.abs(A[-1] - b).max() >= ROUNDING):
         kept = _project(f, w, t + h, q1, v1, counters)
     if not kept:
         return SINGULAR
@@ -352,9 +345,6 @@ def run(  # type: ignore[no-untyped-def]
         np.zeros((s, n)),
         np.zeros((s, n)),
         np.zeros(n, dtype=np.int64),
-        np.zeros(m, dtype=np.int64),
-        np.zeros(m),
-        np.zeros((m, n)),
     )
     if rows.shape[0] == 1:
         a, lam = state[2 * n : 3 * n], state[3 * n :]

@@ -130,7 +130,12 @@ class MinimalFourBar:
 
         rest.terminal = True  # type: ignore[attr-defined]
         rest.direction = -math.copysign(1.0, self.rate(0.0, start)[3])  # type: ignore[attr-defined]
-        rough = solve_ivp(_counted(self.rate), (0.0, LONGEST), start, "DOP853", rtol=1e-8, atol=1e-8, events=rest)
+
+        def run(t_end: float, rtol: float, atol: float, **more: Any) -> Any:
+            span = 0.0, t_end
+            return solve_ivp(_counted(self.rate), span, start, "DOP853", rtol=rtol, atol=atol, events=rest, **more)
+
+        rough = run(LONGEST, 1e-8, 1e-8)
         if rough.status == -1:
             raise ValueError(f"the linkage's equation of motion cannot be integrated: {rough.message}")
         if rough.status != 1:
@@ -138,17 +143,7 @@ class MinimalFourBar:
                 f"the linkage does not come to rest within {LONGEST:g} s: it starts too near an equilibrium"
             )
         end = float(rough.t[-1])
-        fine = solve_ivp(
-            _counted(self.rate),
-            (0.0, 1.1 * end),
-            start,
-            "DOP853",
-            rtol=RTOL,
-            atol=ATOL,
-            max_step=end / STEPS,
-            events=rest,
-            dense_output=True,
-        )
+        fine = run(1.1 * end, RTOL, ATOL, max_step=end / STEPS, dense_output=True)
         if fine.status != 1:
             raise ValueError(f"the linkage comes to rest at {end:g} s with loose tolerances, and not with tight ones")
         return fine

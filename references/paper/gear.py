@@ -13,21 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from references.driver import Task, TimeLimit, check_choice, check_task, result_of, user_call
+from references.driver import Task, TimeLimit, adapter, user_call
 from references.equations.linear import compiled_now, lu_factor, lu_solve
-from references.equations.ode import ode_result
 from references.scipy.index1 import solve_index1
-from twoloop.checks.arguments import check_positive, check_size, check_span
+from twoloop.checks.arguments import check_choice, check_size, check_times
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
-from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
-LABEL = "fixed-step BDF, order {order}, index 3 (stand-in for ADAMS GSTIFF)"
 STARTS = {
     "ramp": "orders 1, 2, ... at the full step until the order is reached",
     "accurate": "first states by DOP853 with projection, to 1e-12",
@@ -36,9 +32,10 @@ HIGHEST = 6  # BDF of order 7 is unstable for any step
 
 START_TOLERANCE = 1e-12
 MAX_NEWTON = 10
+NEWTON_TOL = 1e-12  # the last correction of a coordinate, relative to max(1, |q|)
 SLOW = 0.1  # a correction that is not this much smaller than the last one asks for a new Newton matrix
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |q|)
-FIRST_STEPS = 100  # of the first call of the compiled loop, when there is a time limit
+FIRST_STEPS = 100  # of the first call of the compiled loop
 CALL = 0.05  # s; the steps of a call are doubled until one takes that long, for a call itself costs some 0.1 ms
 WHOLE = 1e-6  # how far, in steps, the length of t_span may be from a whole number of them
 
@@ -50,22 +47,11 @@ _REASONS = {
 }
 NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # places in the counters
 _I8, _F8 = types.int64, types.float64
-_INTEGRATE = _I8(*(KIT, _I8, MATRIX, MATRIX, _I8, _I8, _F8, _F8, _I8, MATRIX, _F8, INTEGERS, MATRIX, INTEGERS))
+_INTEGRATE = _I8(*(KIT, _I8, MATRIX, MATRIX, _I8, _I8, _F8, _F8, _I8, MATRIX, INTEGERS, MATRIX, INTEGERS))
 
 
-def solve_gear(
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
-    step: float,
-    order: int = 2,
-    *,
-    start: str = "ramp",
-    newton_tol: float = 1e-12,
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
-) -> Result:
+@adapter(velocity_rows=False)
+def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") -> Result:
     """Integrate the index-3 equations by BDF with a fixed step and order: the stand-in for ADAMS GSTIFF.
 
     At t_{n+1} the unknowns q, v and lam satisfy q' = v and M v' + C_q^T lam = Q, with q' and v' by the backward
@@ -73,9 +59,6 @@ def solve_gear(
 
     Parameters
     ----------
-    system, t_span, q0, v0, time_limit : see `references.driver`
-        t_span is a whole number of steps long. An accurate start counts for the limit; the clock is looked at about
-        every `CALL` seconds.
     step : float
         Step size, s.
     order : int
@@ -91,11 +74,9 @@ def solve_gear(
 
         "accurate": by `solve_index1` with projection and tolerances 1e-12, what a start under tight error control
         would give. Not counted in cpu_time. Shows the error of the formula alone.
-    newton_tol : float
-        Newton's method ends when no coordinate is corrected by more than this, relative to max(1, |q|).
-    t_eval : array_like, optional
-        Increasing times in t_span, t_span[0] and multiples of the step from there, at which to store the solution.
-        None: every step.
+    others : see `references.driver`
+        t_span is a whole number of steps long; t_eval, of which None is every step, holds multiples of the step from
+        t_span[0] on. The clock is looked at about every `CALL` seconds.
 
     Returns
     -------
@@ -113,52 +94,55 @@ def solve_gear(
     coefficient, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
     Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] then has a condition number that does not grow as h becomes small.
     """
-    check_positive("step", step)
-    t0, t1 = check_span(t_span)
-    n_steps = round((t1 - t0) / step)
-    if n_steps < 1 or abs((t1 - t0) / step - n_steps) > WHOLE:
+    system, n, t0, length = task.system, task.system.n_q, task.t0, task.t1 - task.t0
+    n_steps = round(length / step)
+    if n_steps < 1 or abs(length / step - n_steps) > WHOLE:
         raise ValueError(
-            f"step must go a whole number of times into t_span, whose length is {t1 - t0!r}; given {step!r}"
+            f"step must go a whole number of times into t_span, whose length is {length!r}; given {step!r}"
         )
     if check_size("order", order, 1) > HIGHEST:
         raise ValueError(f"order must be at most {HIGHEST}, BDF of higher order is unstable; given {order}")
-    check_choice("start", start, STARTS)
-    check_positive("newton_tol", newton_tol)
-    task = check_task(system, t_span, q0, v0, t_eval, time_limit, step=step, takes_velocity_rows=False)
+    check_choice("start", start, tuple(STARTS))
+    keep = np.arange(n_steps + 1)
+    if task.times is not None:
+        keep = np.rint((check_times(task.times, t0, task.t1, step) - t0) / (length / n_steps)).astype(np.int64)
 
-    h = (t1 - t0) / n_steps
+    h = length / n_steps
     n_given = min(order, n_steps) if start == "accurate" else 1
-    limit = TimeLimit(time_limit)
-    first = _first_states(task, np.array([t0 + k * h for k in range(n_given)]), limit)
+    first = _first_states(task, np.array([t0 + k * h for k in range(n_given)]))
     if not first.success:
-        message = f"The accurate start failed. {first.message}"
-        if limit.passed():
-            message = limit.message("The accurate start", float(first.t[-1]), "take start='ramp'")
-        return replace(first, message=message)
-    keep = np.arange(n_steps + 1) if task.times is None else np.rint((task.times - t0) / h).astype(np.int64)
-    rows = np.empty((keep.size, 3 * system.n_q + system.n_c))
-    counters = np.zeros(N_COUNTERS, dtype=np.int64)
+        return replace(first, message=f"The accurate start failed. {first.message}")
     given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
-    past = np.zeros((HIGHEST, given.shape[1]))
-    code, made, stride = DONE, -1, n_steps if time_limit is None else FIRST_STEPS
-    fixed = t0, h, order, _formulas(), float(newton_tol), keep, rows, counters
-    with user_call as clock:
+    rows, past = np.empty((keep.size, given.shape[1])), np.zeros((HIGHEST, given.shape[1]))
+    counters, limit = np.zeros(N_COUNTERS, dtype=np.int64), TimeLimit(task.time_limit)
+    code, made, stride, fixed = DONE, -1, FIRST_STEPS, (t0, h, order, _formulas(), keep, rows, counters)
+    with user_call:
         while code == DONE and made < n_steps and not limit.passed():
-            called = time.monotonic()
-            last = min(made + stride, n_steps)
-            code = _integrate(Kit(system.functions), system.n_q, given, past, made + 1, last, *fixed)
-            made = last
-            stride *= 2 if time.monotonic() - called < CALL else 1
-    return _result(system, order, t0, h, code, keep, rows, counters, clock.seconds or 0.0, limit)
+            called, last = time.monotonic(), min(made + stride, n_steps)
+            code = _integrate(Kit(system.functions), n, given, past, made + 1, last, *fixed)
+            made, stride = last, stride * (2 if time.monotonic() - called < CALL else 1)
+
+    made, stored = int(counters[STEPS]), int(counters[STORED])
+    name, failure = f"BDF of order {order}", ""
+    if limit.exceeded:
+        failure = limit.message(name, t0 + made * h, "take a larger step")
+    elif code != DONE:
+        lower = " or a lower order" if order > 1 else ""
+        failure = f"{name} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. "
+        failure += f"Take a smaller step{lower}."
+    counts = {"n_accepted": made, "n_outer": int(counters[NEWTON]), "n_factorizations": int(counters[MATRICES])}
+    return task.result(
+        name, np.asarray(t0 + h * keep[:stored], float), rows[:stored].T, failure, h=np.full(made, h), **counts
+    )
 
 
-def _first_states(task: Task, times: Array, limit: TimeLimit) -> Result:
+def _first_states(task: Task, times: Array) -> Result:
     """States at the first times; of a failed run those before its failure."""
     if times.size == 1:
-        return ode_result(task.system, times, task.y0[:, None], "", "the state given", Statistics())
+        return task.result("the start", times, task.y0[:, None])
+    options: dict[str, Any] = {"stabilisation": "projection", "t_eval": times, "time_limit": task.time_limit}
     span, tolerances = (float(times[0]), float(times[-1])), (START_TOLERANCE, START_TOLERANCE)
-    options: dict[str, Any] = {"stabilisation": "projection", "t_eval": times, "time_limit": limit.left()}
-    return solve_index1(task.system, span, task.q0, task.v0, "DOP853", *tolerances, **options)
+    return solve_index1(task.system, span, task.q0, task.v0, "DOP853", *tolerances, **options)  # type: ignore[no-any-return]
 
 
 def _formulas() -> Array:
@@ -174,34 +158,6 @@ def _formulas() -> Array:
             table[k - 1, i] = -c[i] / c[0]
             table[k - 1, HIGHEST + i] = (-1) ** (i + 1) * math.comb(k, i)
     return table
-
-
-def _result(
-    system: ConstrainedSystem,
-    order: int,
-    t0: float,
-    h: float,
-    code: int,
-    keep: NDArray[np.int64],
-    rows: Array,
-    counters: NDArray[np.int64],
-    cpu: float,
-    limit: TimeLimit,
-) -> Result:
-    n, made, stored = system.n_q, int(counters[STEPS]), int(counters[STORED])
-    name, failure = f"BDF of order {order}", ""
-    if limit.exceeded:
-        failure = limit.message(name, t0 + made * h, "take a larger step")
-    elif code != DONE:
-        failure = (
-            f"{name} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. Take a smaller "
-            f"step{' or a lower order' if order > 1 else ''}."
-        )
-    statistics = Statistics(
-        n_accepted=made, n_outer=int(counters[NEWTON]), n_factorizations=int(counters[MATRICES]), cpu_time=cpu
-    )
-    t, end = t0 + h * keep[:stored], f"{name} reached the end, t = {t0 + made * h:g}."
-    return result_of(n, np.asarray(t, dtype=np.float64), rows[:stored].T, end, failure, statistics, np.full(made, h))
 
 
 class _Space(NamedTuple):
@@ -258,7 +214,7 @@ def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J):  # type: ignor
 
 
 @njit(error_model="numpy")
-def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, counters):  # type: ignore[no-untyped-def]
+def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counters):  # type: ignore[no-untyped-def]
     """Solve for q and forces = (h b)^2 lam, from what they hold; return DONE or why not."""
     n = q.size
     before, renew = np.inf, True
@@ -280,7 +236,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
             forces[k] -= r[n + k]
         if not np.isfinite(r).all():
             return NOT_FINITE
-        if correction <= tol * size:
+        if correction <= NEWTON_TOL * size:
             return DONE
         renew = correction > SLOW * before
         before = correction
@@ -289,7 +245,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, tol, r, there, J, pivots, co
 
 @compiled_now(_INTEGRATE)
 def _integrate(  # type: ignore[no-untyped-def]
-    f, n, given, past, first, last, t0, h, order, formulas, tol, keep, rows, counters
+    f, n, given, past, first, last, t0, h, order, formulas, keep, rows, counters
 ):
     """Steps `first` to `last`; `keep` holds the numbers of those to store.
 
@@ -316,7 +272,7 @@ def _integrate(  # type: ignore[no-untyped-def]
                 new[j] = combined[j] + hb * new[n + j]
             forces = new[3 * n :] * (hb * hb)
             q_past, v_past, t = combined[:n], combined[n:], t0 + step * h
-            code = _newton(f, w, t, new[:n], forces, q_past, v_past, hb, tol, r, there, J, pivots, counters)
+            code = _newton(f, w, t, new[:n], forces, q_past, v_past, hb, r, there, J, pivots, counters)
             if code != DONE:
                 return code
             for j in range(n):

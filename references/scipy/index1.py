@@ -12,25 +12,23 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
-from references.driver import ADVICE, TimeLimit, check_choice, check_task, imported, longest_step, result_of, user_call
+from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_call
 from references.equations.accelerations import Equations, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
 from references.equations.linear import OPTIONS
-from references.equations.rows import on_independent_rows
 from references.equations.straight_line import straight_line_jacobian
 from references.scipy.steps import Steps
-from twoloop.checks.arguments import check_positive
+from twoloop.checks.arguments import check_choice, check_positive
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
 METHODS: dict[str, type[OdeSolver]] = {"DOP853": DOP853, "RK45": RK45, "LSODA": LSODA, "Radau": Radau, "BDF": BDF}
-PAIRS = ("Pr8", "Pr9")  # explicit Runge-Kutta pairs of extensisq (P. J. Prince), of orders 8(7) and 9(8)
+PAIR = "Pr9"  # explicit Runge-Kutta pair of extensisq (P. J. Prince), of orders 9(8)
 IMPLICIT = ("LSODA", "Radau", "BDF")  # wholly, or where the problem is stiff
 ONE_STEP = ("DOP853", "RK45")  # explicit, and nothing of them but y and f outlives a step: they can be projected
 STABILISATIONS = {
@@ -44,30 +42,24 @@ PROJECTED = 1e-10  # correction of q, relative to max(1, |q|), at which a projec
 MAX_PROJECTIONS = 10  # Newton iterations of a projection
 
 
-@on_independent_rows
+@adapter(independent_rows=True)
 def solve_index1(
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
+    task: Task,
     method: str = "DOP853",
     rtol: float = 1e-8,
     atol: float = 1e-8,
     *,
     stabilisation: str = "none",
     alpha: float | None = None,
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
     max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system as the ODE q' = v, v' = a(t, q, v) with one of SciPy's solvers.
 
     Parameters
     ----------
-    system, t_span, q0, v0, rtol, atol, time_limit, max_step : see `references.driver`
-    method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr8", "Pr9"}
-        The solver of `scipy.integrate`, or of extensisq (`PAIRS`: on the four-bar the best of its pairs from 1e-5 down,
-        Pr9 at tight tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
+    method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr9"}
+        The solver of `scipy.integrate`, or of extensisq (`PAIR`: on the four-bar the best of its pairs at tight
+        tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
         can be had as expressions of up to `straight_line.MOST_OPERATIONS`, without Baumgarte's terms; else they
         difference the right-hand side.
     stabilisation : {"none", "baumgarte", "projection"}
@@ -87,8 +79,8 @@ def solve_index1(
         it is a rate of the problem; 1 to 10 is called typical (MapleSim's manual of its exports). On the four-bar
         linkage (period 2.25 s, DOP853, tolerances 1e-6 and 1e-9, 100 s) 10 costs 21 and 13 % more evaluations than no
         stabilisation, and its error is 1/300 and 1/35; from 20 on the cost grows with alpha: the ODE becomes stiff.
-    t_eval : array_like, optional
-        See `references.driver`. None: every step.
+    others : see `references.driver`
+        t_eval None: every step.
 
     Returns
     -------
@@ -98,51 +90,41 @@ def solve_index1(
         right-hand side, those for a difference Jacobian and after a projection included, those for the interpolant not;
         n_factorizations, SciPy's LU count, for "Radau" and "BDF".
     """
-    _check_choices(method, stabilisation, alpha)
-    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol))
-    t0, t1, y0, times = task.t0, task.t1, task.y0, task.times
-    solver_type = METHODS[method] if method in METHODS else getattr(imported("extensisq"), method)
-    strength = (ALPHA if alpha is None else float(alpha)) if stabilisation == "baumgarte" else 0.0
-    equations, projected = RightHandSide(task.system, t0, task.q0, strength), stabilisation == "projection"
-    equations.warm(t0, y0, projected)
-    options: dict[str, Any] = {"rtol": float(rtol), "atol": float(atol)}
-    options |= {} if max_step is None else {"max_step": longest_step(max_step, t1 - t0)}
-    if method in IMPLICIT and (jacobian := equations.jacobian(t0, y0)):
-        options["jac"] = jacobian
-
-    def made(limit: TimeLimit) -> OdeSolver:
-        return solver_type(equations.function(limit), t0, y0, t1, **options)
-
-    limit, no_output = TimeLimit(time_limit), None if times is None else times[:0]
-    run = Steps(made, t0, y0, equations, equations.project if projected else None, no_output, limit)
-    with user_call as clock:
-        run.go()
-    statistics = Statistics(
-        n_accepted=len(run.ends) - 1,
-        n_evaluations=int(equations.counters[0]),
-        n_factorizations=run.solver.nlu if isinstance(run.solver, Radau | BDF) else None,
-        cpu_time=clock.seconds or 0.0,
-    )
-    shown = run.again(times)
-    columns = np.concatenate([shown.states, *equations.at_points(shown.t, shown.states, equations.alpha)])
-    end = f"{method} reached the end, t = {t1:g}."
-    return result_of(system.n_q, shown.t, columns, end, run.message(method, ADVICE), statistics, np.diff(run.ends))
-
-
-def _check_choices(method: str, stabilisation: str, alpha: float | None) -> None:
-    check_choice("method", method, (*METHODS, *PAIRS))
-    check_choice("stabilisation", stabilisation, STABILISATIONS)
-    if stabilisation == "projection" and method not in ONE_STEP:
+    check_choice("method", method, (*METHODS, PAIR))
+    check_choice("stabilisation", stabilisation, tuple(STABILISATIONS))
+    projected, damped = stabilisation == "projection", stabilisation == "baumgarte"
+    if projected and method not in ONE_STEP:
         raise ValueError(
             f"stabilisation='projection' needs an explicit one-step method, {' or '.join(ONE_STEP)}: the others carry "
             f"what a projection does not change from step to step; given method={method!r}"
         )
     if alpha is not None:
         check_positive("alpha", alpha)
-        if stabilisation != "baumgarte":
+        if not damped:
             raise ValueError(
                 f"alpha belongs to stabilisation='baumgarte'; given alpha={alpha!r} with {stabilisation!r}"
             )
+    t0, y0 = task.t0, task.y0
+    solver_type = METHODS[method] if method in METHODS else getattr(imported("extensisq"), method)
+    equations = RightHandSide(task.system, t0, task.q0, float(alpha or ALPHA) if damped else 0.0)
+    equations.warm(t0, y0, projected)
+    options: dict[str, Any] = {"rtol": rtol, "atol": atol}
+    options |= {} if max_step is None else {"max_step": task.longest(max_step)}
+    if method in IMPLICIT and (jacobian := equations.jacobian(t0, y0)):
+        options["jac"] = jacobian
+
+    def made(limit: TimeLimit) -> OdeSolver:
+        return solver_type(equations.function(limit), t0, y0, task.t1, **options)
+
+    run = Steps.timed(task, made, y0, equations, equations.project if projected else None)
+    with user_call:
+        run.go()
+    counts = {"n_accepted": len(run.ends) - 1, "n_evaluations": int(equations.counters[0])}
+    if isinstance(run.solver, Radau | BDF):
+        counts["n_factorizations"] = run.solver.nlu
+    shown = run.again(task.times)
+    rows = np.concatenate([shown.states, *equations.at_points(shown.t, shown.states, equations.alpha)])
+    return task.result(method, shown.t, rows, run.message(method, ADVICE), h=np.diff(run.ends), **counts)
 
 
 class RightHandSide(Equations):
@@ -178,7 +160,9 @@ class RightHandSide(Equations):
     def jacobian(self, t: float, y: Array) -> Callable[[float, Array], Array] | None:
         """df/dy as SciPy calls it, compiled; None where it cannot be had, or is too long to be compiled."""
         try:
-            derivatives = None if self.alpha > 0.0 else straight_line_jacobian(self.system, t, *np.split(y, 2))
+            derivatives = (
+                None if self.alpha > 0.0 else straight_line_jacobian(self.system, t, *map(bytes, np.split(y, 2)))
+            )
         except NotSymbolic:
             return None
         if derivatives is None:

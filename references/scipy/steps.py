@@ -1,26 +1,28 @@
 """The loop over the steps of a solver with SciPy's interface: what it stores, how it ends."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from references.driver import OutOfTimeError, TimeLimit
+from references.driver import OutOfTimeError, Task, TimeLimit
 
 Array = NDArray[np.float64]
 
 SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
 
 
+@dataclass
 class Steps:
     """Steps of one run.
 
-    Parameters
+    Attributes
     ----------
     make : callable
         limit -> the solver at its start; the limit is looked at in every evaluation.
-    t0, y0 : float, ndarray
+    t0, start : float, ndarray
         That start: y, or [y, y'].
     callbacks : object
         `raised` says whether a callback of the system raised: such an exception comes through, the solver's do not.
@@ -29,51 +31,51 @@ class Steps:
     times : ndarray or None
         When to store the state, by the solver's interpolant; None: at the end of every step.
     limit : TimeLimit
-
-    Attributes
-    ----------
     ends : list of float
         The start, and the ends of the accepted steps, s.
+    stored : list of (float, ndarray)
+        Times and states: y, or [y, y'].
     failure : str
         Why it ended, "": it has not failed.
     """
 
-    def __init__(
-        self,
-        make: Callable[[TimeLimit], Any],
-        t0: float,
-        y0: Array,
-        callbacks: Any,
-        project: Callable[[float, Array], bool] | None,
-        times: Array | None,
-        limit: TimeLimit,
-    ):
-        self.make, self.t0, self.y0, self.callbacks, self.project = make, t0, y0, callbacks, project
-        self.times, self.limit = times, limit
-        self.ends: list[float] = []
-        self._t: list[float] = []
-        self._y: list[Array] = []
-        self.failure = ""
-        self.solver: Any = None
+    make: Callable[[TimeLimit], Any]
+    t0: float
+    start: Array
+    callbacks: Any
+    project: Callable[[float, Array], bool] | None
+    times: Array | None
+    limit: TimeLimit
+    ends: list[float] = field(default_factory=list)
+    stored: list[tuple[float, Array]] = field(default_factory=list)
+    failure: str = ""
+    solver: Any = None
+
+    @classmethod
+    def timed(cls, task: Task, make: Any, start: Array, callbacks: Any, project: Any = None) -> "Steps":
+        """The run whose time is told: it stores every step, or nothing, if the task has times for its output."""
+        times = None if task.times is None else task.times[:0]
+        return cls(make, task.t0, start, callbacks, project, times, TimeLimit(task.time_limit))
 
     @property
     def t(self) -> Array:
         """When states were stored."""
-        return np.array(self._t)
+        return np.array([t for t, _ in self.stored])
 
     @property
     def states(self) -> Array:
-        """The states that were stored, one a column: y, or [y, y']."""
-        return np.array(self._y).reshape(-1, self.y0.size).T
+        """The states that were stored, one a column."""
+        return np.array([y for _, y in self.stored]).reshape(-1, self.start.size).T
 
     def go(self) -> None:
         """Integrate to the solver's end or to a failure."""
         self.ends.append(self.t0)
         if self.times is None or self.t0 in self.times[:1]:
-            self._store(self.t0, self.y0)
+            self.stored.append((self.t0, self.start))
         try:
             self.solver = self.make(self.limit)
-            while self.solver.status == "running" and not self.failure and not self._has_all():
+            wanted = self.times.size if self.times is not None and self.times.size else np.inf  # of stored states
+            while self.solver.status == "running" and not self.failure and len(self.stored) < wanted:
                 self.failure = self._attempt()
                 if not self.failure:
                     self._accept()
@@ -88,7 +90,7 @@ class Steps:
         """The same steps, untimed, with the states at those of the times that were reached; itself for None."""
         if times is None:
             return self
-        given = self.make, self.t0, self.y0, self.callbacks, self.project
+        given = self.make, self.t0, self.start, self.callbacks, self.project
         shown = Steps(*given, times[times <= self.ends[-1]], TimeLimit(None))
         if times[0] <= self.ends[-1]:
             shown.go()
@@ -101,10 +103,6 @@ class Steps:
             return self.limit.message(name, self.ends[-1], "take looser tolerances or another method")
         failed = f"{name} failed after t = {self.ends[-1]:.10g}: {self.failure.rstrip('.')}. {advice}"
         return failed if self.failure else ""
-
-    def _has_all(self) -> bool:
-        """Whether the output times of a run that is for them alone are stored."""
-        return bool(self.times is not None and 0 < self.times.size == len(self._t))
 
     def _state(self) -> Array:
         solver = self.solver
@@ -125,7 +123,10 @@ class Steps:
     def _accept(self) -> None:
         """Project and store what a step gave."""
         solver, t = self.solver, float(self.solver.t)
-        due = [] if self.times is None else self._due(t)
+        due: list[float] = []
+        if self.times is not None:
+            first, last = np.searchsorted(self.times, [self.ends[-1], t], side="right")
+            due = self.times[first:last].tolist()
         inside = [moment for moment in due if moment != t]
         if inside:
             # before the projection: the interpolant belongs to the solver's own y and f
@@ -133,7 +134,7 @@ class Steps:
             for moment in inside:
                 state = np.array(interpolant(moment)).ravel()
                 if self._projected(moment, state):
-                    self._store(moment, state)
+                    self.stored.append((moment, state))
         y = self._state()
         if self.project is not None:
             if not self._projected(t, y):
@@ -143,20 +144,10 @@ class Steps:
                 solver.f = solver.fun(t, solver.y)
         self.ends.append(t)
         if self.times is None or len(due) > len(inside):
-            self._store(t, y)
-
-    def _due(self, t: float) -> list[float]:
-        """Output times after the last step's end and up to t."""
-        assert self.times is not None
-        first, last = np.searchsorted(self.times, [self.ends[-1], t], side="right")
-        return [float(moment) for moment in self.times[first:last]]
+            self.stored.append((t, y))
 
     def _projected(self, t: float, y: Array) -> bool:
         if self.project is None or self.project(t, y):
             return True
         self.failure = f"the projection onto the constraints at t = {t:.10g} did not converge"
         return False
-
-    def _store(self, t: float, y: Array) -> None:
-        self._t.append(t)
-        self._y.append(y)

@@ -8,15 +8,13 @@ from contextlib import redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from references.driver import ADVICE, OutOfTimeError, TimeLimit, check_choice, check_task, imported, user_call
-from references.equations.ode import ode_result
-from references.equations.rows import on_independent_rows
+from references.driver import ADVICE, OutOfTimeError, Task, TimeLimit, adapter, imported, user_call
 from references.scipy.index1 import RightHandSide
-from twoloop.problem.system import ConstrainedSystem
+from references.sundials.loop import SMALLEST_STEP
+from twoloop.checks.arguments import check_choice
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -24,19 +22,8 @@ METHODS = ("Adams", "BDF")
 MOST_STEPS = 10**7  # between two output times; its own 500 are soon used up
 
 
-@on_independent_rows
-def solve_cvode(
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
-    method: str = "Adams",
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    *,
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
-) -> Result:
+@adapter(derivatives=False, independent_rows=True)
+def solve_cvode(task: Task, method: str = "Adams", rtol: float = 1e-8, atol: float = 1e-8) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE of scikit-sundae.
 
     What it was given: a right-hand side that numba compiled, and its analytic Jacobian as straight-line code, up to
@@ -44,26 +31,24 @@ def solve_cvode(
 
     Parameters
     ----------
-    system, t_span, q0, v0, rtol, atol, t_eval, time_limit : see `references.driver`
     method : {"Adams", "BDF"}
         Orders up to 12, or up to 5; both with Newton's iteration, scikit-sundae's only one.
+    others : see `references.driver`
 
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states. Of the statistics: n_evaluations, all calls of the right-hand
-        side.
+        Of the statistics: n_evaluations, all calls of the right-hand side.
     """
     check_choice("method", method, METHODS)
-    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
     CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
-    from references.sundials.ida import SMALLEST_STEP, states_at
+    from references.sundials.ida import states_at
 
     t0, t1, times, y0 = task.t0, task.t1, task.instants, task.y0
     equations = RightHandSide(task.system, t0, task.q0, 0.0)
     y0.setflags(write=False)  # as CVODE hands it over, so that what is compiled here is what it calls
     equations.warm(t0, y0, False)
-    options: dict[str, Any] = {"method": method, "rtol": float(rtol), "atol": float(atol), "max_num_steps": MOST_STEPS}
+    options: dict[str, Any] = {"method": method, "rtol": rtol, "atol": atol, "max_num_steps": MOST_STEPS}
     options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0}
     jacobian = equations.jacobian(t0, y0)
 
@@ -78,16 +63,15 @@ def solve_cvode(
 
         return CVODE(right_hand_side, jacfn=None if jacobian is None else jacfn, **options)
 
-    limit = TimeLimit(time_limit)
+    limit = TimeLimit(task.time_limit)
     timed, outcome = integrator(limit), None
-    with redirect_stdout(io.StringIO()), user_call as clock, suppress(OutOfTimeError):  # it prints its failures
+    with redirect_stdout(io.StringIO()), user_call, suppress(OutOfTimeError):  # it prints its failures
         timed.init_step(t0, y0)
         outcome = timed.step(t1, tstop=t1)
-    statistics = Statistics(n_evaluations=int(equations.counters[0]), cpu_time=clock.seconds or 0.0)
+    name, counts = f"CVODE, {method},", {"n_evaluations": int(equations.counters[0])}
     if outcome is None:
         failure = limit.message("CVODE", t0, "take looser tolerances")
-        return ode_result(task.system, times[:0], np.empty((y0.size, 0)), failure, "", statistics)
+        return task.result(name, times[:0], np.empty((y0.size, 0)), failure, **counts)
     failure = "" if outcome.success else f"CVODE failed after t = {outcome.t:.10g}: {outcome.message}. {ADVICE}"
     shown = states_at(integrator(TimeLimit(None)), (t0, t1), times[times <= outcome.t], y0)
-    end = f"CVODE, {method}, reached the end, t = {t1:g}."
-    return ode_result(task.system, shown.t, shown.y.T, failure, end, statistics)
+    return task.result(name, shown.t, shown.y.T, failure, **counts)

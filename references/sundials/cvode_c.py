@@ -4,22 +4,22 @@ The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-l
 not kept, unless CVODE is given a projection. See `references.sundials.ida_c` for what the library promises.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, cfunc, types
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from references.driver import ADVICE, check_choice, check_task
-from references.equations.ode import ode_result
+from references.driver import ADVICE, Task, adapter
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.library import library, made
 from references.sundials.loop import Memory, run
+from twoloop.checks.arguments import check_choice
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,7 @@ COUNTERS: dict[str, dict[str, tuple[str, ...]]] = {
         "n_jacobians": ("JacEvals",),
     },
 }
+POINTER = types.voidptr
 
 
 class Functions(NamedTuple):
@@ -43,18 +44,14 @@ class Functions(NamedTuple):
     data: Array = np.empty(0)
 
 
+@adapter(derivatives=False)
 def solve_cvode_c(
-    system: ConstrainedSystem,
-    t_span: tuple[float, float],
-    q0: ArrayLike,
-    v0: ArrayLike,
+    task: Task,
     method: str = "Adams",
     rtol: float = 1e-8,
     atol: float = 1e-8,
     *,
     projected: bool = False,
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
     max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
@@ -62,49 +59,42 @@ def solve_cvode_c(
     What it was given: accelerations as straight-line code of the one mechanism (`equations.straight_line`); Adams with
     fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's, dense and with the analytic
     Jacobian as straight-line code, up to `straight_line.MOST_OPERATIONS` (which compile in a few seconds), else with
-    differences; timed is a second use of CVODE's memory.
+    differences; timed is a second use of CVODE's memory. The clock is looked at every `STEPS_A_CALL` steps.
 
     Parameters
     ----------
-    system, t_span, q0, v0, rtol, atol, t_eval, time_limit, max_step : see `references.driver`
-        The clock is looked at every `STEPS_A_CALL` steps.
     method : {"Adams", "BDF"}
         Orders up to 12, or up to 5.
     projected : bool
         Whether CVODE projects each step, and its estimate of the error, onto C = 0 and C_q v + C_t = 0
         (`sundials.cvode_projection`), which it can with BDF alone. What it interpolates for t_eval is not projected.
+    others : see `references.driver`
 
     Returns
     -------
     Result
-        `a` and `lam` from eq. (6) at the stored states. The statistics are CVODE's counters, those of the evaluations
-        for the Jacobian included, of the run that is timed. The text of a failure has the name of CVODE's flag.
+        The statistics are CVODE's counters, those of the evaluations for the Jacobian included, of the run that is
+        timed. The text of a failure has the name of CVODE's flag.
 
     Raises
     ------
     RuntimeError
         If scikit-sundae is not the one that this was written for.
     """
-    check_choice("method", method, METHODS)
+    check_choice("method", method, tuple(METHODS))
     if projected and method != "BDF":
         raise ValueError(f"projected needs method 'BDF', with which alone CVODE projects; given {method!r}")
-    task = check_task(system, t_span, q0, v0, t_eval, time_limit, (rtol, atol), derivatives=False)
     jacobian = _jacobian(*task.key) if method == "BDF" else None
-    functions = Functions(_right_hand_side(*task.key), jacobian, *_projection(task.system, projected, rtol, atol))
-    made = integrate(functions, task.y0, (task.t0, task.t1), method, rtol, atol, task.instants, time_limit, max_step)
-    times, rows, failure, statistics = made
-    end = f"CVODE, {method}, reached the end, t = {task.t1:g}."
-    return ode_result(task.system, times, rows.T, failure, end, statistics)
+    functions = Functions(_rate(*task.key), jacobian, *_projection(task.system, projected, rtol, atol))
+    times, rows, failure, counts = integrate(functions, task.y0, task, method, rtol, atol, max_step)
+    return task.result(f"CVODE, {method},", times, rows.T, failure, **counts)
 
 
-@lru_cache(maxsize=256)
-def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
-    """CVODE's right-hand side function."""
-    derivative = straight_line(system, t0, np.frombuffer(q0), np.frombuffer(v0))
-    array_of, size = library().N_VGetArrayPointer, 2 * system.n_q
-    pointer = types.voidptr
+def right_hand_side(derivative: Callable[..., Any], size: int) -> Any:
+    """CVODE's right-hand side function, of a compiled (t, y, rate) -> None."""
+    array_of = library().N_VGetArrayPointer
 
-    @cfunc(types.int32(types.float64, pointer, pointer, pointer), error_model="numpy")
+    @cfunc(types.int32(types.float64, POINTER, POINTER, POINTER), error_model="numpy")
     def right_hand_side(t, y, rate, memory):  # type: ignore[no-untyped-def]
         derivative(t, carray(array_of(y), (size,)), carray(array_of(rate), (size,)))
         return 0
@@ -113,15 +103,19 @@ def _right_hand_side(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes)
 
 
 @lru_cache(maxsize=256)
+def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    return right_hand_side(straight_line(system, t0, q0, v0), 2 * system.n_q)
+
+
+@lru_cache(maxsize=256)
 def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
     """CVODE's Jacobian function; None where it is too long to be compiled."""
-    derivatives = straight_line_jacobian(system, t0, np.frombuffer(q0), np.frombuffer(v0))
+    derivatives = straight_line_jacobian(system, t0, q0, v0)
     if derivatives is None:
         return None
     array_of, matrix_of, size = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data, 2 * system.n_q
-    pointer = types.voidptr
 
-    @cfunc(types.int32(types.float64, *[pointer] * 7), error_model="numpy")
+    @cfunc(types.int32(types.float64, *[POINTER] * 7), error_model="numpy")
     def jacobian(t, y, rate, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
         derivatives(t, carray(array_of(y), (size,)), carray(matrix_of(J), (size, size)))  # CVODE has set J to zero
         return 0
@@ -143,18 +137,16 @@ def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: f
 def integrate(
     functions: Functions,
     start: Array,
-    span: tuple[float, float],
+    task: Task,
     method: str,
     rtol: float,
     atol: float,
-    times: Array,
-    time_limit: float | None,
     max_step: float | None = None,
-) -> tuple[Array, Array, str, Statistics]:
+) -> tuple[Array, Array, str, dict[str, int]]:
     """The times that were reached, rows y there, why it failed ("": it did not), and CVODE's counters."""
 
     def set_up(solver: Memory) -> None:
-        solver.call("Init", functions.rate.address, span[0], *solver.vectors)
+        solver.call("Init", functions.rate.address, task.t0, *solver.vectors)
         solver.call("SStolerances", float(rtol), float(atol))
         if method == "Adams":
             free = solver.sundials.SUNNonlinSolFree_FixedPoint
@@ -165,7 +157,5 @@ def integrate(
         if functions.projection is not None:
             solver.call("SetUserData", functions.data.ctypes.data)
             solver.call("SetProjFn", functions.projection.address)
-        solver.bound_steps(max_step)
 
-    given = "CVode", start[None], span, (METHODS[method],), set_up
-    return run(*given, times, time_limit, COUNTERS[method], ADVICE)
+    return run("CVode", start[None], task, (METHODS[method],), set_up, max_step, COUNTERS[method], ADVICE)

@@ -94,7 +94,10 @@ def library() -> SimpleNamespace:
         if len(found) != 1:
             raise _another_wheel(f"there are {len(found)} files scikit_sundae.libs/libsundials_{name}-*, not 1")
         try:
-            functions |= _declared(ctypes.CDLL(found[0]), wanted)
+            dll = ctypes.CDLL(found[0])
+            for function, (returned, *taken) in wanted.items():
+                functions[function] = declared = getattr(dll, function)
+                declared.restype, declared.argtypes = returned, taken
         except (OSError, AttributeError) as error:
             raise _another_wheel(str(error)) from error
     sundials = SimpleNamespace(**functions)
@@ -132,14 +135,6 @@ def _another_wheel(found: str) -> RuntimeError:
         f"the SUNDIALS of the installed scikit-sundae cannot be driven: {found}. references/sundials/library.py was "
         f"written for {WRITTEN_FOR}. references.sundials.ida.solve_ida does the same through Python"
     )
-
-
-def _declared(dll: ctypes.CDLL, wanted: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
-    functions: dict[str, Any] = {}
-    for name, (returned, *taken) in wanted.items():
-        functions[name] = function = getattr(dll, name)
-        function.restype, function.argtypes = returned, taken
-    return functions
 
 
 def _version(sundials: SimpleNamespace) -> tuple[int, int, int]:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from references.driver import TimeLimit, longest_step, user_call
+from references.driver import Task, TimeLimit, user_call
 from references.sundials.library import LONG, POINTER, REAL, check, context, library, made
-from twoloop.run.record import Statistics
 
 Array = NDArray[np.float64]
 
@@ -31,13 +30,13 @@ COUNTERS = {
 class Memory:
     """The memory of IDA (`kind` "IDA") or CVODE ("CVode") over its vectors, which are the rows of `state`."""
 
-    def __init__(self, stack: ExitStack, kind: str, state: Array, span: tuple[float, float], *given: int):
-        self.kind, self.state, self.start, self.span = kind, state, state.copy(), span
+    def __init__(self, stack: ExitStack, kind: str, start: Array, task: Task, *given: int):
+        self.kind, self.state, self.start, self.task = kind, start.copy(), start, task
         self.stack, self.own, self.sundials = stack, context(stack), library()
-        self.vectors = [self.vector(values) for values in state]
+        self.vectors = [self.vector(values) for values in self.state]
         free = getattr(self.sundials, f"{kind}Free")
         self.memory = made(stack, f"{kind}Create", lambda pointer: free(ctypes.byref(pointer)), *given, self.own)
-        self.reached = REAL(span[0])
+        self.reached = REAL(task.t0)
 
     def vector(self, values: Array) -> Any:
         """SUNDIALS' vector over an array."""
@@ -58,19 +57,18 @@ class Memory:
         if jacobian is not None:
             self.call("SetJacFn", jacobian.address)
 
-    def bound_steps(self, max_step: float | None) -> None:
+    def bound_steps(self, longest: float) -> None:
         """Set its limits on steps, and its end."""
-        t0, t1 = self.span
         self.call("SetMaxNumSteps", STEPS_A_CALL)
-        self.call("SetMaxStep", longest_step(max_step, t1 - t0))
-        self.call("SetMinStep", SMALLEST_STEP * (t1 - t0))
-        self.call("SetStopTime", t1)
+        self.call("SetMaxStep", longest)
+        self.call("SetMinStep", SMALLEST_STEP * (self.task.t1 - self.task.t0))
+        self.call("SetStopTime", self.task.t1)
 
     def restart(self) -> None:
         """Begin at the start, as one does who keeps the memory."""
         self.state[:] = self.start
-        self.call("ReInit", self.span[0], *self.vectors)
-        self.reached.value = self.span[0]
+        self.call("ReInit", self.task.t0, *self.vectors)
+        self.reached.value = self.task.t0
 
     def solve(self, stop: float, mode: int) -> int:
         """Its flag after steps to `stop`, or after one."""
@@ -83,7 +81,7 @@ class Memory:
         """Its last flag; past the time limit that of a run stopped at its greatest number of steps."""
         flag = TOO_MUCH_WORK
         for calls in itertools.count(1):
-            flag = TOO_MUCH_WORK if limit.passed() else self.solve(self.span[1], NORMAL)
+            flag = TOO_MUCH_WORK if limit.passed() else self.solve(self.task.t1, NORMAL)
             if flag != TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
                 break
         return flag
@@ -92,9 +90,9 @@ class Memory:
         """The state (n_t, k n) at times that the same steps have reached before, or at those before a failure."""
         flag, rows = 0, np.empty((times.size, self.state.size))
         for k, stop in enumerate(times.tolist()):
-            if stop > self.span[0]:
-                if k == 0 or times[k - 1] <= self.span[0]:  # the length of the first step depends on where it goes
-                    self.solve(self.span[1], ONE_STEP)
+            if stop > self.task.t0:
+                if k == 0 or times[k - 1] <= self.task.t0:  # the length of the first step depends on where it goes
+                    self.solve(self.task.t1, ONE_STEP)
                 while flag != TSTOP_RETURN:
                     flag = self.solve(stop, NORMAL)
                     if flag != TOO_MUCH_WORK:
@@ -132,30 +130,33 @@ class Memory:
 def run(
     kind: str,
     start: Array,
-    span: tuple[float, float],
+    task: Task,
     given: tuple[int, ...],
     set_up: Callable[[Memory], None],
-    times: Array,
-    time_limit: float | None,
+    max_step: float | None,
     counters: Mapping[str, tuple[str, ...]],
     advice: str,
-) -> tuple[Array, Array, str, Statistics]:
-    """The times that were reached, the states there as rows, why it failed ("": it did not), and the statistics.
+) -> tuple[Array, Array, str, dict[str, int]]:
+    """The times that were reached, the states there as rows, why it failed ("": it did not), and its counters.
 
     Timed is a second use of a memory, as SUNDIALS' guides have it: ReInit, and steps to the end without output. The
     output has a memory of its own: CVODE's ReInit does not forget when it projected last.
     """
-    with ExitStack() as stack:
-        solver = Memory(stack, kind, start.copy(), span, *given)
+    longest = task.longest(max_step)
+
+    def ready(stack: ExitStack) -> Memory:
+        solver = Memory(stack, kind, start, task, *given)
         set_up(solver)
-        limit = TimeLimit(time_limit)
-        with user_call as clock:
+        solver.bound_steps(longest)
+        return solver
+
+    with ExitStack() as stack:
+        solver, limit = ready(stack), TimeLimit(task.time_limit)
+        with user_call:
             solver.restart()
             flag = solver.go_to_the_end(limit)
         counts = {name: sum(map(solver.counted, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
-        failure, kept = solver.failure(flag, limit, advice), times[times <= solver.reached.value]
+        failure, kept = solver.failure(flag, limit, advice), task.instants[task.instants <= solver.reached.value]
     with ExitStack() as stack:
-        solver = Memory(stack, kind, start.copy(), span, *given)
-        set_up(solver)
-        rows = solver.rows_at(kept)
-    return kept[: len(rows)], rows, failure, Statistics(cpu_time=clock.seconds or 0.0, **counts)
+        rows = ready(stack).rows_at(kept)
+    return kept[: len(rows)], rows, failure, counts

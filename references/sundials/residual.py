@@ -19,12 +19,12 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
+from references.driver import Task
 from references.equations.accelerations import compiled_gamma
+from references.equations.least_norm import accelerations
 from references.equations.linear import OPTIONS
-from references.equations.ode import accelerations
 from twoloop.kernels.compile.callbacks import stand_in
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
-from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,7 @@ FORMS = {
     "index1": "index 1: C_q v' = Q_d; multipliers out of the error test (atol 1e12)",
     "stabilised": "GGL, integrated multipliers: C = 0 and C_q v + C_t = 0; multipliers' integrals in the error test",
 }
+NOT_TESTED = 1e12  # the absolute tolerance that takes an unknown out of IDA's error test, and out of Newton's
 ALL = 10**9  # rows that are of C: there are none of A v + b = 0 below
 DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
 
@@ -54,42 +55,43 @@ class Parts(NamedTuple):
     constant_mass: bool
 
 
-def parts_of(system: ConstrainedSystem, form: str, positions: int) -> Parts:
-    """Those of a system."""
-    f, index1 = system.functions, form == "index1"
-    gamma = compiled_gamma(system) if index1 else f.gamma
-    functions = f.mass, f.force, f.constraint, f.jacobian, f.constraint_rate, gamma, own_tangent(system)
-    return Parts(index1, *functions, positions, system.constant_mass)
+class Implicit:
+    """F(t, y, y') = 0 of a task in one of the `FORMS`.
 
+    Attributes
+    ----------
+    start : ndarray (2, size)
+        Unknowns and their derivatives; accelerations and multipliers by eq. (6).
+    space : tuple of ndarray
+        What the compiled functions take: p, M, which stays if it is constant, C_q, dQ/dq, and scratch.
+    parts : Parts
+        What they are compiled of.
+    residual, matrix : callable
+        See `residual_at` and `iteration_matrix_at`.
+    """
 
-def own_tangent(system: ConstrainedSystem) -> Dispatcher | None:
-    """The system's dQ/dq, if it gives one and the force does not depend on v: nothing of it is then differenced."""
-    flags = system.functions.flags
-    exact = flags[FORCE_BY_Q_GIVEN] == 1 and flags[FORCE_BY_V_GIVEN] == 0
-    return system.functions.force_by_q if exact else None
+    def __init__(self, task: Task, form: str):
+        system, self.index1 = task.system, form == "index1"
+        f, n, m = system.functions, system.n_q, system.n_c
+        exact = f.flags[FORCE_BY_Q_GIVEN] == 1 and f.flags[FORCE_BY_V_GIVEN] == 0
+        gamma = compiled_gamma(system) if self.index1 else f.gamma
+        functions = f.mass, f.force, f.constraint, f.jacobian, f.constraint_rate, gamma, f.force_by_q if exact else None
+        positions = task.n_c if m > task.n_c else ALL
+        self.parts = Parts(self.index1, *functions, positions, system.constant_mass)
+        self.residual, self.matrix = residual_at(self.parts), iteration_matrix_at(self.parts)
+        self.sizes = n, m
+        a, lam = (each[:, 0] for each in accelerations(system, np.array([task.t0]), task.y0[:, None]))
+        zeros = np.zeros(m)
+        y, yp = ([lam], [zeros]) if self.index1 else ([zeros, zeros], [lam, zeros])
+        self.start = np.array([np.concatenate([task.y0, *y]), np.concatenate([task.v0, a, *yp])])
+        mass = np.array(system.mass(task.t0, task.q0))
+        self.space = f.p, mass, np.zeros((m, n)), np.zeros((n, n)), *np.zeros((3, self.start.shape[1]))
 
-
-def start_of(system: ConstrainedSystem, form: str, t0: float, q: Array, v: Array) -> Array:
-    """Unknowns and their derivatives at the start (2, size); accelerations and multipliers by eq. (6)."""
-    m = system.n_c
-    a, lam = (each[:, 0] for each in accelerations(system, np.array([t0]), np.concatenate([q, v])[:, None]))
-    zeros = np.zeros(m)
-    if form == "index1":
-        return np.array([np.concatenate([q, v, lam]), np.concatenate([v, a, zeros])])
-    return np.array([np.concatenate([q, v, zeros, zeros]), np.concatenate([v, a, lam, zeros])])
-
-
-def columns_of(form: str, n: int, m: int, y: Array, yp: Array) -> Array:
-    """Rows [q v a lam] (3 n_q + n_c, n_t) of unknowns and their derivatives (size, n_t)."""
-    lam = (y if form == "index1" else yp)[2 * n : 2 * n + m]
-    return np.concatenate([y[: 2 * n], yp[n : 2 * n], lam])
-
-
-def space_of(system: ConstrainedSystem, form: str, t0: float, q0: Array) -> tuple[Array, ...]:
-    """The arrays that the functions below take: p, M, which stays if it is constant, C_q, dQ/dq, and scratch."""
-    n, m = system.n_q, system.n_c
-    scratch = np.zeros((3, 2 * n + (m if form == "index1" else 2 * m)))
-    return system.functions.p, np.array(system.mass(t0, q0)), np.zeros((m, n)), np.zeros((n, n)), *scratch
+    def columns(self, y: Array, yp: Array) -> Array:
+        """Rows [q v a lam] (3 n_q + n_c, n_t) of unknowns and their derivatives (size, n_t)."""
+        n, m = self.sizes
+        lam = (y if self.index1 else yp)[2 * n : 2 * n + m]
+        return np.concatenate([y[: 2 * n], yp[n : 2 * n], lam])
 
 
 @lru_cache(maxsize=64)

@@ -14,8 +14,9 @@ from references.scipy.fully_implicit import solve_fully_implicit
 from references.scipy.index1 import METHODS, solve_index1
 from references.sundials.cvode import solve_cvode
 from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.ida import FORMS, solve_ida
+from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
+from references.sundials.residual import FORMS
 
 
 class Adapter(NamedTuple):

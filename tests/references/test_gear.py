@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from references.equations.ode import accelerations
+from references.equations.least_norm import accelerations
 from references.paper import gear
 from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear

@@ -73,9 +73,6 @@ def test_six_digits_of_the_stiff_beam_at_2_s():
 def test_the_same_through_python(form):
     result = run("flexible", 1e-7, solve_ida, form=form, t_eval=TIMES[:10])
     assert errors("flexible", result)[0] < 3e-7
-    result = run("stiff", 1e-6, solve_ida, form=form, t_eval=TIMES[:5], **ORDER_2)
-    assert errors("stiff", result)[1] < 1e-3
-    assert result.stats.n_evaluations < 4000
 
 
 def test_default_steps_follow_the_vibrations_whatever_the_tolerance():
@@ -92,29 +89,16 @@ def test_order_2_and_positions_step_over_them():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("driver", [solve_ida, solve_ida_c])
-def test_tangent_gives_the_same_motion(driver):
-    given, differenced = (
-        run(name, 1e-6, driver, t_eval=TIMES[:5], **ORDER_2) for name in ("stiff", "stiff, no tangent")
-    )
+def test_tangent_gives_the_same_motion():
+    given, differenced = (run(name, 1e-6, t_eval=TIMES[:5], **ORDER_2) for name in ("stiff", "stiff, no tangent"))
     assert np.abs(given.q - differenced.q).max() < 3e-3
     assert given.stats.n_factorizations == pytest.approx(differenced.stats.n_factorizations, rel=0.4)
 
 
-@pytest.mark.parametrize("driver", [solve_ida, solve_ida_c])
-def test_orders_and_error_test_reach_ida(driver):
+def test_orders_and_error_test_reach_ida():
     def steps(**options):
-        result = driver(FOUR_BAR.system, (0.0, 2.0), FOUR_BAR.q0, FOUR_BAR.v0, rtol=1e-7, atol=1e-7, **options)
+        result = solve_ida_c(FOUR_BAR.system, (0.0, 2.0), FOUR_BAR.q0, FOUR_BAR.v0, rtol=1e-7, atol=1e-7, **options)
         return result.stats.n_evaluations
 
     assert steps(max_order=1) > 7 * steps(max_order=2) > 14 * steps()  # rounding moves the first ratio from 9 to 13
     assert steps(error_test="positions") < 0.8 * steps()
-
-
-def test_low_orders_and_positions_alone_are_far_cheaper_on_the_stiff_beam():
-    problem = CASES["stiff"]
-    arguments = problem.system, (0.0, 0.2), problem.q0, problem.v0
-    default, best = (solve_ida_c(*arguments, 1e-3, 1e-3, **options).stats.n_accepted for options in ({}, ORDER_2))
-    assert 10 * best < default
-    through_python = solve_ida(*arguments, "stabilised", 1e-3, 1e-3, **ORDER_2)
-    assert 0.5 * best < through_python.stats.n_accepted < 2.0 * best

@@ -6,12 +6,10 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from references.casadi.integrators import solve_cvodes, solve_idas
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials import cvode_c
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.cvode_projection import projection_for_cvode
-from references.sundials.ida import NOT_TESTED, tolerances
 from references.sundials.ida_c import solve_ida_c
 from studies.bench.figures import STYLES
 from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
@@ -36,20 +34,9 @@ def error(problem, result):
 
 def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipliers():
     pytest.importorskip("sksundae")
-    tested = tolerances(FOUR_BAR.system, 34, "states", 1e-7)
-    assert (tested[:18] == 1e-7).all() and (tested[18:] == NOT_TESTED).all()
     made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("states", "positions")}
     assert 1e-9 < error(FOUR_BAR, made["states"]) < 2e-4
     assert made["positions"].stats.n_accepted < 0.8 * made["states"].stats.n_accepted
-
-
-def test_cvodes_of_casadi_is_cvodes_and_right():
-    pytest.importorskip("casadi")
-    result = run(solve_cvodes, PENDULUM, 1e-9, 1e-9, t_end=2.0)
-    assert 1e-13 < np.abs(result.q[:, -1] - PENDULUM.q0).max() < 1e-5
-    assert result.message.startswith("CVODES of CasADi reached the end")
-    assert result.stats.cpu_time > 0.0
-    assert result.stats.n_accepted != run(solve_idas, PENDULUM, 1e-9, 1e-9, t_end=2.0).stats.n_accepted
 
 
 @callback("mass")
@@ -112,7 +99,9 @@ STATES = {
 @pytest.mark.parametrize("name", STATES)
 def test_the_jacobian_of_the_accelerations_is_their_derivative(name):
     system, q, v = STATES[name]
-    rate, derivatives = (make(system, 0.0, q, v) for make in (straight_line, straight_line_jacobian))
+    rate, derivatives = (
+        make(system, 0.0, q.tobytes(), v.tobytes()) for make in (straight_line, straight_line_jacobian)
+    )
     y = np.concatenate([q, v]) + 0.02 * np.random.default_rng(1).standard_normal(2 * system.n_q)
     columns, differences = np.zeros((y.size, y.size)), np.empty((y.size, y.size))
     derivatives(0.3, y, columns)
@@ -139,7 +128,7 @@ def test_cvode_takes_the_analytic_jacobian_and_differences_of_what_is_too_long(m
 
 def test_a_long_jacobian_is_not_compiled():
     problem = spatial_slider_crank()
-    assert straight_line_jacobian(problem.system, 0.0, problem.q0, problem.v0) is None
+    assert straight_line_jacobian(problem.system, 0.0, problem.q0.tobytes(), problem.v0.tobytes()) is None
 
 
 def kept(system, t, q, v):
