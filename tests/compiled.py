@@ -1,6 +1,6 @@
 """The pendulum of 1 kg on 1 m in compiled callbacks: for other forces, masses and files of machine code."""
 
-from twoloop import callback
+from twoloop import ConstrainedSystem, callback
 
 
 @callback("mass")
@@ -11,6 +11,11 @@ def unit_mass(t, q, p, M):
 @callback("force")
 def weight(t, q, v, p, Q):
     Q[1] = -9.81
+
+
+@callback("force")
+def attraction(t, q, v, p, Q):
+    Q[1] = -p[0]
 
 
 @callback("constraint")
@@ -30,3 +35,8 @@ def centripetal(t, q, v, p, Qd):
 
 PENDULUM = {"mass": unit_mass, "force": weight, "constraint": circle, "jacobian": radius, "gamma": centripetal}
 PENDULUM |= {"n_q": 2, "n_c": 1, "constant_mass": True, "name": "pendulum"}
+
+
+def pendulum_under(gravity):
+    """The pendulum under another gravity."""
+    return ConstrainedSystem(**PENDULUM | {"force": attraction}, parameters=[gravity])

@@ -7,6 +7,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
+from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.linking import KernelCompiler
@@ -32,6 +33,11 @@ def without_tangent(problem):
 def slope(f, e=1e-3):
     """df(s)/ds at s = 0, central differences of order 4."""
     return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
+
+
+def unconstrained(force, n_q=1, **more):
+    """q'' = force(t, q, v): no rows, and unit masses unless others are given."""
+    return ConstrainedSystem.from_python(**{"n_q": n_q, "n_c": 0, "mass": np.eye(n_q), "force": force, **more})
 
 
 # --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
@@ -107,11 +113,7 @@ def _pivot(t):
 
 
 def moving_pivot(*, compile=False, gamma=True):
-    pivot = _pivot
-    if compile:
-        from numba import njit
-
-        pivot = njit(_pivot)
+    pivot = njit(_pivot) if compile else _pivot
 
     def constraint(t, q):
         d = q - pivot(t)[0]
@@ -407,10 +409,10 @@ def violations(system, result):
 
 
 def force_residual(system, result):
-    """Largest |M a + C_q^T lam - Q| over all stored states."""
+    """Largest |M a + C_q^T lam + A^T mu - Q| over all stored states."""
     largest = 0.0
     for t, q, v, a, lam in zip(result.t, result.q.T, result.v.T, result.a.T, result.lam.T, strict=True):
-        residual = system.mass(t, q) @ a + system.jacobian(t, q).T @ lam - system.force(t, q, v)
+        residual = system.mass(t, q) @ a + system.rows(t, q).T @ lam - system.force(t, q, v)
         largest = max(largest, np.abs(residual).max())
     return float(largest)
 
@@ -418,11 +420,13 @@ def force_residual(system, result):
 # --- runs that end: one that crawls is to fail, not to hang
 
 START = ([-1.0, 0.0], [0.0, 0.0])
+SWING = ConstrainedSystem(**PENDULUM)
 
 
-def swing(end=2.0, system=None, **options):
+def swing(end=2.0, system=SWING, **options):
+    """The pendulum from the horizontal, of compiled functions unless another is given."""
     options.setdefault("max_steps", 200_000)
-    return solve_dae(system or pendulum(), (0.0, end), *START, **options)
+    return solve_dae(system, (0.0, end), *START, **options)
 
 
 def run(problem, end=10.0, **options):

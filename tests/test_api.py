@@ -1,14 +1,13 @@
 """The public face, run as the design prints it."""
 
 import pydoc
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 import twoloop
 from tests.problems import pendulum_state, worst
+from tests.processes import run_python
 
 IMPORTS = """
 import numpy as np
@@ -93,8 +92,7 @@ def test_all_that_is_promised_can_be_imported():
 
 def test_an_import_compiles_no_kernels():
     compiled = {"twoloop.kernels.lanes", "twoloop.kernels.evaluation.calls", "twoloop.kernels.advance"}
-    words = f"import sys, twoloop; sys.exit(len({compiled} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", words]).returncode == 0
+    run_python(f"import sys, twoloop; sys.exit(len({compiled} & set(sys.modules)))")
 
 
 @pytest.mark.parametrize("name", twoloop.__all__)

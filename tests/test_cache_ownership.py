@@ -4,17 +4,15 @@ import hashlib
 import os
 import pickle
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.own_cache import with_kernels
+from tests.processes import ROOT, run_python
 from twoloop.kernels.compile import caches, ownership
 from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder, read_own, write_own
 
-ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="rights on other systems are not in the mode")
 
 RUN = """
@@ -58,11 +56,7 @@ def user(tmp_path):
 
     def run(umask=0o022):
         paths = {"NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(home), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
-        command = [sys.executable, "-c", f"import os; os.umask({umask})\n{RUN}"]
-        done = subprocess.run(
-            command, env=os.environ | paths, cwd=tmp_path, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
+        done = run_python(f"import os; os.umask({umask})\n{RUN}", folder=tmp_path, **paths)
         value, hits = done.stdout.split()
         return float(value), int(hits), done.stderr
 

@@ -1,18 +1,14 @@
 """Machine code on disk: read again when nothing changed, rebuilt when anything did, never a reason to fail."""
 
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numba import njit
 
 from tests.own_cache import with_kernels
+from tests.processes import ROOT, run_python
 from twoloop.kernels.compile.caches import UNWRITABLE, watch
-
-ROOT = Path(__file__).parents[1]
 
 # what a mechanism's file looks like: a callback for each value, some of which enclose a global
 MECHANISM = """
@@ -81,15 +77,11 @@ class Folder:
 
     def run(self, source=RUN, **environment):
         variables = {
-            **os.environ,
             "NUMBA_CACHE_DIR": str(self.cache),
             "PYTHONPATH": f"{self.path}{os.pathsep}{ROOT}",
             "PYTHONDONTWRITEBYTECODE": "1",  # Python's own cache sees whole seconds only
-            **environment,
         }
-        command = [sys.executable, "-c", source]
-        done = subprocess.run(command, env=variables, cwd=self.path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
+        done = run_python(source, folder=self.path, **variables | environment)
         self.said = done.stderr
         return done.stdout
 
@@ -317,12 +309,5 @@ print(next(iter(through_python(sys.argv[1]).overloads.values())).fndesc.mangled_
 def test_closures_of_one_name_from_two_processes_have_symbols_of_their_own(tmp_path):
     # numba numbers symbols within a process: each of these two gives its only closure the same number
     cache = with_kernels(tmp_path / "cache")
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
-    symbols = set()
-    for kind in ("force_by_q", "reaction_by_q"):
-        done = subprocess.run(
-            [sys.executable, "-c", SYMBOL, kind], capture_output=True, text=True, env=environment, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
-        symbols.add(done.stdout)
-    assert len(symbols) == 2
+    kinds = ("force_by_q", "reaction_by_q")
+    assert len({run_python(SYMBOL, kind, NUMBA_CACHE_DIR=str(cache)).stdout for kind in kinds}) == 2

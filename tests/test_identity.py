@@ -3,14 +3,12 @@
 import copy
 import multiprocessing
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.problems import pendulum
+from tests.processes import run_python
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
@@ -108,15 +106,13 @@ def test_a_forked_system_that_is_not_pickled_keeps_its_functions():
 def test_a_pickle_read_in_a_new_process_does_not_run_the_functions_of_another_system(tmp_path):
     file = tmp_path / "system.pickle"
     file.write_bytes(pickle.dumps(made()))
-    source = (
-        "import pickle, numpy as np\n"
-        "from tests.test_identity import made, heavy\n"
-        "others = [made(force=heavy) for _ in range(3)]\n"
-        f"print(pickle.load(open({str(file)!r}, 'rb')).force(0.0, [0.0, 1.0], [0.0, 0.0]).tolist())"
-    )
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", source], cwd=root, capture_output=True, text=True, timeout=300)
-    assert done.stdout.strip() == "[0.0, -9.81]", done.stderr
+    program = """
+        import pickle, sys
+        from tests.test_identity import made, heavy
+        others = [made(force=heavy) for _ in range(3)]
+        print(pickle.load(open(sys.argv[1], "rb")).force(0.0, [0.0, 1.0], [0.0, 0.0]).tolist())
+    """
+    assert run_python(program, file).stdout.strip() == "[0.0, -9.81]"
 
 
 def test_pickled_systems_solve_alike():

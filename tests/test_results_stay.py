@@ -1,16 +1,14 @@
 """A result is what the run was: its parameters stay, and what Ctrl-C or an early event leaves is a result, too."""
 
-import os
 import signal
-import subprocess
 import sys
-import textwrap
 import warnings
 
 import numpy as np
 import pytest
 
 from tests.problems import pendulum, run, worst
+from tests.processes import run_python
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.interrupts import CALLS_A_USER
@@ -282,23 +280,24 @@ def test_a_handler_of_the_users_own_stays():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals to oneself")
-def test_real_signals_while_python_callbacks_and_events_run():
-    program = """
+def test_real_signals_while_compiled_code_python_callbacks_and_events_run():
+    run_python("""
         import os, signal, threading
         from tests.problems import pendulum
         from twoloop import solve_dae
+        from twoloop.mechanisms import four_bar
+
+        def interrupted(system, *start, after, **options):
+            solve_dae(system, (0.0, 0.1), *start)
+            threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)).start()
+            result = solve_dae(system, (0.0, 1e9), *start, check_derivatives=False, time_limit=20.0, **options)
+            assert result.status.name == "INTERRUPTED", result.message
+            return result
 
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        system, start = pendulum(), ([0.0, -1.0], [3.0, 0.0])
-        solve_dae(system, (0.0, 0.1), *start)
-        for k in range(4):
-            events = (lambda t, q, v: q[0]) if k % 2 else None
-            threading.Timer(0.1 + 0.0137 * k, os.kill, (os.getpid(), signal.SIGINT)).start()
-            result = solve_dae(system, (0.0, 1e9), *start, events=events, check_derivatives=False, time_limit=20.0)
-            assert result.status.name == "INTERRUPTED", result.message
-        print("interrupted", flush=True)
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=240, env=os.environ
-    )
-    assert done.stdout.strip() == "interrupted", done.stderr
+        linkage, system = four_bar(), pendulum()
+        compiled = interrupted(linkage.system, linkage.q0, linkage.v0, after=0.3, t_eval=[1e9])
+        assert compiled.stats.n_accepted > 100
+        for k, events in enumerate((None, lambda t, q, v: q[0], None, lambda t, q, v: q[0])):
+            interrupted(system, [0.0, -1.0], [3.0, 0.0], after=0.1 + 0.0137 * k, events=events)
+    """)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from tests.problems import pendulum
-from twoloop import ConstrainedSystem, Taylor, solve_dae
+from tests.problems import pendulum, unconstrained
+from twoloop import Taylor, solve_dae
 from twoloop.generate import series_code
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import own_code
@@ -40,13 +40,7 @@ FORCES = {
 
 
 def one_coordinate(law):
-    return ConstrainedSystem.from_python(
-        n_q=1,
-        n_c=0,
-        mass=lambda t, q: np.array([[1.0]]),
-        force=lambda t, q, v: np.array([law(t, q[0], v[0])]),
-        name="one coordinate",
-    )
+    return unconstrained(lambda t, q, v: np.array([law(t, q[0], v[0])]), name="one coordinate")
 
 
 @pytest.mark.parametrize("name", FORCES)

@@ -1,23 +1,18 @@
 """Mechanisms are imported one by one: the first import of a mechanism compiles its callbacks and no others."""
 
-import subprocess
-import sys
-from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from tests.processes import run_python
 from twoloop import mechanisms
-
-ROOT = Path(__file__).parents[2]
 
 
 def imported(*statements):
     """Modules of mechanisms after each of the statements in a new process."""
     told = "print(*(m for m in sys.modules if m.startswith('twoloop.mechanisms.')))"
     source = "\n".join(["import sys", *(f"{statement}; {told}" for statement in statements)])
-    done = subprocess.run([sys.executable, "-c", source], cwd=ROOT, capture_output=True, text=True, check=True)
-    lines = done.stdout.removesuffix("\n").split("\n")
+    lines = run_python(source).stdout.removesuffix("\n").split("\n")
     return [{name.removeprefix("twoloop.mechanisms.") for name in line.split()} for line in lines]
 
 
