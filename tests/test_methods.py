@@ -65,23 +65,6 @@ def test_names_are_different():
     assert len({method.name for method in PRESETS.values()}) == len(PRESETS)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "words"),
-    [
-        (lambda: RungeKutta(gauss(2), outer="auto", variables="momenta"), ValueError, "outer='auto' goes with"),
-        (lambda: RungeKutta(gauss(2), partition="no"), ValueError, "partition must be.*lasting.*symmetric.*'no'"),
-        (lambda: RungeKutta(gauss(2), outer="paper", variables="momenta"), ValueError, "outer='paper'.*'momenta'"),
-        (lambda: RungeKutta(gauss(2), outer_tol=np.nan), ValueError, "outer_tol must be positive"),
-        (lambda: Newmark(beta=-0.1), ValueError, "beta must be between 0 and 1.*-0.1"),
-        (lambda: Newmark(gamma=1.5), ValueError, "gamma must be between 0 and 1.*1.5"),
-        (lambda: BDF(inner_tol=0.0), ValueError, "inner_tol must be positive"),
-    ],
-)
-def test_wrong_options_are_named(make, error, words):
-    with pytest.raises(error, match=words):
-        make()
-
-
 def test_the_papers_criterion_over_all_coordinates_needs_fewer_steps_at_a_loose_tolerance(default_four_bar):
     """Criterion (32), tolerance 1e-3: over y_i alone the outer loop stops too early, and steps become small."""
     problem = default_four_bar

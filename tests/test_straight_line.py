@@ -298,13 +298,6 @@ def test_stages_that_the_code_leaves_to_the_general_one():
     assert own > 0.9 * general  # where the mechanism's own code is taken, half of them
 
 
-@pytest.mark.parametrize("method", ["Gauss4", "RadauIIA5", "PaperIRK", "BDF"])
-def test_methods_that_make_no_use_of_it_refuse(method):
-    problem = four_bar()
-    with pytest.raises(ValueError, match=r"compiled=True goes with .*; given method"):
-        solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, method, compiled=True)
-
-
 def test_redundant_rows_that_stop_holding_end_the_run():
     def system(drift):
         return pendulum(

@@ -224,12 +224,6 @@ def test_a_function_that_returns_the_wrong_shape_on_symbols_is_refused():
         solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
 
 
-@pytest.mark.parametrize(("order", "kind"), [(3, ValueError), (41, ValueError), (8.5, TypeError), ("high", TypeError)])
-def test_an_order_out_of_range_is_refused(order, kind):
-    with pytest.raises(kind, match="order"):
-        Taylor(order)
-
-
 def test_the_method_alone_says_what_it_needs():
     with pytest.raises(ValueError, match="for_system"):
         Taylor().plan(2, 1e-8, 1e-8, False)
