@@ -45,6 +45,11 @@ def row_errors(system, t, q, v, e=1e-3):
     return worst(system.jacobian(t, q) @ v, by_q), worst(system.constraint_rate(t, q), by_t), worst(right, -bend)
 
 
+def functions_of(system):
+    """The callbacks of a system as functions that return arrays."""
+    return {kind: getattr(system, kind) for kind in system.given if kind != "kinematics"}
+
+
 def unconstrained(force, n_q=1, **more):
     """q'' = force(t, q, v): no rows, and unit masses unless others are given."""
     return ConstrainedSystem.from_python(**{"n_q": n_q, "n_c": 0, "mass": np.eye(n_q), "force": force, **more})
@@ -224,31 +229,6 @@ def double_pendulum_canonical(q, v):
 def _double_pendulum_mass(angles):
     coupling = np.cos(angles[0] - angles[1])
     return np.array([[2.0, coupling], [coupling, 1.0]])
-
-
-# --- a mass on a rigid rod, and a second one on a spring and a damper from the first
-
-SPRUNG_START = (np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4))
-
-
-def sprung_pair(stiffness, damping=0.0, compile=False):
-    """The stiffness may be a function of t; the damping is given over it."""
-    stiffness_at = stiffness if callable(stiffness) else njit(lambda t: stiffness)
-
-    def force(t, q, v):
-        d, u, k = q[2:] - q[:2], v[2:] - v[:2], stiffness_at(t)
-        length = np.sqrt(d[0] * d[0] + d[1] * d[1])
-        pull = k * (length - 1.0 + damping * (d[0] * u[0] + d[1] * u[1]) / length) / length
-        return np.array([pull * d[0], pull * d[1] - 9.81, -pull * d[0], -pull * d[1] - 9.81])
-
-    return pendulum(
-        n_q=4,
-        mass=np.eye(4),
-        force=force,
-        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
-        compile=compile,
-        name="sprung pair",
-    )
 
 
 # --- oblique polar coordinates: x = r(cos phi, sin phi), r = q0, phi = q1 + 0.3 q0; a damped pendulum whose pivot is

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from twoloop import Result, Status, mechanisms, solve_dae
+from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
 
 mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
@@ -212,6 +213,26 @@ def test_the_message_of_a_failed_run_ends_with_it(names):
 
 def test_success_is_not_explained():
     assert explained(Status.REACHED_END) == explained(Status.EVENT) == ""
+
+
+# --- the reference has an entry for all that a user can import
+
+ENTRIES = set(
+    re.findall(
+        r"^\.\. auto(?:class|function|exception):: (\S+)", (DOCS / "reference.md").read_text("utf-8"), re.MULTILINE
+    )
+)
+
+
+@pytest.mark.parametrize("package", ["twoloop", "twoloop.symbolic"])
+def test_every_name_of_a_package_has_an_entry(package):
+    module = pytest.importorskip(package, exc_type=ImportError)
+    assert {f"{package}.{name}" for name in module.__all__} <= ENTRIES
+
+
+def test_so_has_every_method_that_a_name_stands_for():
+    kinds = {type(method).__qualname__ for method in PRESETS.values()}
+    assert kinds <= {entry.rpartition(".")[2] for entry in ENTRIES}
 
 
 # --- links, and what is generated

@@ -36,11 +36,14 @@ def test_a_fixed_step_that_cannot_converge_says_so_and_does_not_change(default_f
     assert result.stats.n_rejected_convergence <= 2  # once more with a new partition
 
 
-def test_a_fixed_step_estimates_nothing(default_four_bar):
-    coarse = run(default_four_bar, step_size=0.01, rtol=1e-3, atol=1e-3)
-    fine = run(default_four_bar, step_size=0.01, rtol=1e-12, atol=1e-12)
+@pytest.mark.parametrize("method", ["auto", "DOP853"])
+def test_a_fixed_step_estimates_nothing(default_four_bar, method):
+    options = {"method": method, "step_size": 0.01}
+    coarse, fine = (run(default_four_bar, 1.0, rtol=tol, atol=tol, **options) for tol in (1e-3, 1e-12))
     assert (coarse.q == fine.q).all()
     assert coarse.stats.n_rejected_error == 0
+    if method == "DOP853":
+        assert coarse.stats.n_evaluations == 12 * 100 + 1  # its stages, and the start
 
 
 def test_symmetric_gauss_with_fixed_steps_does_not_drift_while_the_partition_stays():

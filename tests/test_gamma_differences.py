@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.problems import pendulum, worst
-from twoloop import ConstrainedSystem, Status, consistent_state, solve_dae
+from twoloop import Status, consistent_state, solve_dae
 
 AMPLITUDE = 1e-3  # m
 
@@ -25,16 +25,12 @@ def shaken_pendulum(speed, gamma=True, noise=0.0):
         u = np.array([v[0] - AMPLITUDE * speed * np.cos(speed * t), v[1]])
         return np.array([-(u @ u) - d[0] * AMPLITUDE * speed**2 * np.sin(speed * t)])
 
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
+    return pendulum(
+        constant_mass=True,
         constraint=lambda t, q: np.array([0.5 * (arm(t, q) @ arm(t, q) - 1.0)]),
         jacobian=lambda t, q: opaque(arm(t, q)[None, :] + noise * np.sin(1e13 * (q[0] + t))),
         constraint_rate=lambda t, q: np.array([-arm(t, q)[0] * AMPLITUDE * speed * np.cos(speed * t)]),
-        gamma=right_hand_side if gamma else None,
-        name="shaken pendulum",
+        gamma=right_hand_side if gamma else False,
     )
 
 
@@ -43,7 +39,7 @@ def start(system, speed):
 
 
 @pytest.mark.parametrize("method", ["Gauss12", "DOP853", "BDF"])
-@pytest.mark.parametrize("speed", [1.0, 10.0, 1e3, 4e3, 2.0 * np.pi * 16e3])
+@pytest.mark.parametrize("speed", [1.0, 1e3, 2.0 * np.pi * 16e3])
 def test_a_fast_drive(speed, method):
     exact, differenced = shaken_pendulum(speed), shaken_pendulum(speed, gamma=False)
     span = (0.0, min(3.0, 30.0 / speed))
@@ -62,14 +58,12 @@ def test_differences_are_not_lengthened_over_the_drive():
     def angle(t):
         return 50.0 * t**4
 
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -1.0]),
+    system = pendulum(
+        constant_mass=True,
         constraint=lambda t, q: np.array([q[0] - 0.01 * np.sin(angle(t))]),
         jacobian=lambda t, q: opaque(np.array([[1.0, 0.0]])) + 0.0 * opaque(q[0]),
         constraint_rate=lambda t, q: np.array([-0.01 * np.cos(angle(t)) * 200.0 * t**3]),
+        gamma=False,
     )
     times = np.linspace(0.1, 2.0, 20)
     run = solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "DOP853", t_eval=times)

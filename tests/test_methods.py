@@ -28,14 +28,9 @@ def test_suns_presets_use_table_1(name):
 
 
 def test_methods_are_frozen():
-    with pytest.raises(FrozenInstanceError):
-        RungeKutta(gauss(2)).inner_tol = 1.0
-    with pytest.raises(FrozenInstanceError):
-        Newmark().beta = 1.0
-    with pytest.raises(FrozenInstanceError):
-        BDF().max_order = 1
-    with pytest.raises(FrozenInstanceError):
-        DOP853().inner_tol = 1.0
+    for method in (RungeKutta(gauss(2)), Newmark(), BDF(), DOP853()):
+        with pytest.raises(FrozenInstanceError):
+            method.inner_tol = 1.0
 
 
 def test_papers_newmark_has_beta_as_printed_and_takes_another():
@@ -51,14 +46,6 @@ def test_papers_presets_name_their_deviations():
         assert words.lower() in paper_irk.__doc__.lower()
     for words in ("beta = 1/2", "1/4", "Hussein", "err_out"):
         assert words in paper_newmark.__doc__
-
-
-def test_a_tableau_by_hand_is_a_method_too(default_four_bar):
-    problem = default_four_bar
-    span = (0.0, 1.0)
-    named = solve_dae(problem.system, span, problem.q0, problem.v0, method="Gauss6")
-    made = solve_dae(problem.system, span, problem.q0, problem.v0, method=RungeKutta(gauss(3)))
-    assert (named.q == made.q).all()
 
 
 def test_names_are_different():

@@ -76,7 +76,7 @@ SMOOTH = [
 
 
 @METHODS
-@pytest.mark.parametrize("tol", [1e-4, 1e-8, 1e-12])
+@pytest.mark.parametrize("tol", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow), 1e-12])
 @pytest.mark.parametrize(("make", "end"), SMOOTH)
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_smooth_motion_is_not_called_stiff(make, end, tol, method):

@@ -1,6 +1,5 @@
 """Results as tables and figures: names, energy, violation; and results in other processes."""
 
-import multiprocessing
 import pickle
 from dataclasses import replace
 
@@ -111,7 +110,7 @@ def test_nonholonomic_rows_are_plotted_too(make):
     assert len(done.plot().axes) == len(set(problem.units)) + 2
 
 
-# --- packages that may be missing, and other processes
+# --- packages that may be missing, and other processes (see also tests/test_identity.py)
 
 
 def test_missing_packages_say_how_to_install_them(tmp_path):
@@ -132,15 +131,6 @@ for call in (result.to_dataframe, result.plot, lambda: result.animate("x.gif")):
     lines = run_python(source, tmp_path / "page.html").stdout.splitlines()
     for line, package in zip(lines, ("pandas", "matplotlib", "pillow"), strict=True):
         assert line.endswith(f"needs the package {package}: pip install {package}")
-
-
-def end(result):
-    return result.energy[-1], result.system.name
-
-
-def test_results_travel_with_their_system(result):
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        assert pool.apply(end, (result,)) == (result.energy[-1], "four-bar")
 
 
 def test_results_of_lambdas_travel_without_their_system():

@@ -7,8 +7,9 @@ False.
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, functions_of, known, of_functions
+from tests.general.mechanism import G, Mechanism, known, of_functions
 from tests.mechanisms.motions import spatial
+from tests.problems import functions_of
 from twoloop.mechanisms.rolling_disc import ACROSS, AXIAL, energy, rolling_disc
 from twoloop.mechanisms.rolling_disc import MASS as M
 from twoloop.mechanisms.rolling_disc import RADIUS as R

@@ -59,11 +59,6 @@ def of_functions(**functions):
     return lambda **changed: make(**functions | changed) if changed else usual()
 
 
-def functions_of(system):
-    """The callbacks of a system as functions that return arrays."""
-    return {kind: getattr(system, kind) for kind in system.given if kind != "kinematics"}
-
-
 def of_problem(problem, state, end, rank=None):
     """A ready problem beside a motion that shares nothing with it; rank=None: all rows count."""
     system = problem.system

@@ -6,8 +6,9 @@ as far from the slider as the rod is long.
 
 import numpy as np
 
-from tests.general.mechanism import Mechanism, functions_of, known, of_functions, of_problem
+from tests.general.mechanism import Mechanism, known, of_functions, of_problem
 from tests.mechanisms.motions import planar
+from tests.problems import functions_of
 from twoloop import mechanisms
 
 CRANK, ROD = 0.5, 1.2
