@@ -96,7 +96,7 @@ class Folder:
         self.said = done.stderr
         return done.stdout
 
-    def values(self, **environment):
+    def values(self, source=RUN):
         """{name: (value, how often its machine code was read)}."""
-        rows = [line.split() for line in self.run(**environment).splitlines()]
+        rows = [line.split() for line in self.run(source).splitlines()]
         return {name: (float(value), int(hits)) for name, value, hits in rows}

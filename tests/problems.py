@@ -407,6 +407,15 @@ def force_residual(system, result):
     return float(largest)
 
 
+def event(function, terminal=None, direction=None):
+    """An event function with attributes."""
+    if terminal is not None:
+        function.terminal = terminal
+    if direction is not None:
+        function.direction = direction
+    return function
+
+
 # --- runs that end: one that crawls is to fail, not to hang
 
 START = ([-1.0, 0.0], [0.0, 0.0])

@@ -8,17 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from tests.problems import pendulum, run, swing, unconstrained, violations, worst
+from tests.problems import event, pendulum, run, swing, unconstrained, violations, worst
 from twoloop import Status, solve_dae
-
-
-def event(function, terminal=None, direction=None):
-    """An event function with attributes."""
-    if terminal is not None:
-        function.terminal = terminal
-    if direction is not None:
-        function.direction = direction
-    return function
 
 
 def at_one(terminal=None, direction=None):

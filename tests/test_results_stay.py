@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from tests.problems import pendulum, run, worst
+from tests.problems import event, pendulum, run, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
@@ -117,10 +117,7 @@ def test_a_callback_that_writes_to_its_parameters_is_refused():
 
 @pytest.mark.parametrize("options", [{}, {"dense_output": True}, {"method": "SunRadau5"}, {"step_size": 0.125}])
 def test_an_event_before_the_first_output_ends_the_run(options):
-    def early(t, q, v):
-        return t - 0.2
-
-    early.terminal = True
+    early = event(lambda t, q, v: t - 0.2, terminal=True)
     result = solve_dae(pendulum(), (0.0, 2.0), *START, t_eval=[0.5, 1.0], events=early, **options)
     assert result.status is Status.EVENT and abs(result.t_events[0][0] - 0.2) < 1e-12
     assert result.t.size == 0 and result.q.shape == (2, 0) and result.lam.shape == (1, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.compiled import PENDULUM
-from tests.problems import pendulum, pendulum_state
+from tests.problems import event, pendulum, pendulum_state
 from tests.test_callbacks import heavy
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, callback, ensemble, mechanisms, solve_dae
 
@@ -176,10 +176,7 @@ def test_what_cannot_go_in_lanes_says_why(made):
     runs = ensemble(system, (0.0, 0.1), q[:3], v[:3], parameters=parameters[:3], method="DOP853")
     assert runs.singly.all() and "DOP853 does not go in lanes" in runs.message
 
-    def low(t, q, v):
-        return q[1] + 0.2
-
-    low.terminal = True
+    low = event(lambda t, q, v: q[1] + 0.2, terminal=True)
     runs = ensemble(system, SPAN, q[:3], v[:3], parameters=parameters[:3], events=low)
     assert runs.singly.all() and "events" in runs.message and (runs.status == Status.EVENT).any()
     assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()

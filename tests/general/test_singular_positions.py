@@ -9,7 +9,7 @@ from tests.general.dead_points import CUSP_TIME, cusp
 from tests.general.mechanisms import SINGULAR, WINDOWS, mechanism
 from tests.general.runs import error, run
 from tests.general.windows import first_singular_time
-from tests.problems import worst
+from tests.problems import event, worst
 from twoloop import DOP853, ConstraintWarning, Status, solve_dae
 
 METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
@@ -105,12 +105,7 @@ def test_a_cusp_ends_the_run_and_is_named(method):
 @pytest.mark.parametrize("method", ["DOP853", "auto"])
 def test_states_stay_as_they_were_stored_when_a_step_goes_across(method):
     """With a terminal event chunks are short, and one may end, half full, at a singular position."""
-    m = mechanism("A02, N = 1")
-
-    def never(t, q, v):
-        return 1.0
-
-    never.terminal = True
+    m, never = mechanism("A02, N = 1"), event(lambda t, q, v: 1.0, terminal=True)
     crossed = 0
     for tol in (1e-3, 1e-4, 1e-8):
         runs = [
