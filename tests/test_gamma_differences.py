@@ -65,7 +65,7 @@ def test_differences_are_not_lengthened_over_the_drive():
 
 def test_what_cannot_reach_the_tolerance_is_a_status():
     system = shaken(10.0, gamma=False, noise=1e-9)
-    q0, v0 = start(system, 10.0)
+    q0, v0 = start(shaken(10.0), 10.0)
     run = solve_dae(system, (0.0, 1.0), q0, v0, check_derivatives=False)
     assert run.status is Status.NOT_CONVERGED
     assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message
