@@ -9,7 +9,6 @@ from twoloop import ConstrainedSystem
 from twoloop.mechanisms import four_bar
 
 UNITS = {"km": 1e3, "m": 1.0, "mm": 1e-3, "um": 1e-6}
-SHAPES = {"jacobian": 2, "constraint_rate": 1, "gamma": 1, "force_by_q": 2, "force_by_v": 2, "reaction_by_q": 2}
 
 
 @dataclass

@@ -7,6 +7,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
+from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.linking import KernelCompiler
@@ -20,7 +21,7 @@ TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
 
 
 def worst(a, b):
-    return float(np.abs(np.asarray(a) - np.asarray(b)).max())
+    return float(np.abs(np.asarray(a) - np.asarray(b)).max(initial=0.0))
 
 
 def without_tangent(problem):
@@ -30,8 +31,28 @@ def without_tangent(problem):
 
 
 def slope(f, e=1e-3):
-    """df(s)/ds at s = 0, central differences of order 4."""
-    return (8.0 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12.0 * e)
+    """df(s)/ds at s = 0, central differences of order 6."""
+    return (45.0 * (f(e) - f(-e)) - 9.0 * (f(2 * e) - f(-2 * e)) + f(3 * e) - f(-3 * e)) / (60.0 * e)
+
+
+def row_errors(system, t, q, v, e=1e-3):
+    """Largest errors of C_q v, of C_t, and of Q_d and Q_a, against differences along q + s v."""
+    by_q = slope(lambda s: system.constraint(t, q + s * v), e)
+    by_t = slope(lambda s: system.constraint(t + s, q), e)
+    bend = slope(lambda s: system.velocity_constraint(t + s, q + s * v, v), e)
+    kinds = [kind for kind, n in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if n]
+    right = np.concatenate([np.zeros(0), *(system.evaluate(kind, t, q, v) for kind in kinds)])
+    return worst(system.jacobian(t, q) @ v, by_q), worst(system.constraint_rate(t, q), by_t), worst(right, -bend)
+
+
+def functions_of(system):
+    """The callbacks of a system as functions that return arrays."""
+    return {kind: getattr(system, kind) for kind in system.given if kind != "kinematics"}
+
+
+def unconstrained(force, n_q=1, **more):
+    """q'' = force(t, q, v): no rows, and unit masses unless others are given."""
+    return ConstrainedSystem.from_python(**{"n_q": n_q, "n_c": 0, "mass": np.eye(n_q), "force": force, **more})
 
 
 # --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
@@ -107,11 +128,7 @@ def _pivot(t):
 
 
 def moving_pivot(*, compile=False, gamma=True):
-    pivot = _pivot
-    if compile:
-        from numba import njit
-
-        pivot = njit(_pivot)
+    pivot = njit(_pivot) if compile else _pivot
 
     def constraint(t, q):
         d = q - pivot(t)[0]
@@ -212,31 +229,6 @@ def double_pendulum_canonical(q, v):
 def _double_pendulum_mass(angles):
     coupling = np.cos(angles[0] - angles[1])
     return np.array([[2.0, coupling], [coupling, 1.0]])
-
-
-# --- a mass on a rigid rod, and a second one on a spring and a damper from the first
-
-SPRUNG_START = (np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4))
-
-
-def sprung_pair(stiffness, damping=0.0, compile=False):
-    """The stiffness may be a function of t; the damping is given over it."""
-    stiffness_at = stiffness if callable(stiffness) else njit(lambda t: stiffness)
-
-    def force(t, q, v):
-        d, u, k = q[2:] - q[:2], v[2:] - v[:2], stiffness_at(t)
-        length = np.sqrt(d[0] * d[0] + d[1] * d[1])
-        pull = k * (length - 1.0 + damping * (d[0] * u[0] + d[1] * u[1]) / length) / length
-        return np.array([pull * d[0], pull * d[1] - 9.81, -pull * d[0], -pull * d[1] - 9.81])
-
-    return pendulum(
-        n_q=4,
-        mass=np.eye(4),
-        force=force,
-        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0, 0.0]]),
-        compile=compile,
-        name="sprung pair",
-    )
 
 
 # --- oblique polar coordinates: x = r(cos phi, sin phi), r = q0, phi = q1 + 0.3 q0; a damped pendulum whose pivot is
@@ -407,22 +399,33 @@ def violations(system, result):
 
 
 def force_residual(system, result):
-    """Largest |M a + C_q^T lam - Q| over all stored states."""
+    """Largest |M a + C_q^T lam + A^T mu - Q| over all stored states."""
     largest = 0.0
     for t, q, v, a, lam in zip(result.t, result.q.T, result.v.T, result.a.T, result.lam.T, strict=True):
-        residual = system.mass(t, q) @ a + system.jacobian(t, q).T @ lam - system.force(t, q, v)
+        residual = system.mass(t, q) @ a + system.rows(t, q).T @ lam - system.force(t, q, v)
         largest = max(largest, np.abs(residual).max())
     return float(largest)
+
+
+def event(function, terminal=None, direction=None):
+    """An event function with attributes."""
+    if terminal is not None:
+        function.terminal = terminal
+    if direction is not None:
+        function.direction = direction
+    return function
 
 
 # --- runs that end: one that crawls is to fail, not to hang
 
 START = ([-1.0, 0.0], [0.0, 0.0])
+SWING = ConstrainedSystem(**PENDULUM)
 
 
-def swing(end=2.0, system=None, **options):
+def swing(end=2.0, system=SWING, **options):
+    """The pendulum from the horizontal, of compiled functions unless another is given."""
     options.setdefault("max_steps", 200_000)
-    return solve_dae(system or pendulum(), (0.0, end), *START, **options)
+    return solve_dae(system, (0.0, end), *START, **options)
 
 
 def run(problem, end=10.0, **options):

@@ -100,35 +100,6 @@ def test_a_tolerance_is_one_number_or_one_for_each_coordinate():
             check_tolerance("atol", value, 2)
 
 
-SHAPES = {
-    "mass": (2, 2),
-    "force": (2,),
-    "constraint": (1,),
-    "jacobian": (1, 2),
-    "gamma": (1,),
-    "constraint_rate": (1,),
-    "force_by_q": (2, 2),
-}
-
-
-@pytest.mark.parametrize("kind", SHAPES)
-@pytest.mark.parametrize(
-    ("value", "error", "words"),
-    [
-        (np.zeros((3, 3)), ValueError, r"returned shape \(3, 3\)"),
-        (0.0, ValueError, r"returned shape \(\)"),
-        (None, TypeError, "returned None"),
-        ("text", TypeError, "returned 'text'"),
-        (np.zeros(1, dtype=complex), TypeError, "returned array"),
-        ([[1.0], [1.0, 2.0]], TypeError, r"returned \[\[1"),
-    ],
-)
-def test_results_of_callbacks(kind, value, error, words):
-    shape = str(SHAPES[kind]).replace("(", r"\(").replace(")", r"\)")
-    with pytest.raises(error, match=rf"(?s){kind} of system 'pendulum' must return.*shape {shape}.*{words}"):
-        solve(pendulum(**{kind: lambda *arguments: value}))
-
-
 @pytest.mark.parametrize("mass", [np.diag([1.0, -2.0]), np.diag([0.0, -1.0]), np.zeros((2, 2))])
 @pytest.mark.parametrize("constant", [True, False])
 def test_a_mass_that_is_not_positive_definite(mass, constant):

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.problems import pendulum
+from tests.problems import event, pendulum
 from twoloop import Status, solve_dae
 from twoloop.mechanisms import four_bar, n_four_bar
 
@@ -49,10 +49,7 @@ def test_steps_across_singular_positions(windows, tolerances, end, compiled):
 def test_no_event_that_is_none_ends_a_run():
     problem = n_four_bar(3)
 
-    def far_away(t, q, v):
-        return 9.0 - np.abs(q).max()  # the bars reach 4 m
-
-    far_away.terminal = True
+    far_away = event(lambda t, q, v: 9.0 - np.abs(q).max(), terminal=True)  # the bars reach 4 m
     t = np.linspace(0.0, 10.0, 5000)
     result = across(problem, 10.0, (3e-9, 2e-9, 1e-8, 2e-8, 5e-8), events=far_away, t_eval=t)
     assert result.status == Status.REACHED_END

@@ -4,32 +4,15 @@ import hashlib
 import os
 import pickle
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.own_cache import with_kernels
+from tests.own_cache import RUN, Folder
 from twoloop.kernels.compile import caches, ownership
 from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder, read_own, write_own
 
-ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="rights on other systems are not in the mode")
-
-RUN = """
-from mechanism import force
-import numpy as np
-Q = np.zeros(1)
-force(0.0, np.ones(1), np.ones(1), np.ones(1), Q)
-print(Q[0], sum(force.stats.cache_hits.values()))
-"""
-MECHANISM = """
-from twoloop import callback
-@callback("force")
-def force(t, q, v, p, Q):
-    Q[0] = 2.0 * q[0]
-"""
 
 
 class Planted:
@@ -53,21 +36,15 @@ def first_warning(monkeypatch):
 @pytest.fixture
 def user(tmp_path):
     """Runs of a mechanism with caches of its own: its value, how often it was read, and what was said."""
-    (tmp_path / "mechanism.py").write_text(MECHANISM)
-    cache, home = with_kernels(tmp_path / "cache"), tmp_path / "home"
+    folder, home = Folder(tmp_path), tmp_path / "home"
+    folder.mechanism(force="2.0 * q[0]")
 
     def run(umask=0o022):
-        paths = {"NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(home), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
-        command = [sys.executable, "-c", f"import os; os.umask({umask})\n{RUN}"]
-        done = subprocess.run(
-            command, env=os.environ | paths, cwd=tmp_path, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
-        value, hits = done.stdout.split()
-        return float(value), int(hits), done.stderr
+        _, value, hits = folder.run(f"import os; os.umask({umask})\n{RUN}", XDG_CACHE_HOME=str(home)).split()
+        return float(value), int(hits), folder.said
 
-    run.cache, run.home, run.planted = cache, home, tmp_path / "planted"
-    run.file = lambda: next(cache.glob("*/mechanism.force-*.nbc"))
+    run.cache, run.home, run.planted = folder.cache, home, tmp_path / "planted"
+    run.file = lambda: next(folder.cache.glob("*/mechanism.force-*.nbc"))
     return run
 
 

@@ -1,102 +1,12 @@
 """Machine code on disk: read again when nothing changed, rebuilt when anything did, never a reason to fail."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numba import njit
 
-from tests.own_cache import with_kernels
+from tests.own_cache import RUN, Folder, with_kernels
+from tests.processes import run_python
 from twoloop.kernels.compile.caches import UNWRITABLE, watch
-
-ROOT = Path(__file__).parents[1]
-
-# what a mechanism's file looks like: a callback for each value, some of which enclose a global
-MECHANISM = """
-import numpy as np
-import numba
-from typing import NamedTuple
-from twoloop import callback
-import constants, helpers
-from constants import *
-from helpers import *
-from own_caches import *
-
-class Callbacks:
-    pass
-
-{callbacks}
-
-def value(function):
-    Q = np.zeros(1)
-    function(0.0, np.ones(1), np.ones(1), np.ones(1), Q)
-    return float(Q[0])
-"""
-CALLBACK = """
-@callback("force")
-def {name}(t, q, v, p, Q):
-    Q[0] = {value}
-Callbacks.{name} = {name}
-"""
-ENCLOSING = """
-def make_{name}(enclosed):
-    @callback("force")
-    def force(t, q, v, p, Q):
-        Q[0] = {value}
-    return force
-Callbacks.{name} = make_{name}({enclosed})
-"""
-# names, values, and how often the machine code was read from the disk
-RUN = """
-import mechanism as m
-for name, function in vars(m.Callbacks).items():
-    if not name.startswith("_"):
-        print(name, m.value(function), sum(function.stats.cache_hits.values()))
-"""
-
-
-class Folder:
-    """Files of a mechanism, and processes that run it with a cache of their own."""
-
-    def __init__(self, path):
-        self.path = path
-        self.cache = with_kernels(path / "cache")
-        self.write("constants", "")
-        self.write("helpers", "")
-        self.write("own_caches", "")
-
-    def write(self, name, text):
-        (self.path / f"{name}.py").write_text(text)
-
-    def mechanism(self, **values):
-        """A callback for each value; what stands behind a semicolon is enclosed."""
-        texts = []
-        for name, value in values.items():
-            text, _, enclosed = value.partition(";")
-            texts.append((ENCLOSING if enclosed else CALLBACK).format(name=name, value=text, enclosed=enclosed))
-        self.write("mechanism", MECHANISM.format(callbacks="".join(texts)))
-
-    def run(self, source=RUN, **environment):
-        variables = {
-            **os.environ,
-            "NUMBA_CACHE_DIR": str(self.cache),
-            "PYTHONPATH": f"{self.path}{os.pathsep}{ROOT}",
-            "PYTHONDONTWRITEBYTECODE": "1",  # Python's own cache sees whole seconds only
-            **environment,
-        }
-        command = [sys.executable, "-c", source]
-        done = subprocess.run(command, env=variables, cwd=self.path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        self.said = done.stderr
-        return done.stdout
-
-    def values(self, **environment):
-        """{name: (value, how often its machine code was read)}."""
-        rows = [line.split() for line in self.run(**environment).splitlines()]
-        return {name: (float(value), int(hits)) for name, value, hits in rows}
 
 
 @pytest.fixture
@@ -163,17 +73,46 @@ def own_cache(x):
 def own_cache_at_once(x):
     return inner(x)
 """
+KERNELS = """
+from twoloop.kernels.data.common import kernel, f8
+@kernel(f8(f8))
+def twice(x):
+    return 2.0 * x
+@kernel(f8(f8))
+def thrice(x):
+    return 3.0 * x
+"""
+ANNOUNCED = "compiling the integrator"
+# plain functions that from_python compiles, of one name and with other enclosed numbers
+SYSTEMS = """
+import numpy as np
+import constants
+from twoloop import ConstrainedSystem
+
+def made(scale):
+    return ConstrainedSystem.from_python(
+        n_q=1, n_c=0, compile=True, mass=scale * np.eye(1), force=lambda t, q, v: scale * constants.FLOAT * q)
+
+for scale in (1, 10):
+    system = made(1.0 * scale)
+    for kind, value in (("force", system.force(0.0, [1.0], [0.0])[0]), ("mass", system.mass(0.0, [1.0])[0, 0])):
+        print(f"{kind}_{scale}", value, sum(getattr(system.functions, kind).stats.cache_hits.values()))
+"""
 INNER = "import numba\n@numba.njit\ndef inner(x):\n    return {0}.0 * x\n"
 
 
 def test_what_changes_in_other_files_makes_machine_code_stale(folder):
     folder.mechanism(**VALUES)
-    folder.write("own_caches", OWN_CACHES)  # does not change
+    folder.write("own_caches", OWN_CACHES + KERNELS)  # does not change
+    folder.write("systems", SYSTEMS)
     for factor in (1, 2):
         for name, text in {"constants": CONSTANTS, "helpers": HELPERS, "inner": INNER}.items():
             folder.write(name, text.format(factor))
         kept = factor - 1  # what names none of it is read from the disk the second time
-        assert folder.values() == {name: (factor, 0) for name in VALUES} | {"nothing": (1.0, kept)}
+        same = {"nothing": (1.0, kept), "mass_1": (1.0, kept), "mass_10": (10.0, kept)}
+        changed = {name: (factor, 0) for name in VALUES} | {"force_1": (factor, 0), "force_10": (10.0 * factor, 0)}
+        assert folder.values(f"{RUN}\nimport systems") == changed | same
+        assert folder.said.count(ANNOUNCED) == 1 - kept  # of the kernels
     never = {"what_cannot_be_watched": (2.0, 0)}
     assert folder.values() == {name: (2.0, 1) for name in VALUES} | {"nothing": (1.0, 1)} | never
 
@@ -212,53 +151,10 @@ def block_caches(folder):
 def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(folder):
     folder.mechanism(one="q[0]", two="q[0]")
     blocked = block_caches(folder)
-    folder.write(
-        "kernels",
-        "from twoloop.kernels.data.common import kernel, f8\n"
-        "@kernel(f8(f8))\ndef twice(x):\n    return 2.0 * x\n"
-        "@kernel(f8(f8))\ndef thrice(x):\n    return 3.0 * x\n",
-    )
+    folder.write("kernels", KERNELS)
     values = folder.run(f"from kernels import *; print(twice(1.0), thrice(1.0))\n{RUN}", **blocked)
     assert values.split() == ["2.0", "3.0", "one", "1.0", "0", "two", "1.0", "0"]
     assert folder.said.count(UNWRITABLE) == 1
-
-
-def test_a_kernel_is_announced_when_it_compiles_and_only_then(folder):
-    folder.write(
-        "kernels",
-        "from twoloop.kernels.data.common import kernel, f8\n@kernel(f8(f8))\ndef twice(x):\n    return 2.0 * x\n",
-    )
-    source = "from kernels import *; print(twice(1.0))"
-    folder.run(source)
-    assert folder.said.count("compiling the integrator") == 1
-    folder.run(source)
-    assert folder.said == ""
-
-
-SYSTEM = """
-import numpy as np
-from twoloop import ConstrainedSystem
-from constants import FACTOR
-
-def made(scale):
-    return ConstrainedSystem.from_python(
-        n_q=2, n_c=0, compile=True, mass=scale * np.eye(2), force=lambda t, q, v: scale * FACTOR * q)
-"""
-RUN_SYSTEM = """
-from system import made
-one, two = made(1.0), made(10.0)
-q, v = [1.0, 2.0], [0.0, 0.0]
-print(one.force(0.0, q, v)[0], two.force(0.0, q, v)[0], two.mass(0.0, q)[0, 0],
-      sum(sum(getattr(each.functions, kind).stats.cache_hits.values()) for each in (one, two) for kind in each.given))
-"""
-
-
-def test_functions_that_from_python_compiles_are_kept(folder):
-    folder.write("system", SYSTEM)
-    folder.write("constants", "FACTOR = 1.0")
-    assert folder.run(RUN_SYSTEM).split()[:3] == ["1.0", "10.0", "10.0"]
-    folder.write("constants", "FACTOR = 3.0")
-    assert folder.run(RUN_SYSTEM).split() == ["3.0", "30.0", "10.0", "2"]  # all but the two forces are read
 
 
 # --- the digests themselves
@@ -317,12 +213,5 @@ print(next(iter(through_python(sys.argv[1]).overloads.values())).fndesc.mangled_
 def test_closures_of_one_name_from_two_processes_have_symbols_of_their_own(tmp_path):
     # numba numbers symbols within a process: each of these two gives its only closure the same number
     cache = with_kernels(tmp_path / "cache")
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
-    symbols = set()
-    for kind in ("force_by_q", "reaction_by_q"):
-        done = subprocess.run(
-            [sys.executable, "-c", SYMBOL, kind], capture_output=True, text=True, env=environment, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
-        symbols.add(done.stdout)
-    assert len(symbols) == 2
+    kinds = ("force_by_q", "reaction_by_q")
+    assert len({run_python(SYMBOL, kind, NUMBA_CACHE_DIR=str(cache)).stdout for kind in kinds}) == 2

@@ -1,18 +1,14 @@
 """Files of results with anything in them: a `ValueError` that names the field, and never a crash."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import twoloop
 from tests.problems import run
+from tests.processes import run_python
 from twoloop.mechanisms import four_bar
-
-ROOT = Path(__file__).parents[1]
 
 
 def crossing(t, q, v):
@@ -218,13 +214,5 @@ print(refused, read)
 
 
 def test_nothing_in_a_file_ends_the_process(saved, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", FUZZ, saved, tmp_path, "240"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    refused, read = map(int, done.stdout.split())
+    refused, read = map(int, run_python(FUZZ, saved, tmp_path, 240, PYTHONWARNINGS="ignore").stdout.split())
     assert refused > 120 and read > 10  # both ways were tried

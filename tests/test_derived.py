@@ -69,7 +69,9 @@ def test_they_are_those_of_the_formulas(absent):
 READY = sorted({name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam", "n_four_bar"})
 
 
-@pytest.mark.parametrize("name", READY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "governor" else ()) for name in READY]
+)
 def test_of_every_ready_mechanism_they_are_those_of_its_formulas(name):
     problem = getattr(mechanisms, name)()
     system, v = problem.system, problem.v0 + np.linspace(0.5, 1.5, problem.system.n_q)

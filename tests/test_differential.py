@@ -43,7 +43,7 @@ def test_a_run_is_right_or_says_that_it_is_not(family):
 
 
 def test_the_motions_are_those_of_the_mechanisms():
-    for family in ("gust of 30 ms", "drive with a kink", "softplus stop"):
+    for family in ("gust of 100 ms", "drive with a kink", "softplus stop"):
         n_drawn, known = MOTIONS[family]
         mechanism = mechanism_of(family, n_drawn)
         again = positions(mechanism, march(mechanism, "DOP853", 1e-9, mechanism.y0))

@@ -1,15 +1,15 @@
 """The documentation and the README: their code as printed, links, what they say of every status, generated pages."""
 
-import importlib.util
 import re
-import sys
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.test_rooms import documentation
 from twoloop import Result, Status, mechanisms, solve_dae
+from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
 
 mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
@@ -214,6 +214,26 @@ def test_success_is_not_explained():
     assert explained(Status.REACHED_END) == explained(Status.EVENT) == ""
 
 
+# --- the reference has an entry for all that a user can import
+
+ENTRIES = set(
+    re.findall(
+        r"^\.\. auto(?:class|function|exception):: (\S+)", (DOCS / "reference.md").read_text("utf-8"), re.MULTILINE
+    )
+)
+
+
+@pytest.mark.parametrize("package", ["twoloop", "twoloop.symbolic"])
+def test_every_name_of_a_package_has_an_entry(package):
+    module = pytest.importorskip(package, exc_type=ImportError)
+    assert {f"{package}.{name}" for name in module.__all__} <= ENTRIES
+
+
+def test_so_has_every_method_that_a_name_stands_for():
+    kinds = {type(method).__qualname__ for method in PRESETS.values()}
+    assert kinds <= {entry.rpartition(".")[2] for entry in ENTRIES}
+
+
 # --- links, and what is generated
 
 
@@ -226,18 +246,10 @@ def test_links_lead_to_files_that_are_there():
                 assert (DOCS / link).is_file(), f"{page}.md: {link}"
 
 
-def generator(name):
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_front_page_shows_what_its_code_writes(tmp_path):
     for name in ("gallery", "rooms"):
-        generator(name)
-    generator("generate").run_the_front_page(tmp_path / "front")
+        documentation(name)
+    documentation("generate").run_the_front_page(tmp_path / "front")
     assert {file.name for file in (tmp_path / "front").iterdir()} == {"run.png", "run.html"}
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     assert '<iframe src="front/run.html"' in text and "generated/extra/front/run.png" in text
@@ -245,7 +257,7 @@ def test_the_front_page_shows_what_its_code_writes(tmp_path):
 
 
 def test_the_gallery_shows_every_ready_mechanism(tmp_path, monkeypatch):
-    gallery = generator("gallery")
+    gallery = documentation("gallery")
     monkeypatch.setattr(gallery, "LONGEST", 0.01)  # s: whole motions are for the build
     gallery.write(tmp_path / "gallery.md", tmp_path / "animations")
     text = (tmp_path / "gallery.md").read_text(encoding="utf-8")

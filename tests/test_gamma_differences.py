@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from tests.derivative_cases import shaken_pendulum
 from tests.problems import pendulum, worst
-from twoloop import ConstrainedSystem, Status, consistent_state, solve_dae
+from twoloop import Status, consistent_state, solve_dae
 
 AMPLITUDE = 1e-3  # m
 
@@ -14,28 +15,14 @@ def opaque(x):
     return np.maximum(x, -np.inf)
 
 
-def shaken_pendulum(speed, gamma=True, noise=0.0):
+def shaken(speed, gamma=True, noise=0.0):
     """A pendulum of 1 m whose pivot is shaken horizontally with the angular frequency `speed`."""
-
-    def arm(t, q):
-        return np.array([q[0] - AMPLITUDE * np.sin(speed * t), q[1]])
-
-    def right_hand_side(t, q, v):
-        d = arm(t, q)
-        u = np.array([v[0] - AMPLITUDE * speed * np.cos(speed * t), v[1]])
-        return np.array([-(u @ u) - d[0] * AMPLITUDE * speed**2 * np.sin(speed * t)])
-
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
-        constraint=lambda t, q: np.array([0.5 * (arm(t, q) @ arm(t, q) - 1.0)]),
-        jacobian=lambda t, q: opaque(arm(t, q)[None, :] + noise * np.sin(1e13 * (q[0] + t))),
-        constraint_rate=lambda t, q: np.array([-arm(t, q)[0] * AMPLITUDE * speed * np.cos(speed * t)]),
-        gamma=right_hand_side if gamma else None,
-        name="shaken pendulum",
-    )
+    case = shaken_pendulum(1.0, omega=speed, amplitude=AMPLITUDE)
+    changed = {
+        "force": lambda t, q, v: np.array([0.0, -9.81]),
+        "jacobian": lambda t, q: opaque(case.functions["jacobian"](t, q) + noise * np.sin(1e13 * (q[0] + t))),
+    }
+    return case.system(**changed if gamma else changed | {"gamma": None})
 
 
 def start(system, speed):
@@ -43,9 +30,9 @@ def start(system, speed):
 
 
 @pytest.mark.parametrize("method", ["Gauss12", "DOP853", "BDF"])
-@pytest.mark.parametrize("speed", [1.0, 10.0, 1e3, 4e3, 2.0 * np.pi * 16e3])
+@pytest.mark.parametrize("speed", [1.0, 1e3, 2.0 * np.pi * 16e3])
 def test_a_fast_drive(speed, method):
-    exact, differenced = shaken_pendulum(speed), shaken_pendulum(speed, gamma=False)
+    exact, differenced = shaken(speed), shaken(speed, gamma=False)
     span = (0.0, min(3.0, 30.0 / speed))
     q0, v0 = start(exact, speed)
     given = solve_dae(exact, span, q0, v0, method, 1e-8, 1e-8)
@@ -62,14 +49,12 @@ def test_differences_are_not_lengthened_over_the_drive():
     def angle(t):
         return 50.0 * t**4
 
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -1.0]),
+    system = pendulum(
+        constant_mass=True,
         constraint=lambda t, q: np.array([q[0] - 0.01 * np.sin(angle(t))]),
         jacobian=lambda t, q: opaque(np.array([[1.0, 0.0]])) + 0.0 * opaque(q[0]),
         constraint_rate=lambda t, q: np.array([-0.01 * np.cos(angle(t)) * 200.0 * t**3]),
+        gamma=False,
     )
     times = np.linspace(0.1, 2.0, 20)
     run = solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "DOP853", t_eval=times)
@@ -79,8 +64,8 @@ def test_differences_are_not_lengthened_over_the_drive():
 
 
 def test_what_cannot_reach_the_tolerance_is_a_status():
-    system = shaken_pendulum(10.0, gamma=False, noise=1e-9)
-    q0, v0 = start(system, 10.0)
+    system = shaken(10.0, gamma=False, noise=1e-9)
+    q0, v0 = start(shaken(10.0), 10.0)
     run = solve_dae(system, (0.0, 1.0), q0, v0, check_derivatives=False)
     assert run.status is Status.NOT_CONVERGED
     assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message

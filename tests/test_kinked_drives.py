@@ -1,5 +1,7 @@
 """Drives whose C_t jumps: velocities change as by an impulse, by every method, or the run says why not."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -85,7 +87,11 @@ def through(pieces, v0):
     return np.concatenate([q, v])
 
 
-@pytest.fixture(scope="module", params=[(1.3, 0.5), (-3e-4, 0.437)])
+CASES = [(1.3, 0.5), (-3e-4, 0.437)]  # on the grid of constant steps, and a small one between
+FAMILIES = ("auto", "Adams", "Gauss8", "RadauIIA9", "BDF", "Newmark", "ESDIRK4")
+
+
+@pytest.fixture(scope="module", params=CASES)
 def case(request):
     """A jump and its time, and the state at the end."""
     jump, at = request.param
@@ -98,11 +104,21 @@ def case(request):
     return jump, at, through([(0.0, at, smooth), (at, END, after)], velocities(smooth))
 
 
+def end_of(system, method="DOP853", tolerance=1e-10, **options):
+    """State at the end of a run from the start, by a method that lands on what jumps."""
+    result = solve_dae(system, (0.0, END), START, velocities(system), method, tolerance, tolerance, **options)
+    return np.concatenate([result.q[:, -1], result.v[:, -1]])
+
+
 def off(result, expected):
     return np.abs(np.concatenate([result.q[:, -1], result.v[:, -1]]) - expected).max()
 
 
-@pytest.mark.parametrize("method", [name for name in PRESETS if name not in TRACED])
+@pytest.mark.parametrize(
+    ("case", "method"),
+    [(CASES[0], name) for name in PRESETS if name not in TRACED] + [(CASES[1], name) for name in FAMILIES],
+    indirect=["case"],
+)
 def test_a_jump_is_an_impulse(case, method):
     jump, at, expected = case
     tol = 1e-5 if method in LOW_ORDER else 1e-7  # the Newmark methods take thousands of steps
@@ -126,25 +142,29 @@ def test_gamma_may_be_differenced(case):
 def test_constant_steps(at):
     system = shaken(1.3, at)
     result = solve_dae(system, (0.0, END), START, velocities(system), "Gauss6", step_size=0.01)
-    fine = solve_dae(system, (0.0, END), START, velocities(system), "Gauss6", 1e-9, 1e-9)
-    assert off(result, np.concatenate([fine.q[:, -1], fine.v[:, -1]])) < 1e-7
+    assert off(result, end_of(system, "Gauss6", 1e-9)) < 1e-7
     assert result.t.size - 1 in (81, 82)
     assert np.abs(result.t[-1] - END) < 1e-15
 
 
+@pytest.fixture(scope="module")
+def before_and_end():
+    """States before a jump at 0.3 s, and at the end of the run."""
+    return through([(0.0, 0.3, shaken())], velocities(shaken())), end_of(shaken(0.9, 0.3))
+
+
 @pytest.mark.parametrize("method", ["DOP853", "Gauss4", "RadauIIA5"])
 @pytest.mark.parametrize("after_too", [True, False])
-def test_at_the_ends_of_a_run(method, after_too):
+def test_at_the_ends_of_a_run(before_and_end, method, after_too):
     """The value of C_t at the time of the jump says on which side of it a run begins or ends."""
     system, smooth = shaken(0.9, 0.3, after_too), shaken()
-    before = through([(0.0, 0.3, smooth)], velocities(smooth))
+    before, end = before_and_end
     beyond = np.append(before[:5], impulse(shaken(0.9, 0.3), 0.3, before[:5], before[5:]))
     result = solve_dae(system, (0.0, 0.3), START, velocities(smooth), method, 1e-8, 1e-8)
     assert off(result, beyond if after_too else before) < 1e-6
     begun = (beyond if after_too else before)[5:]
     again = solve_dae(system, (0.3, END), before[:5], begun, method, 1e-8, 1e-8, check_derivatives=False)
-    expected = solve_dae(shaken(0.9, 0.3), (0.0, END), START, velocities(smooth), "DOP853", 1e-10, 1e-10)
-    assert off(again, np.concatenate([expected.q[:, -1], expected.v[:, -1]])) < 1e-5
+    assert off(again, end) < 1e-5
     assert ("jumps" in again.message) is not after_too
 
 
@@ -156,9 +176,9 @@ def sigmoid(x):
     return 1.0 / (1.0 + np.exp(-x)) if x > -700.0 else 0.0
 
 
-@pytest.mark.parametrize("method", ["auto", "Gauss4", "Gauss16", "RadauIIA9", "BDF", "SunRadau5"])
-@pytest.mark.parametrize("width", [1e-3, 1e-4, 1e-8])
-def test_a_steep_ramp_is_none(method, width):
+@cache
+def steep_ramp(width):
+    """A drive that becomes faster within the width, and the state at the end."""
     at, jump = 0.4371, 0.8
 
     def steep(t):
@@ -169,17 +189,34 @@ def test_a_steep_ramp_is_none(method, width):
         lambda t: jump * steep(t),
         lambda t: jump / width * steep(t) * (1.0 - steep(t)),
     )
+    return system, end_of(system, max_step=0.005)
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-4, 1e-8])
+@pytest.mark.parametrize("method", ["auto", "Gauss4", "Gauss16", "RadauIIA9", "BDF", "SunRadau5"])
+def test_a_steep_ramp_is_none(method, width):
+    system, expected = steep_ramp(width)
     result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-6, 1e-6)
-    expected = solve_dae(system, (0.0, END), START, velocities(system), "DOP853", 1e-10, 1e-10, max_step=0.005)
-    assert off(result, np.concatenate([expected.q[:, -1], expected.v[:, -1]])) < 1e-4
+    assert off(result, expected) < 1e-4
     assert "jumps" not in result.message
+
+
+def at_rest_and_then(place, speed, acceleration, at):
+    """State at the end where a drive is still until a time."""
+    rest = driven(lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)
+    return through([(0.0, at, rest), (at, END, driven(place, speed, acceleration))], np.zeros(5))
+
+
+@pytest.fixture(scope="module")
+def after_a_sudden_start():
+    return at_rest_and_then(lambda t: 0.8 * (t - 0.4371), lambda t: 0.8, lambda t: 0.0, 0.4371)
 
 
 @pytest.mark.parametrize(
     ("method", "tolerance"), [("Newmark", 1e-4), ("TRBDF2", 1e-4), ("TRBDF2", 1e-6), ("auto", 1e-6)]
 )
 @pytest.mark.parametrize("width", [1e-4, 1e-6, 1e-9])
-def test_a_ramp_between_the_ends_of_a_step(method, tolerance, width):
+def test_a_ramp_between_the_ends_of_a_step(after_a_sudden_start, method, tolerance, width):
     """At both ends of a step as long as the ramp its acceleration is zero: such steps left the impulse of it out."""
     at, jump = 0.4371, 0.8
 
@@ -191,41 +228,42 @@ def test_a_ramp_between_the_ends_of_a_step(method, tolerance, width):
         lambda t: jump * min(max(0.0, t - at) / width, 1.0),
         lambda t: jump / width if at <= t < at + width else 0.0,
     )
-    rest = driven(lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)
-    after = driven(lambda t: jump * (t - at), lambda t: jump, lambda t: 0.0)
-    expected = through([(0.0, at, rest), (at, END, after)], np.zeros(5))
     result = solve_dae(system, (0.0, END), START, np.zeros(5), method, tolerance, tolerance)
     assert result.success
-    assert off(result, expected) < 50.0 * tolerance + 2.0 * width
+    assert off(result, after_a_sudden_start) < 50.0 * tolerance + 2.0 * width
+
+
+@pytest.fixture(scope="module")
+def after_a_gentle_start():
+    return at_rest_and_then(lambda t: 3.0 * (t - 0.437) ** 2, lambda t: 6.0 * (t - 0.437), lambda t: 6.0, 0.437)
 
 
 @pytest.mark.parametrize("method", ["auto", "Gauss4", "RadauIIA9", "BDF", "Adams", "PaperIRK"])
-def test_a_jump_of_the_acceleration_of_a_drive_is_none(method):
+def test_a_jump_of_the_acceleration_of_a_drive_is_none(after_a_gentle_start, method):
     at = 0.437
     system = driven(
         lambda t: 3.0 * max(0.0, t - at) ** 2, lambda t: 6.0 * max(0.0, t - at), lambda t: 6.0 if t > at else 0.0
     )
-    v0 = np.zeros(5)
-    rest = driven(lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)
-    after = driven(lambda t: 3.0 * (t - at) ** 2, lambda t: 6.0 * (t - at), lambda t: 6.0)
-    expected = through([(0.0, at, rest), (at, END, after)], v0)
-    result = solve_dae(system, (0.0, END), START, v0, method, 1e-6, 1e-6)
-    assert off(result, expected) < 1e-3
+    result = solve_dae(system, (0.0, END), START, np.zeros(5), method, 1e-6, 1e-6)
+    assert off(result, after_a_gentle_start) < 1e-3
     assert "jumps" not in result.message
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Gauss8", "Gauss6", "BDF"])
-def test_between_the_steps_no_polynomial_goes_through_the_jump(method):
+@pytest.fixture(scope="module")
+def beside_a_jump():
+    """A system whose drive jumps at 0.437 s, and states on both sides."""
     system = shaken(1.3, 0.437)
-    result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-7, 1e-7, dense_output=True)
-    pieces = (shaken(), 0.0, 0.43699), (shaken(1.3, 0.437), 0.43701, END)
-    v0 = velocities(system)
-    for _, begin, end in pieces:
-        t = np.linspace(begin, end, 60)
-        exact = solve_dae(system, (0.0, END), START, v0, "DOP853", 1e-11, 1e-11, t_eval=t, max_step=0.02)
-        state = result.sol(t)
-        assert np.abs(state.q - exact.q).max() < 1e-5
-        assert np.abs(state.v - exact.v).max() < 1e-5
+    t = np.concatenate([np.linspace(0.0, 0.43699, 60), np.linspace(0.43701, END, 60)])
+    start = system, (0.0, END), START, velocities(system)
+    return start, solve_dae(*start, "DOP853", 1e-11, 1e-11, t_eval=t, max_step=0.02)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Gauss8", "Gauss6", "BDF"])
+def test_between_the_steps_no_polynomial_goes_through_the_jump(beside_a_jump, method):
+    start, exact = beside_a_jump
+    state = solve_dae(*start, method, 1e-7, 1e-7, dense_output=True).sol(exact.t)
+    assert np.abs(state.q - exact.q).max() < 1e-5
+    assert np.abs(state.v - exact.v).max() < 1e-5
 
 
 def test_a_skate_whose_blade_is_driven_suddenly():

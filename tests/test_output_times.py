@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from tests.problems import run, worst
+from tests.problems import event, run, worst
 from twoloop import Status
 from twoloop.methods.presets import PRESETS
 from twoloop.run.dense import Interpolator
@@ -69,10 +69,7 @@ def test_nothing_is_interpolated_at_the_ends_of_a_run(default_four_bar, method, 
 
 
 def test_an_event_ends_a_run_with_output_at_the_end_only(default_four_bar):
-    def half_way(t, q, v):
-        return t - 0.5
-
-    half_way.terminal = True
+    half_way = event(lambda t, q, v: t - 0.5, terminal=True)
     result = run(default_four_bar, 1.0, t_eval=[0.0, 1.0], events=half_way)
     assert result.status == Status.EVENT
     assert result.t.tolist() == [0.0]

@@ -1,4 +1,4 @@
-"""What is shipped, and with which versions of others."""
+"""What is shipped, with which versions of others, and what is used of numba's private parts."""
 
 import re
 import tomllib
@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 from hatchling.build import build_wheel
+from numba.core.types.functions import BaseFunction, Function
+from numba.np import arrayobj
+
+from twoloop.kernels.compile.versions import BELOW, LEAST, check_version
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -49,3 +53,33 @@ def test_the_tools_of_both_test_runs_are_the_same():
     tools = {name: version for name, version in pins("requirements-oldest.txt").items() if name not in least}
     locked = pins("requirements.lock")
     assert tools and all(locked[name] == version for name, version in tools.items())
+
+
+# --- private parts of numba: in one folder, of versions that are known, and put back after each compilation
+
+
+def test_other_versions_of_numba_are_refused_with_what_to_install():
+    for known in ("0.61.0", "0.68.1", "0.68.0rc1"):
+        check_version(known)
+    for unknown in ("0.60.0", "0.69.0", "1.0.0"):
+        with pytest.raises(ImportError, match=r"numba .* is installed: pip install 'numba>=0\.61,<0\.69'"):
+            check_version(unknown)
+
+
+def test_the_versions_of_numba_are_those_of_the_package():
+    least, below = (".".join(map(str, version)) for version in (LEAST, BELOW))
+    assert f"numba>={least},<{below}" in PROJECT["dependencies"]
+
+
+def test_private_parts_of_numba_are_used_in_one_folder():
+    private = re.compile(r"(from|import) numba\.(core|np|misc)")
+    users = {path.parent for path in (ROOT / "twoloop").rglob("*.py") if private.search(path.read_text())}
+    assert users == {ROOT / "twoloop" / "kernels" / "compile"}
+
+
+def test_numba_is_its_own_after_kernels_were_compiled_or_read():
+    from twoloop.kernels import advance
+
+    assert advance.advance.overloads
+    assert arrayobj.fix_integer_index.__module__ == "numba.np.arrayobj"
+    assert "get_call_type" not in vars(Function) and Function.get_call_type is BaseFunction.get_call_type

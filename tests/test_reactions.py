@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import twoloop
+from tests.compiled import PENDULUM
+from tests.problems import pendulum as bare_pendulum
 from twoloop import ConstrainedSystem, ConstraintWarning, Joint, solve_dae
 from twoloop.mechanisms import (
     andrews,
@@ -284,67 +286,50 @@ def test_a_redundant_row_is_said_to_leave_single_joints_open():
 
 
 def test_rows_that_depend_on_one_another_within_a_joint_leave_it_unique():
-    system = hanging(n_c=2, rows=(0, 1))
     with pytest.warns(ConstraintWarning):
-        result = solve_dae(system, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0])
+        result = solve_dae(hanging_twice((0, 1)), (0.0, 0.1), *BOB)
     link = result.reactions("link")
     assert result.rank == 1 and link.unique
     assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-12
-    apart = hanging(n_c=2, rows=(0,))
     with pytest.warns(ConstraintWarning):
-        assert not solve_dae(apart, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0]).reactions("link").unique
+        assert not solve_dae(hanging_twice((0,)), (0.0, 0.1), *BOB).reactions("link").unique
 
 
 # --- signs, points, names
 
 
-def hanging(n_c=1, rows=(0,), joints=None):
-    """A bob of 1 kg on a link of 1 m, said once or twice."""
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=n_c,
-        mass=np.eye(2),
-        force=gravity,
-        constraint=once if n_c == 1 else twice,
-        jacobian=jacobian_once if n_c == 1 else jacobian_twice,
-        joints=[Joint("link", rows, (0, 1))] if joints is None else joints,
-        name="bob",
+BOB = [0.0, -1.0], [0.0, 0.0]
+
+
+def hanging():
+    """A bob of 1 kg on a link of 1 m."""
+    return ConstrainedSystem(**PENDULUM, joints=[Joint("link", (0,), (0, 1))])
+
+
+def hanging_twice(rows, **more):
+    """The same, the length of the link said twice, and the link of some of these rows."""
+    return bare_pendulum(
+        n_c=2,
+        constant_mass=True,
+        constraint=lambda t, q: np.repeat(0.5 * (q @ q - 1.0), 2),
+        jacobian=lambda t, q: np.stack([q, q]),
+        gamma=False,
+        joints=[Joint("link", rows, (0, 1), **more)],
     )
-
-
-def gravity(t, q, v):
-    return np.array([0.0, -9.81])
-
-
-def once(t, q):
-    return np.array([0.5 * (q @ q - 1.0)])
-
-
-def twice(t, q):
-    return np.repeat(0.5 * (q @ q - 1.0), 2)
-
-
-def jacobian_once(t, q):
-    return q[None, :]
-
-
-def jacobian_twice(t, q):
-    return np.stack([q, q])
 
 
 @pytest.mark.parametrize(("rows", "unique"), [((0,), False), ((1,), False), ((0, 1), True)])
 def test_what_is_unique_among_sums_of_rows(rows, unique):
     sums_of_rows = np.array([[1.0, 0.0], [1.0, 2.0]])
-    system = hanging(n_c=2, joints=[Joint("link", rows, (0, 1), equations=sums_of_rows)])
     with pytest.warns(ConstraintWarning):
-        link = solve_dae(system, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0]).reactions("link")
+        link = solve_dae(hanging_twice(rows, equations=sums_of_rows), (0.0, 0.1), *BOB).reactions("link")
     assert link.unique == unique
     if unique:
         assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-12
 
 
 def test_what_hangs_is_pulled_upwards():
-    result = solve_dae(hanging(), (0.0, 0.1), [0.0, -1.0], [0.0, 0.0])
+    result = solve_dae(hanging(), (0.0, 0.1), *BOB)
     link = result.reactions("link")
     assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-13
     assert (link.point == result.q).all()
@@ -406,7 +391,4 @@ def test_copies_and_pickles_keep_joints():
     system = hanging()
     for other in (copy.copy(system), copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
         assert [joint.name for joint in other.joints] == ["link"]
-        assert (
-            np.abs(solve_dae(other, (0.0, 0.1), [0.0, -1.0], [0.0, 0.0]).reactions("link").force[1] - 9.81).max()
-            < 1e-12
-        )
+        assert solve_dae(other, (0.0, 0.1), *BOB).reactions("link").force[1] == pytest.approx(9.81, abs=1e-12)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.problems import worst
-from twoloop import ConstrainedSystem, mechanisms, solve_dae
+from tests.problems import unconstrained, worst
+from twoloop import mechanisms, solve_dae
 
 TOL = 1e-8
 W, PUSH, END = 3.0, 10.0, 1.0  # rad/s, m/s^2, s
@@ -13,14 +13,7 @@ TIMES = np.linspace(0.21, 0.79, 8) ** 1.1  # s, on no grid of steps
 
 def pushed(at):
     """A mass on a spring, pushed from a time on."""
-    return ConstrainedSystem.from_python(
-        n_q=1,
-        n_c=0,
-        mass=np.eye(1),
-        force=lambda t, q, v: np.array([(PUSH if t > at else 0.0) - W * W * q[0]]),
-        constraint=None,
-        jacobian=None,
-    )
+    return unconstrained(lambda t, q, v: np.array([(PUSH if t > at else 0.0) - W * W * q[0]]))
 
 
 def errors(method):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.problems import event
 from twoloop import DOP853, ConstrainedSystem, Status, solve_dae
 from twoloop.kernels.data import common
 from twoloop.kernels.steps import adams_step as kernels
@@ -28,14 +29,6 @@ from twoloop.run.stability import Looks, said_of_stiffness
 
 STIFF = "The problem looks stiff"
 METHODS = pytest.mark.parametrize("method", ["Adams", "DOP853"])
-
-
-def never(t, q, v):
-    """An event that does not occur, but has Python look at a run every 16 attempts."""
-    return 1.0
-
-
-never.terminal = True
 
 
 def run(problem, end, method, tol, **options):
@@ -76,10 +69,11 @@ SMOOTH = [
 
 
 @METHODS
-@pytest.mark.parametrize("tol", [1e-4, 1e-8, 1e-12])
+@pytest.mark.parametrize("tol", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow), 1e-12])
 @pytest.mark.parametrize(("make", "end"), SMOOTH)
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_smooth_motion_is_not_called_stiff(make, end, tol, method):
+    never = event(lambda t, q, v: 1.0, terminal=True)  # has Python look at a run every 16 attempts
     result = run(make(), end, method, tol, events=never)
     assert result.success
     assert STIFF not in result.message

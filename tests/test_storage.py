@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import twoloop
-from tests.problems import run, swing
+from tests.problems import event, run, swing
 from twoloop import Result, Statistics, Status
 
 
-def event(t, q, v):
+def raised(t, q, v):
     return q[8] - 1.0
 
 
@@ -31,7 +31,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "BDF", "RadauIIA5", "RadauIIA13", "Taylor"])
 def test_there_and_back(default_four_bar, tmp_path, method):
-    result = run(default_four_bar, 1.0, method=method, dense_output=True, events=event)
+    result = run(default_four_bar, 1.0, method=method, dense_output=True, events=raised)
     result.save(tmp_path / "run.npz")
     again = twoloop.load(tmp_path / "run.npz", default_four_bar.system)
     same(result, again)
@@ -51,11 +51,8 @@ def test_without_the_system_there_is_no_dense_solution(default_four_bar, tmp_pat
 
 
 def test_a_run_that_an_event_ended(default_four_bar, tmp_path):
-    def end(t, q, v):
-        return q[8] - 1.0
-
-    end.terminal = True
-    result = run(default_four_bar, 1.0, dense_output=True, events=[end, event])
+    end = event(lambda t, q, v: q[8] - 1.0, terminal=True)
+    result = run(default_four_bar, 1.0, dense_output=True, events=[end, raised])
     result.save(tmp_path / "run.npz")
     again = twoloop.load(str(tmp_path / "run.npz"), default_four_bar.system)
     same(result, again)

@@ -11,9 +11,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.compiled import PENDULUM as COMPILED
+from tests.compiled import pendulum_under
 from tests.problems import pendulum as bare_pendulum
-from twoloop import ConstrainedSystem, callback, sweep
+from twoloop import sweep
 from twoloop.generate import stage_code, straight_code
 from twoloop.mechanisms import Problem
 from twoloop.sweeps import sweep as sweeps
@@ -307,14 +307,8 @@ def test_a_worker_that_cannot_begin_is_an_error(monkeypatch):
 # --- memory
 
 
-@callback("force")
-def attraction(t, q, v, p, Q):
-    Q[1] = -p[0]
-
-
 def swinging_under(gravity):
-    system = ConstrainedSystem(**{**COMPILED, "force": attraction}, parameters=[gravity])
-    return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
+    return Problem("swing", pendulum_under(gravity), np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
 
 
 def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):

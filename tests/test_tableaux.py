@@ -207,9 +207,3 @@ def test_sun_damps_nothing_and_radau_iia_everything_stiff(s):
         assert abs(stability(sun_radau_iib(s), 1j * y) - stability(gauss(s), 1j * y)) < 1e-12  # the same function
     assert abs(stability(radau_iia(s), -1e8)) < 1e-6
     assert np.abs(radau_iia(s).A[-1] - radau_iia(s).b).max() < 1e-15  # stiffly accurate
-
-
-@pytest.mark.parametrize("s", [2.0, "3", None, True])
-def test_number_of_stages_must_be_an_int(s):
-    with pytest.raises(TypeError, match=r"\bs\b.*lobatto_iiie"):  # of the others: tests/bad_input
-        lobatto_iiie(s)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.problems import pendulum_state, worst
-from twoloop import ConstrainedSystem, mechanisms, solve_dae
+from tests.problems import pendulum_state, unconstrained, worst
+from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 
@@ -23,9 +23,7 @@ def test_errors_of_many_short_steps_do_not_add_up():
 
 def test_vibrations_that_steps_pass_over_do_not_grow():
     rates = np.array([1.0, 300.0, 1e4])
-    system = ConstrainedSystem.from_python(
-        n_q=3, n_c=0, mass=np.eye(3), force=lambda t, q, v: -(rates**2) * q, constraint=None, jacobian=None
-    )
+    system = unconstrained(lambda t, q, v: -(rates**2) * q, 3)
     start = np.array([1.0, 1e-6, 1e-9])
     result = solve_dae(system, (0.0, 10.0), start, np.zeros(3), "TRBDF2", 1e-4, 1e-4)
     assert result.stats.n_accepted < 300  # 5e5 periods of the fastest

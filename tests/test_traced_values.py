@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.compiled import unit_mass
-from tests.problems import pendulum, worst
+from tests.problems import pendulum, unconstrained, worst
 from twoloop import ConstrainedSystem, Status, callback
 from twoloop.generate.calls_on_symbols import as_forms
 from twoloop.generate.series import series_program
@@ -338,7 +338,7 @@ def test_numba_takes_functions_only(force):
 
 
 def two_masses(mass):
-    return ConstrainedSystem.from_python(n_q=2, n_c=0, mass=mass, force=lambda t, q, v: np.ones(2), name="two")
+    return unconstrained(lambda t, q, v: np.ones(2), 2, mass=mass, name="two")
 
 
 @pytest.mark.parametrize("method", ["auto", "Taylor", "RadauIIA5"])

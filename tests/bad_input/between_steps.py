@@ -61,6 +61,7 @@ BETWEEN_STEPS = [
     event_case("an event that returns an array", returning(np.zeros(2)), TypeError, "must return a number", NUMBER),
     event_case("an event that returns None", returning(None), TypeError, "must return a number", NUMBER),
     event_case("an event that returns True", returning(True), TypeError, "must return a number", NUMBER),
+    event_case("an event of the time alone", lambda t: 1.0, TypeError, "takes 1 positional argument", FUNCTION),
     event_case("an event that returns text", returning("high"), TypeError, "must return a number", NUMBER),
     event_case(
         "an event that returns NaN",
@@ -73,6 +74,7 @@ BETWEEN_STEPS = [
     event_case("`hit.terminal = -1`", having(terminal=-1), ValueError, "terminal must be True", COUNT),
     event_case("`hit.terminal = 1.5`", having(terminal=1.5), TypeError, "terminal must be True", COUNT),
     event_case("`hit.direction = 'up'`", having(direction="up"), TypeError, "direction must be -1, 0 or 1", "give 1"),
+    event_case("`hit.direction = nan`", having(direction=np.nan), ValueError, "direction must be -1, 0 or 1", "give 1"),
     event_case("`hit.direction = 2`", having(direction=2), ValueError, "direction must be -1, 0 or 1", "give 1"),
     event_case("`hit.direction = True`", having(direction=True), TypeError, "direction must be -1, 0 or 1", "give 1"),
     *argument(

@@ -4,8 +4,8 @@ from functools import partial
 
 import numpy as np
 
-from tests.bad_input.case import FEW_POSITIVES, INFINITE, Case, argument
-from twoloop.mechanisms import ancf_beam, four_bar, very_flexible_beam
+from tests.bad_input.case import FEW_POSITIVES, INFINITE, POSITIVE, Case, argument, cases_of
+from twoloop.mechanisms import ancf_beam, closed_chain, four_bar, n_four_bar, pendulum, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection
 
 
@@ -14,6 +14,9 @@ def beam(n_elements=1, **options):
     return ancf_beam(n_elements, **{**usual, **options})
 
 
+APART = "the linkage cannot be assembled.*"
+GEOMETRY = "change lengths, ground or theta3"
+of_four_bar = cases_of("four_bar")
 of_linkage = partial(argument, "four_bar", four_bar)
 of_beam = partial(argument, "ancf_beam", beam)
 MECHANISMS = [
@@ -44,14 +47,9 @@ MECHANISMS = [
             (True, ValueError, "must be 1 .*or -1 .*given True", "give 1 or -1"),
         ],
     ),
-    Case(
-        "four_bar",
-        "bars that cannot be assembled",
-        lambda: four_bar((0.1, 0.1, 0.1), 5.0),
-        ValueError,
-        "the linkage cannot be assembled.*Change lengths, ground or theta3",
-        "change lengths, ground or theta3",
-    ),
+    of_four_bar("bars too short", lambda: four_bar((1.0, 1.0, 0.5), 5.0), f"{APART} 4.5 m .*0 and 2 m", GEOMETRY),
+    of_four_bar("bars too long", lambda: four_bar((3.0, 1.0, 0.5), 1.0), f"{APART} 0.5 m .*2 and 4 m", GEOMETRY),
+    of_four_bar("bars in one line", lambda: four_bar((1.0, 1.0, 1.0), 3.0), f"{APART} 2 m .*ends excluded", GEOMETRY),
     *of_beam(
         "n_elements",
         [
@@ -59,11 +57,16 @@ MECHANISMS = [
             (2.5, TypeError, "must be an int; given 2.5", "give an int of at least 1"),
         ],
     ),
-    *of_beam("start", [("tip", ValueError, "must be 'node'.*given 'tip'", "take one of these")]),
+    *of_beam("start", [(start, ValueError, "must be 'node'", "take one of these") for start in ("tip", ["node"])]),
     *of_beam("youngs_modulus", [*FEW_POSITIVES, INFINITE]),
     *of_beam("length", FEW_POSITIVES[:2]),
     *of_beam("amplitude", [(np.inf, ValueError, "must be finite; given inf", "give metres")]),
-    *of_beam("poisson_ratio", [(0.5, ValueError, "must lie between -1 and 0.5", "give 0.3, say")]),
+    *of_beam("poisson_ratio", [(nu, ValueError, "must lie between -1 and 0.5", "give 0.3, say") for nu in (-1.0, 0.5)]),
+    *of_beam("poisson_ratio", [(np.nan, ValueError, "must be finite", "give 0.3, say")]),
+    *of_beam("angular_frequency", FEW_POSITIVES[:1]),
+    *of_beam("density", FEW_POSITIVES[:1]),
+    *of_beam("height", [(-0.02, ValueError, "must be positive", POSITIVE)]),
+    *of_beam("width", [INFINITE]),
     *of_beam("gravity", [(-9.81, ValueError, "must be at least 0", "gravity acts along -y")]),
     *argument(
         "very_flexible_beam", very_flexible_beam, "n_elements", [("4", TypeError, "must be an int", "give an int")]
@@ -76,4 +79,19 @@ MECHANISMS = [
         "q must be of an even number of elements.*given 1",
         "take an even number of elements",
     ),
+    *argument(
+        "closed_chain",
+        closed_chain,
+        "n",
+        [
+            (1, ValueError, "must be at least 2; given 1", "give an int from 2 to 20"),
+            (21, ValueError, "must be at most 20.*given 21", "give an int from 2 to 20"),
+            (4.0, TypeError, "must be an int", "give an int from 2 to 20"),
+        ],
+    ),
+    *argument("n_four_bar", n_four_bar, "n", [(0, ValueError, "must be at least 1", "give a number of windows")]),
+    *argument(
+        "n_four_bar", n_four_bar, "coordinates", [("angles", ValueError, "must be one of tips, bodies", "take one")]
+    ),
+    *argument("pendulum", pendulum, "start", [(0.5, ValueError, "must be -1 or 1", "give the side it starts from")]),
 ]

@@ -4,8 +4,8 @@ from functools import partial
 
 import numpy as np
 
-from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, argument, cases_of
-from twoloop import BDF, DOP853, Newmark, RungeKutta, paper_irk, paper_newmark
+from tests.bad_input.case import FEW_POSITIVES, HUGE, INFINITE, POSITIVE, argument, cases_of
+from twoloop import BDF, DOP853, Newmark, RungeKutta, Taylor, paper_irk, paper_newmark
 from twoloop.methods.tableaux import Tableau, gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 
@@ -55,14 +55,22 @@ METHODS = [
     *of_option("error", [("none", ValueError, "must be 'richardson'", "take one of these")]),
     *of_option("variables", [("q", ValueError, "must be 'velocities'", "take one of these")]),
     *of_option("partition", [(1, TypeError, "must be 'lasting'", "take one of these")]),
+    *of_option("partition", [("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of these")]),
     *of_option("outer_test", [(1, TypeError, "must be 'all'", "take one of these")]),
     *of_option("inner_tol", FEW_POSITIVES),
-    *of_option("outer_tol", [*FEW_POSITIVES, INFINITE]),
-    of_runge_kutta(
-        "`outer='newton', variables='momenta'`",
-        lambda: runge_kutta(outer="newton", variables="momenta"),
-        "outer='newton' goes with variables='velocities' only",
-        "take outer='fixed-point' for momenta",
+    *of_option("outer_tol", [*FEW_POSITIVES, INFINITE, (np.nan, ValueError, "must be positive", POSITIVE)]),
+    *(
+        of_runge_kutta(
+            f"`outer='{outer}', variables='momenta'`",
+            lambda outer=outer: runge_kutta(outer=outer, variables="momenta"),
+            f"outer='{outer}' {words}",
+            "take outer='fixed-point' for momenta",
+        )
+        for outer, words in (
+            ("newton", "goes with variables='velocities' only"),
+            ("auto", "goes with variables='velocities' only"),
+            ("paper", ".*'momenta'"),
+        )
     ),
     of_runge_kutta(
         "`outer='paper', partition='symmetric'`",
@@ -74,13 +82,14 @@ METHODS = [
         "beta",
         [
             (2.0, ValueError, "must be between 0 and 1; given 2.0", UNIT),
+            (-0.1, ValueError, "must be between 0 and 1; given -0.1", UNIT),
             (np.nan, ValueError, "must be between 0 and 1; given nan", UNIT),
             ("1/4", TypeError, "must be a number; given '1/4'", UNIT),
             (True, TypeError, "must be a number; given True", UNIT),
             (HUGE, ValueError, "must fit into a float", UNIT),
         ],
     ),
-    *of_newmark("gamma", [(-0.5, ValueError, "must be between 0 and 1; given -0.5", UNIT)]),
+    *of_newmark("gamma", [(gamma, ValueError, "must be between 0 and 1; given", UNIT) for gamma in (-0.5, 1.5)]),
     *of_newmark("error_tol", FEW_POSITIVES),
     *argument(
         "BDF",
@@ -95,25 +104,37 @@ METHODS = [
         ],
     ),
     *argument("BDF", BDF, "outer_tol", FEW_POSITIVES[:2]),
+    *argument("BDF", BDF, "inner_tol", FEW_POSITIVES[:1]),
+    *argument(
+        "Taylor",
+        Taylor,
+        "order",
+        [
+            (3, ValueError, "must be", "give an int from 4 to 40"),
+            (41, ValueError, "must be", "give an int from 4 to 40"),
+            (8.5, TypeError, "must be", "give an int from 4 to 40"),
+            ("high", TypeError, "must be", "give an int from 4 to 40"),
+        ],
+    ),
     *argument("DOP853", DOP853, "inner_tol", FEW_POSITIVES),
     *argument("paper_irk", paper_irk, "inner_tol", FEW_POSITIVES[:2]),
     *argument("paper_newmark", paper_newmark, "beta", [(2.0, ValueError, "must be between 0 and 1", UNIT)]),
     *(
         case
-        for family in (gauss, radau_iia, sun_radau_iib)
+        for family in (gauss, radau_iia, sun_radau_iib, lobatto_iiie)
         for case in argument(
             family.__name__,
             family,
             "s",
             [
-                (0, ValueError, "must be at least 1", STAGES),
+                (0, ValueError, "must be at least [12]", STAGES),
                 (2.0, TypeError, "must be an int", STAGES),
             ],
         )
     ),
+    *argument("lobatto_iiie", lobatto_iiie, "s", [(1, ValueError, "must be at least 2", STAGES)]),
     *argument("gauss", gauss, "s", [(True, TypeError, "must be an int", STAGES), ("3", TypeError, "must be", STAGES)]),
     *argument("gauss", gauss, "s", [(HUGE, ValueError, "must be at most 100", "give a moderate number")]),
-    *argument("lobatto_iiie", lobatto_iiie, "s", [(1, ValueError, "must be at least 2", STAGES)]),
     *of_tableau("name", [(3, TypeError, "must be a string; given 3", "give a string")]),
     *of_tableau(
         "A",

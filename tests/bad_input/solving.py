@@ -92,6 +92,7 @@ SOLVE = [
         "rtol and atol must not both be below",
         "raise one of them to 1e-15 or more",
     ),
+    *of_argument("time_limit", POSITIVES[:4]),
     *of_argument("first_step", [*FEW_POSITIVES, INFINITE]),
     *of_argument("max_step", [*FEW_POSITIVES, (None, TypeError, "must be a number", "leave it out")]),
     *of_argument(
@@ -154,11 +155,14 @@ SOLVE = [
             (1, TypeError, "must be True or False; given 1", "give True or leave it out"),
         ],
     ),
-    of_solve(
-        "`compiled=True` with an implicit method",
-        lambda: solve(method="RadauIIA5", compiled=True),
-        "compiled=True goes with 'auto', .*given method Radau IIA",
-        "leave it out, or take a method that is named",
+    *(
+        of_solve(
+            f"`compiled=True` with `method='{method}'`",
+            lambda method=method: solve(method=method, compiled=True),
+            f"compiled=True goes with 'auto', .*given method {name}",
+            "leave it out, or take a method that is named",
+        )
+        for method, name in (("RadauIIA5", "Radau IIA"), ("Gauss4", "Gauss"), ("PaperIRK", "Sun"), ("BDF", "BDF"))
     ),
     of_solve(
         "`compiled=True` with `step_size` and the default method",

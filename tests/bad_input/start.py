@@ -116,7 +116,13 @@ START = [
             rf"{kind} of system 'pendulum' must return an array of shape .*it returned shape \(3, 3\)",
             "return an array of the shape named",
         )
-        for kind in ("mass", "force", "constraint", "jacobian", "gamma", "constraint_rate")
+        for kind in ("mass", "force", "constraint", "jacobian", "gamma", "constraint_rate", "force_by_q")
+    ),
+    of_start(
+        "`force` returns a number",
+        lambda: solve(pendulum(force=lambda *arguments: 0.0)),
+        r"force of system 'pendulum' must return an array of shape \(2,\).*returned shape \(\)",
+        "return an array of the shape named",
     ),
     *(
         of_start(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, one_coordinate, plain
+from tests.general.mechanism import G, Mechanism, of_functions, one_coordinate
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
 
 
@@ -23,9 +23,7 @@ def isosceles_slider_crank():
     weight = np.array([0.0, -G, 0.0])
     return Mechanism(
         name="isosceles slider-crank",
-        sizes={"n_q": 3, "n_c": 2},
-        functions=plain(system),
-        ready=system,
+        system=lambda: system,
         end=2.0,
         state=one_coordinate(kinematics, np.ones(3), weight, (0.3, 5.0), 2.0),
         rank=2,
@@ -45,9 +43,7 @@ def crossing_lines():
 
     return Mechanism(
         name="crossing lines",
-        sizes={"n_q": 2, "n_c": 1},
-        functions=plain(system),
-        ready=system,
+        system=lambda: system,
         end=1.0,
         state=state,
         rank=1,
@@ -71,14 +67,16 @@ def cusp():
 
     return Mechanism(
         name="cusp",
-        sizes={"n_q": 2, "n_c": 1},
-        functions={
-            "mass": np.eye(2),
-            "force": lambda t, q, v: np.zeros(2),
-            "constraint": lambda t, q: np.array([0.5 * (q[1] ** 2 - q[0] ** 3)]),
-            "jacobian": lambda t, q: np.array([[-1.5 * q[0] ** 2, q[1]]]),
-            "gamma": lambda t, q, v: np.array([3.0 * q[0] * v[0] ** 2 - v[1] ** 2]),
-        },
+        system=of_functions(
+            name="cusp",
+            n_q=2,
+            n_c=1,
+            mass=np.eye(2),
+            force=lambda t, q, v: np.zeros(2),
+            constraint=lambda t, q: np.array([0.5 * (q[1] ** 2 - q[0] ** 3)]),
+            jacobian=lambda t, q: np.array([[-1.5 * q[0] ** 2, q[1]]]),
+            gamma=lambda t, q, v: np.array([3.0 * q[0] * v[0] ** 2 - v[1] ** 2]),
+        ),
         end=2.0,
         state=state,
         rank=1,

@@ -7,8 +7,9 @@ False.
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, known, plain
+from tests.general.mechanism import G, Mechanism, known, of_functions
 from tests.mechanisms.motions import spatial
+from tests.problems import functions_of
 from twoloop.mechanisms.rolling_disc import ACROSS, AXIAL, energy, rolling_disc
 from twoloop.mechanisms.rolling_disc import MASS as M
 from twoloop.mechanisms.rolling_disc import RADIUS as R
@@ -17,25 +18,20 @@ SYSTEM = rolling_disc().system
 
 
 def _disc(name, end, state, redundant):
-    functions = plain(SYSTEM)
-    if redundant:  # the contact point does not move along z either
+    def nonholonomic(t, q):  # the contact point does not move along z either
+        return np.vstack([SYSTEM.nonholonomic(t, q), [0.0, 0.0, 1.0, 0.0, R * np.sin(q[4]), 0.0]])
 
-        def nonholonomic(t, q):
-            return np.vstack([SYSTEM.nonholonomic(t, q), [0.0, 0.0, 1.0, 0.0, R * np.sin(q[4]), 0.0]])
+    def nonholonomic_gamma(t, q, v):
+        return np.append(SYSTEM.nonholonomic_gamma(t, q, v), -R * np.cos(q[4]) * v[4] ** 2)
 
-        def nonholonomic_gamma(t, q, v):
-            return np.append(SYSTEM.nonholonomic_gamma(t, q, v), -R * np.cos(q[4]) * v[4] ** 2)
-
-        functions |= {"nonholonomic": nonholonomic, "nonholonomic_gamma": nonholonomic_gamma}
+    more = {"n_q": 6, "n_c": 1, "n_a": 3, "nonholonomic": nonholonomic, "nonholonomic_gamma": nonholonomic_gamma}
     return Mechanism(
         name=f"{name}{', redundant' if redundant else ''}",
-        sizes={"n_q": 6, "n_c": 1, "n_a": 3 if redundant else 2},
-        functions=functions,
+        system=of_functions(**functions_of(SYSTEM) | more) if redundant else lambda: SYSTEM,
         end=end,
         state=state,
         rank=3,
         energy=lambda q, v: energy(0.0, q, v),
-        ready=None if redundant else SYSTEM,
     )
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, one_coordinate
+from tests.general.mechanism import G, Mechanism, of_functions, one_coordinate
 from twoloop import ConstrainedSystem
 
 SPRING = 20.0
@@ -20,14 +20,16 @@ def massless_coordinate():
 
     return Mechanism(
         name="massless coordinate",
-        sizes={"n_q": 3, "n_c": 2},
-        functions={
-            "mass": np.diag([1.0, 1.0, 0.0]),
-            "force": lambda t, q, v: np.array([0.0, -G, -SPRING * q[2]]),
-            "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0), q[2] - q[0]]),
-            "jacobian": lambda t, q: np.array([[q[0], q[1], 0.0], [-1.0, 0.0, 1.0]]),
-            "gamma": lambda t, q, v: np.array([-v[0] * v[0] - v[1] * v[1], 0.0]),
-        },
+        system=of_functions(
+            name="massless coordinate",
+            n_q=3,
+            n_c=2,
+            mass=np.diag([1.0, 1.0, 0.0]),
+            force=lambda t, q, v: np.array([0.0, -G, -SPRING * q[2]]),
+            constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0), q[2] - q[0]]),
+            jacobian=lambda t, q: np.array([[q[0], q[1], 0.0], [-1.0, 0.0, 1.0]]),
+            gamma=lambda t, q, v: np.array([-v[0] * v[0] - v[1] * v[1], 0.0]),
+        ),
         end=2.0,
         state=one_coordinate(kinematics, np.array([1.0, 1.0, 0.0]), rate_force, (1.2, 0.5), 2.0),
         rank=2,

@@ -7,7 +7,7 @@ Zlatar 2016): 15 kg, the centre of mass at (0, 1, 0) from the fixed point, axis 
 import numpy as np
 from scipy.special import ellipj, ellipkinc
 
-from tests.general.mechanism import G, Mechanism, known, of_problem
+from tests.general.mechanism import G, Mechanism, known, of_functions, of_problem
 from tests.mechanisms.motions import spatial
 from twoloop.mechanisms import heavy_top
 
@@ -60,14 +60,16 @@ def top_of_euler_parameters():
     weight = np.array([0.0, 0.0, -M * G * LENGTH])
     return Mechanism(
         name="top of Euler parameters",
-        sizes={"n_q": 4, "n_c": 1},
-        functions={
-            "mass": lambda t, q: mass(q),
-            "force": lambda t, q, v: force(q, v) + _axis_by_e(q).T @ weight,
-            "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-            "jacobian": lambda t, q: q.reshape(1, 4),
-            "gamma": lambda t, q, v: np.array([-(v @ v)]),
-        },
+        system=of_functions(
+            name="top of Euler parameters",
+            n_q=4,
+            n_c=1,
+            mass=lambda t, q: mass(q),
+            force=lambda t, q, v: force(q, v) + _axis_by_e(q).T @ weight,
+            constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+            jacobian=lambda t, q: q.reshape(1, 4),
+            gamma=lambda t, q, v: np.array([-(v @ v)]),
+        ),
         end=END,
         state=_motion(),
         rank=1,

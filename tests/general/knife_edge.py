@@ -7,7 +7,7 @@ blade that is pushed sideways at a known speed, so that the non-holonomic row ha
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism
+from tests.general.mechanism import G, Mechanism, of_functions
 
 M, INERTIA, SLOPE, SPIN = 1.3, 0.2, 0.4, 1.7
 PULL = G * np.sin(SLOPE)
@@ -31,6 +31,9 @@ def state(t):
 
 
 FUNCTIONS = {
+    "n_q": 3,
+    "n_c": 0,
+    "n_a": 1,
     "mass": np.diag([M, M, INERTIA]),
     "force": lambda t, q, v: np.array([M * PULL, 0.0, 0.0]),
     "nonholonomic": nonholonomic,
@@ -42,8 +45,7 @@ def knife_edge():
     """No holonomic row at all; the ready mechanism is this one in compiled functions."""
     return Mechanism(
         name="knife edge",
-        sizes={"n_q": 3, "n_c": 0, "n_a": 1},
-        functions={**FUNCTIONS, "constraint": None, "jacobian": None},
+        system=of_functions(**FUNCTIONS, name="knife edge"),
         end=END,
         state=state,
         rank=1,
@@ -68,16 +70,18 @@ def knife_edge_in_space():
 
     return Mechanism(
         name="knife edge in space",
-        sizes={"n_q": 4, "n_c": 1, "n_a": 1},
-        functions={
-            "mass": np.diag([M, M, M, INERTIA]),
-            "force": lambda t, q, v: np.array([0.0, 0.0, -M * G, 0.0]),
-            "constraint": lambda t, q: np.array([q[2] + tangent * q[0]]),
-            "jacobian": lambda t, q: np.array([[tangent, 0.0, 1.0, 0.0]]),
-            "gamma": lambda t, q, v: np.zeros(1),
-            "nonholonomic": rows,
-            "nonholonomic_gamma": rows_gamma,
-        },
+        system=of_functions(
+            n_q=4,
+            n_c=1,
+            n_a=1,
+            mass=np.diag([M, M, M, INERTIA]),
+            force=lambda t, q, v: np.array([0.0, 0.0, -M * G, 0.0]),
+            constraint=lambda t, q: np.array([q[2] + tangent * q[0]]),
+            jacobian=lambda t, q: np.array([[tangent, 0.0, 1.0, 0.0]]),
+            gamma=lambda t, q, v: np.zeros(1),
+            nonholonomic=rows,
+            nonholonomic_gamma=rows_gamma,
+        ),
         end=END,
         state=lifted,
         rank=2,
@@ -100,16 +104,15 @@ def pushed_knife_edge():
 
     return Mechanism(
         name="pushed knife edge",
-        sizes={"n_q": 3, "n_c": 0, "n_a": 1},
-        functions={
-            **FUNCTIONS,
-            "constraint": None,
-            "jacobian": None,
-            "nonholonomic_rate": lambda t, q: np.array([-PUSH * np.sin(2.0 * SPIN * t)]),
-            "nonholonomic_gamma": lambda t, q, v: (
-                nonholonomic_gamma(t, q, v) + 2.0 * PUSH * SPIN * np.cos(2.0 * SPIN * t)
-            ),
-        },
+        system=of_functions(
+            **FUNCTIONS
+            | {
+                "nonholonomic_rate": lambda t, q: np.array([-PUSH * np.sin(2.0 * SPIN * t)]),
+                "nonholonomic_gamma": lambda t, q, v: (
+                    nonholonomic_gamma(t, q, v) + 2.0 * PUSH * SPIN * np.cos(2.0 * SPIN * t)
+                ),
+            }
+        ),
         end=END,
         state=pushed,
         rank=1,

@@ -1,15 +1,13 @@
-"""What is known of a mechanism: its functions, a consistent start, and its motion from another source."""
+"""What is known of a mechanism: its system, a consistent start, and its motion from another source."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from functools import cache, partial
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from twoloop import ConstrainedSystem
-from twoloop.kernels.compile.callbacks import KINDS
 
 G = 9.81
 TIGHT = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
@@ -17,15 +15,13 @@ TIGHT = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism in plain functions and its motion by a route that shares no equation of motion with them.
+    """A mechanism and its motion by a route that shares no equation of motion with it.
 
     Attributes
     ----------
     name : str
-    sizes : dict
-        n_q, n_c and, where there are non-holonomic rows, n_a.
-    functions : dict
-        The callbacks by kind, as `ConstrainedSystem.from_python` takes them.
+    system : callable
+        system() -> ConstrainedSystem; of plain functions, it takes others in the place of some by their names.
     end : float
         End of the run, s; it starts at 0.
     state : callable
@@ -34,91 +30,33 @@ class Mechanism:
         Rank of all rows [C_q; A] at the start.
     energy : callable, optional
         energy(q, v); None where it is not conserved.
-    compile : bool
-        Whether numba is to compile the functions.
-    ready : ConstrainedSystem, optional
-        The system, where it is a ready one whose callbacks are compiled.
     given : tuple of ndarray, optional
         Its start q, v (n_q,), where the system comes with one. None: that of `state`.
     """
 
     name: str
-    sizes: dict[str, int]
-    functions: dict[str, Any]
+    system: Callable[..., ConstrainedSystem]
     end: float
     state: Callable[[float], tuple[np.ndarray, np.ndarray]]
     rank: int
     energy: Callable[[np.ndarray, np.ndarray], float] | None = None
-    compile: bool = False
-    ready: ConstrainedSystem | None = None
     given: tuple[np.ndarray, np.ndarray] | None = None
-
-    @property
-    def n_rows(self):
-        return self.sizes["n_c"] + self.sizes.get("n_a", 0)
 
     @property
     def start(self):
         return self.state(0.0) if self.given is None else self.given
-
-    def system(self, **changed):
-        if self.ready is not None and not changed:
-            return self.ready
-        options = {**self.sizes, **self.functions, "compile": self.compile, "name": self.name, **changed}
-        return ConstrainedSystem.from_python(**options)
 
     def states(self, times):
         """q, v (n_q, n_t) of the reference."""
         q, v = zip(*(self.state(t) for t in times), strict=True)
         return np.array(q).T, np.array(v).T
 
-    def call(self, kind, *arguments):
-        """One of the functions, or the zeros that stand for it."""
-        function = self.functions.get(kind)
-        if function is not None:
-            return function(*arguments) if callable(function) else function
-        n_q, n_c, n_a = self.sizes["n_q"], self.sizes["n_c"], self.sizes.get("n_a", 0)
-        shapes = {
-            "constraint": (n_c,),
-            "jacobian": (n_c, n_q),
-            "constraint_rate": (n_c,),
-            "gamma": (n_c,),
-            "nonholonomic": (n_a, n_q),
-            "nonholonomic_rate": (n_a,),
-            "nonholonomic_gamma": (n_a,),
-        }
-        return np.zeros(shapes[kind])
 
-    def rows(self, t, q):
-        """All rows [C_q; A] (n_rows, n_q)."""
-        return np.vstack([self.call("jacobian", t, q), self.call("nonholonomic", t, q)])
-
-    def velocity_residual(self, t, q, v):
-        """[C_q v + C_t; A v + b] (n_rows,)."""
-        rates = np.concatenate([self.call("constraint_rate", t, q), self.call("nonholonomic_rate", t, q)])
-        return self.rows(t, q) @ v + rates
-
-    def solution(self, t, q, v):
-        """Acceleration and multipliers of minimum norm, a (n_q,), lam (n_rows,), by eigenvalues of the whole matrix."""
-        J, M = self.rows(t, q), self.call("mass", t, q)
-        n_q = M.shape[0]
-        gamma = np.concatenate([self.call("gamma", t, q, v), self.call("nonholonomic_gamma", t, q, v)])
-        matrix = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
-        both = np.linalg.pinv(matrix, rcond=1e-11, hermitian=True) @ np.concatenate(
-            [self.call("force", t, q, v), gamma]
-        )
-        return both[:n_q], both[n_q:]
-
-
-def plain(system):
-    """The callbacks of a ready system as functions that return arrays."""
-
-    def returning(kind):
-        if len(KINDS[kind].state) == 1:
-            return lambda t, q: system.evaluate(kind, t, q)
-        return lambda t, q, v: system.evaluate(kind, t, q, v)
-
-    return {kind: returning(kind) for kind in system.given if kind != "kinematics"}
+def of_functions(**functions):
+    """What makes a system of plain functions, once, and others with other functions in the place of some."""
+    make = ConstrainedSystem.from_python
+    usual = cache(partial(make, **functions))
+    return lambda **changed: make(**functions | changed) if changed else usual()
 
 
 def of_problem(problem, state, end, rank=None):
@@ -126,13 +64,11 @@ def of_problem(problem, state, end, rank=None):
     system = problem.system
     return Mechanism(
         name=problem.name,
-        sizes={"n_q": system.n_q, "n_c": system.n_c, "n_a": system.n_a},
-        functions=plain(system),
+        system=lambda: system,
         end=end,
         state=state,
         rank=system.n_c + system.n_a if rank is None else rank,
         energy=(lambda q, v: problem.energy(0.0, q, v)) if problem.conserved else None,
-        ready=system,
         given=(problem.q0, problem.v0),
     )
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.general.mechanism import Mechanism
+from tests.general.mechanism import Mechanism, of_functions
 
 
 def planet(eccentricity=0.2):
@@ -16,13 +16,13 @@ def planet(eccentricity=0.2):
 
     return Mechanism(
         name="planet",
-        sizes={"n_q": 2, "n_c": 0},
-        functions={
-            "mass": np.eye(2),
-            "force": lambda t, q, v: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5,
-            "constraint": None,
-            "jacobian": None,
-        },
+        system=of_functions(
+            name="planet",
+            n_q=2,
+            n_c=0,
+            mass=np.eye(2),
+            force=lambda t, q, v: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5,
+        ),
         end=3.0,
         state=state,
         rank=0,

@@ -12,18 +12,13 @@ TOLERANCE = 5e-11
 
 
 @cache
-def system(name):
-    return mechanism(name).system()
-
-
-@cache
 def run(name, method, tolerance=TOLERANCE, times=41):
     """A run, and the warnings about its rows."""
     m = mechanism(name)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = solve_dae(
-            system(name),
+            m.system(),
             (0.0, m.end),
             *m.start,
             method=method,

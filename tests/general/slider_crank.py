@@ -6,8 +6,9 @@ as far from the slider as the rod is long.
 
 import numpy as np
 
-from tests.general.mechanism import Mechanism, known, of_problem, plain
+from tests.general.mechanism import Mechanism, known, of_functions, of_problem
 from tests.mechanisms.motions import planar
+from tests.problems import functions_of
 from twoloop import mechanisms
 
 CRANK, ROD = 0.5, 1.2
@@ -53,17 +54,16 @@ def driven_slider_crank(redundant):
 
     if not redundant:
         return of_problem(mechanisms.driven_slider_crank(), state, 2.0)
-    free = plain(mechanisms.redundant_slider_crank().system)
+    free = mechanisms.redundant_slider_crank().system
     rows = {
-        "constraint": lambda t, q: np.append(free["constraint"](t, q), q[2] - drive(t)[0]),
-        "jacobian": lambda t, q: np.vstack([free["jacobian"](t, q), np.eye(9)[2]]),
+        "constraint": lambda t, q: np.append(free.constraint(t, q), q[2] - drive(t)[0]),
+        "jacobian": lambda t, q: np.vstack([free.jacobian(t, q), np.eye(9)[2]]),
         "constraint_rate": lambda t, q: np.append(np.zeros(9), -drive(t)[1]),
-        "gamma": lambda t, q, v: np.append(free["gamma"](t, q, v), drive(t)[2]),
+        "gamma": lambda t, q, v: np.append(free.gamma(t, q, v), drive(t)[2]),
     }
     return Mechanism(
         name="driven slider-crank, redundant",
-        sizes={"n_q": 9, "n_c": 10},
-        functions={**free, **rows},
+        system=of_functions(n_q=9, n_c=10, **functions_of(free) | rows),
         end=2.0,
         state=state,
         rank=9,

@@ -5,6 +5,7 @@ import pytest
 
 from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism
 from tests.general.runs import relative_error, run
+from tests.mechanisms.make_references import solution
 
 METHODS = ("Gauss12", "DOP853", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
@@ -27,10 +28,10 @@ def test_nine_digits(name, method):
 @pytest.mark.parametrize("name", REGULAR)
 def test_every_state_is_on_all_rows(name, method):
     """Redundant rows too, though they are left out of the solution."""
-    m, (result, _) = mechanism(name), run(name, method)
+    system, (result, _) = mechanism(name).system(), run(name, method)
     for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True):
-        assert np.abs(m.call("constraint", t, q)).max(initial=0.0) < 1e-10
-        assert np.abs(m.velocity_residual(t, q, v)).max(initial=0.0) < 1e-9 * max(1.0, np.abs(v).max())
+        assert np.abs(system.constraint(t, q)).max(initial=0.0) < 1e-10
+        assert np.abs(system.velocity_constraint(t, q, v)).max(initial=0.0) < 1e-9 * max(1.0, np.abs(v).max())
 
 
 @both
@@ -38,7 +39,7 @@ def test_every_state_is_on_all_rows(name, method):
 def test_energy(name, method):
     m, (result, _) = mechanism(name), run(name, method)
     energies = np.array([m.energy(q, v) for q, v in zip(result.q.T, result.v.T, strict=True)])
-    kinetic = 0.5 * max(v @ m.call("mass", t, q) @ v for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True))
+    kinetic = 0.5 * max(v @ m.system().mass(t, q) @ v for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True))
     assert np.ptp(energies) < 4e-9 * max(1.0, kinetic)
 
 
@@ -47,10 +48,10 @@ def test_energy(name, method):
 def test_accelerations_and_multipliers_of_minimum_norm(name, method):
     """Against the pseudoinverse of the whole matrix at the known state; lam is [lam; mu]."""
     m, (result, _) = mechanism(name), run(name, method)
-    assert result.lam.shape == (m.n_rows, result.t.size)
-    known = [m.solution(t, *m.state(t)) for t in result.t]
+    assert result.lam.shape == (m.system().n_c + m.system().n_a, result.t.size)
+    known = [solution(m.system(), t, *m.state(t)) for t in result.t]
     assert relative_error(result.a, np.array([a for a, _ in known]).T) < 1e-7
-    if m.n_rows:
+    if result.lam.size:
         assert relative_error(result.lam, np.array([lam for _, lam in known]).T) < 1e-7
 
 
@@ -60,8 +61,8 @@ def test_rank_and_redundant_rows(name, method):
     """What remains without the rows named must be independent, and as many as the rank."""
     m, (result, warned) = mechanism(name), run(name, method)
     assert result.rank == m.rank
-    assert len(result.redundant) == m.n_rows - m.rank
-    kept = np.delete(m.rows(0.0, m.start[0]), result.redundant, axis=0)
+    assert len(result.redundant) == len(result.lam) - m.rank
+    kept = np.delete(m.system().rows(0.0, m.start[0]), result.redundant, axis=0)
     assert np.linalg.matrix_rank(kept, tol=1e-9) == m.rank == len(kept)
     assert len(warned) == (1 if name in REDUNDANT else 0)
     for row in result.redundant:

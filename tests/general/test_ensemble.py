@@ -5,10 +5,25 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from tests.problems import pendulum, pendulum_state
-from twoloop import ConstrainedSystem, ConstraintWarning, Status, ensemble, mechanisms, solve_dae
+from tests.compiled import PENDULUM
+from tests.problems import event, pendulum, pendulum_state
+from tests.test_callbacks import heavy
+from twoloop import ConstrainedSystem, ConstraintWarning, Status, callback, ensemble, mechanisms, solve_dae
 
 SPAN, TOLERANCE = (0.0, 2.0), 1e-8
+
+
+@callback("force")
+def weight_and_drag(t, q, v, p, Q):
+    Q[0], Q[1] = -0.1 * v[0], -0.1 * v[1] - p[0] * p[2]
+
+
+@callback("constraint")
+def circle_of_length(t, q, p, C):
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])
+
+
+COMPILED = PENDULUM | {"mass": heavy, "force": weight_and_drag, "constraint": circle_of_length, "constant_mass": False}
 
 
 def system_of(parameters, **functions):
@@ -33,9 +48,9 @@ def drawn(n_runs):
     return q, np.zeros_like(q), parameters
 
 
-def pendulums(n_runs, compile=True):
+def pendulums(n_runs):
     q, v, parameters = drawn(n_runs)
-    return system_of(parameters, gamma=lambda t, q, v: np.array([-(v @ v)]), compile=compile), q, v, parameters
+    return ConstrainedSystem(**COMPILED, parameters=parameters[0]), q, v, parameters
 
 
 def far_from_single_runs(runs, which, system, span, q, v, parameters, **options):
@@ -111,9 +126,9 @@ def test_one_start_serves_all_parameters_and_one_set_of_parameters_all_starts():
 
 
 def test_plain_python_functions_of_parameters_go_in_lanes():
-    system, q, v, parameters = pendulums(9, compile=False)
-    runs = ensemble(system, SPAN, q, v, parameters=parameters)
-    compiled = ensemble(pendulums(9)[0], SPAN, q, v, parameters=parameters)
+    compiled, q, v, parameters = pendulums(9)
+    compiled = ensemble(compiled, SPAN, q, v, parameters=parameters)
+    runs = ensemble(system_of(parameters), SPAN, q, v, parameters=parameters)
     assert runs.singly.sum() == 1 and np.abs(runs.q - compiled.q)[1:].max() < 1e-12
 
 
@@ -128,11 +143,11 @@ BRANCHING = {
 @pytest.mark.parametrize("force", BRANCHING.values(), ids=BRANCHING)
 @pytest.mark.parametrize("compiled", [False, True])
 def test_what_lanes_cannot_see_is_found_and_made_singly(force, compiled):
-    q, v, parameters = drawn(24)
+    q, v, parameters = drawn(12)
     system = system_of(parameters, mass=np.eye(2), force=force, compile=compiled)
     runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
     assert runs.success.all()
-    assert far_from_single_runs(runs, range(24), system, (0.0, 1.0), q, v, parameters) < 1e-6
+    assert far_from_single_runs(runs, range(12), system, (0.0, 1.0), q, v, parameters) < 1e-6
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -161,10 +176,7 @@ def test_what_cannot_go_in_lanes_says_why(made):
     runs = ensemble(system, (0.0, 0.1), q[:3], v[:3], parameters=parameters[:3], method="DOP853")
     assert runs.singly.all() and "DOP853 does not go in lanes" in runs.message
 
-    def low(t, q, v):
-        return q[1] + 0.2
-
-    low.terminal = True
+    low = event(lambda t, q, v: q[1] + 0.2, terminal=True)
     runs = ensemble(system, SPAN, q[:3], v[:3], parameters=parameters[:3], events=low)
     assert runs.singly.all() and "events" in runs.message and (runs.status == Status.EVENT).any()
     assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()

@@ -57,8 +57,8 @@ def test_a_guess_is_projected_on_all_rows():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConstraintWarning)
         found_q, found_v = consistent_state(m.system(), 0.0, q + 1e-3 * np.cos(np.arange(9)), v)
-    assert np.abs(m.call("constraint", 0.0, found_q)).max() < 1e-12
-    assert np.abs(m.velocity_residual(0.0, found_q, found_v)).max() < 1e-11
+    assert np.abs(m.system().constraint(0.0, found_q)).max() < 1e-12
+    assert np.abs(m.system().velocity_constraint(0.0, found_q, found_v)).max() < 1e-11
 
 
 def test_velocities_are_projected_on_non_holonomic_rows():
@@ -66,5 +66,5 @@ def test_velocities_are_projected_on_non_holonomic_rows():
     q, v = m.start
     found_q, found_v = consistent_state(m.system(), 0.0, q, v + 0.01 * np.cos(np.arange(6)))
     assert found_q == pytest.approx(q, abs=1e-12)
-    assert np.abs(m.velocity_residual(0.0, found_q, found_v)).max() < 1e-11
+    assert np.abs(m.system().velocity_constraint(0.0, found_q, found_v)).max() < 1e-11
     assert found_v != pytest.approx(v, abs=1e-4)

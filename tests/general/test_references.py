@@ -5,13 +5,10 @@ import pytest
 
 from tests.general import dead_points, heavy_top, windows
 from tests.general.mechanisms import ALL, mechanism
+from tests.mechanisms.make_references import solution
+from tests.problems import row_errors, slope
 
 STEP = 1e-3
-
-
-def slope(f, e=STEP):
-    """df(s)/ds at s = 0, central differences of order 6."""
-    return (45.0 * (f(e) - f(-e)) - 9.0 * (f(2 * e) - f(-2 * e)) + f(3 * e) - f(-3 * e)) / (60.0 * e)
 
 
 def step(m):
@@ -28,8 +25,8 @@ def test_the_known_motion_keeps_all_rows(name):
     m = mechanism(name)
     for t in times(m):
         q, v = m.state(t)
-        assert np.abs(m.call("constraint", t, q)).max(initial=0.0) < 1e-11
-        assert np.abs(m.velocity_residual(t, q, v)).max(initial=0.0) < 1e-11
+        assert np.abs(m.system().constraint(t, q)).max(initial=0.0) < 1e-11
+        assert np.abs(m.system().velocity_constraint(t, q, v)).max(initial=0.0) < 1e-11
         assert np.abs(slope(lambda s, t=t: m.state(t + s)[0], step(m)) - v).max() < 1e-6 * max(1.0, np.abs(v).max())
 
 
@@ -37,11 +34,12 @@ def test_the_known_motion_keeps_all_rows(name):
 def test_the_known_motion_obeys_the_equations(name):
     """What is left of M a - Q must lie in the rows; a is that of the reference, by differences."""
     m = mechanism(name)
+    system = m.system()
     for t in times(m):
         q, v = m.state(t)
         a = slope(lambda s, t=t: m.state(t + s)[1], step(m))
-        known, lam = m.solution(t, q, v)
-        residual = m.call("mass", t, q) @ known + m.rows(t, q).T @ lam - m.call("force", t, q, v)
+        known, lam = solution(system, t, q, v)
+        residual = system.mass(t, q) @ known + system.rows(t, q).T @ lam - system.force(t, q, v)
         assert np.abs(residual).max() < 1e-8 * max(1.0, np.abs(lam).max(initial=0.0))
         assert np.abs(known - a).max() < 1e-7 * max(1.0, np.abs(a).max())
 
@@ -51,19 +49,10 @@ def test_derivatives(name):
     """C_q, C_t and Q_d (and those of the non-holonomic rows) against differences, off the motion."""
     m, rng = mechanism(name), np.random.default_rng(7)
     for t in times(m)[::3]:
-        q, v = m.state(t)
-        _check_derivatives(m, t, q + 0.05 * rng.normal(size=q.size), v + rng.normal(size=q.size))
-
-
-def _check_derivatives(m, t, q, v):
-    e = STEP * min(1.0, 10.0 / np.abs(v).max())
-    by_q = slope(lambda s: m.call("constraint", t, q + s * v), e)
-    assert by_q == pytest.approx(m.call("jacobian", t, q) @ v, rel=1e-9, abs=1e-9)
-    by_t = slope(lambda s: m.call("constraint", t + s, q), e)
-    assert by_t == pytest.approx(m.call("constraint_rate", t, q), rel=1e-9, abs=1e-9)
-    bend = slope(lambda s: m.velocity_residual(t + s, q + s * v, v), e)
-    gamma = np.concatenate([m.call("gamma", t, q, v), m.call("nonholonomic_gamma", t, q, v)])
-    assert -bend == pytest.approx(gamma, rel=1e-7, abs=1e-7)
+        q, v = (each + size * rng.normal(size=each.size) for each, size in zip(m.state(t), (0.05, 1.0), strict=True))
+        fast = max(1.0, np.abs(v).max())
+        by_q, by_t, gamma = row_errors(m.system(), t, q, v, STEP * min(1.0, 10.0 / fast))
+        assert by_q < 1e-9 * fast and by_t < 1e-9 and gamma < 1e-7 * fast**2
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if mechanism(name).energy is not None])
@@ -76,7 +65,7 @@ def test_energy_of_the_known_motion(name):
 @pytest.mark.parametrize("name", ALL)
 def test_rank_at_the_start(name):
     m = mechanism(name)
-    assert np.linalg.matrix_rank(m.rows(0.0, m.start[0]), tol=1e-9) == m.rank
+    assert np.linalg.matrix_rank(m.system().rows(0.0, m.start[0]), tol=1e-9) == m.rank
 
 
 # --- what is published
@@ -104,7 +93,7 @@ def test_two_windows_are_the_published_ones():
 def test_windows_lose_a_rank_each(n):
     t = windows.first_singular_time(n)
     m = mechanism(f"A02, N = {n}")
-    singular = np.linalg.svd(m.rows(t, m.state(t)[0]), compute_uv=False)
+    singular = np.linalg.svd(m.system().rows(t, m.state(t)[0]), compute_uv=False)
     assert (singular < 1e-12).sum() == n
     assert 0.6 < t < 0.8
 

@@ -1,5 +1,7 @@
 """Where C_q loses rank on the way: the motion goes on where it is smooth, on the same branch, by every method."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from tests.general.dead_points import CUSP_TIME, cusp
 from tests.general.mechanisms import SINGULAR, WINDOWS, mechanism
 from tests.general.runs import error, run
 from tests.general.windows import first_singular_time
-from twoloop import DOP853, Status, solve_dae
+from tests.problems import event, worst
+from twoloop import DOP853, ConstraintWarning, Status, solve_dae
 
 METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
 
@@ -56,6 +59,24 @@ def test_one_window_by_steps_of_constant_size(method, step_size):
     assert np.abs(couplers).max() < 1e-3  # on the other branch the coupler turns
 
 
+@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("method", ["auto", "DOP853", "RadauIIA5"])
+@pytest.mark.parametrize("tol", [1e-6, 1e-10])
+def test_the_end_on_a_singular_position_is_right_or_the_run_says_so(n, method, tol):
+    """Velocities are not determined there."""
+    m, end = mechanism(f"A02, N = {n}"), first_singular_time(n)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", ConstraintWarning)
+        result = solve_dae(m.system(), (0.0, end), *m.start, method, tol, tol)
+    q, v = m.state(end)
+    if result.success:
+        assert worst(result.q[:, -1], q) < 1e3 * tol
+        assert worst(result.v[:, -1], v) < 1e3 * tol or len(said) == 1
+        assert ("The run ends where the constraints lose rank" in result.message) is bool(said)
+    else:
+        assert "s ahead: end a little before that position, or beyond." in result.message
+
+
 @pytest.mark.parametrize("method", ["DOP853"])
 def test_a_run_that_ends_on_a_singular_position(method):
     """The last instant is the singular one, but for rounding: the run comes there, or says that it ends just before."""
@@ -84,12 +105,7 @@ def test_a_cusp_ends_the_run_and_is_named(method):
 @pytest.mark.parametrize("method", ["DOP853", "auto"])
 def test_states_stay_as_they_were_stored_when_a_step_goes_across(method):
     """With a terminal event chunks are short, and one may end, half full, at a singular position."""
-    m = mechanism("A02, N = 1")
-
-    def never(t, q, v):
-        return 1.0
-
-    never.terminal = True
+    m, never = mechanism("A02, N = 1"), event(lambda t, q, v: 1.0, terminal=True)
     crossed = 0
     for tol in (1e-3, 1e-4, 1e-8):
         runs = [

@@ -8,14 +8,13 @@ import numpy as np
 from tests.bad_input.case import HUGE, WRONG, argument, cases_of
 from tests.general import knife_edge
 from tests.general.faulty import parted_drives, parted_velocities, without_inertia
-from twoloop import ConstrainedSystem, RungeKutta, consistent_state, solve_dae
+from twoloop import RungeKutta, consistent_state, solve_dae
 from twoloop.methods.tableaux import gauss
 
 
 def edge(**changed):
     """The knife edge, with other arguments in place of its own."""
-    m = knife_edge.knife_edge()
-    return ConstrainedSystem.from_python(**{**m.sizes, **m.functions, "name": m.name, **changed})
+    return knife_edge.knife_edge().system(**changed)
 
 
 def slide(system=None, v0=None, **options):

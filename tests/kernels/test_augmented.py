@@ -7,7 +7,7 @@ import twoloop.run.workspace as workspace_module
 from studies.work_precision.scaling import chain
 from tests.general.mechanisms import mechanism
 from tests.general.runs import error
-from tests.problems import force_residual, violations, worst
+from tests.problems import force_residual, functions_of, pendulum, violations, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
 from twoloop.kernels.algebra.sparse import MANY, sparse_pays
 from twoloop.kernels.data import common
@@ -86,20 +86,18 @@ def test_chosen_where_rows_and_degrees_of_freedom_are_many():
     assert form(started(n_four_bar(20))) == common.AUGMENTED
 
 
+def with_mass(system, mass):
+    """A system with another mass."""
+    sizes = {"n_q": system.n_q, "n_c": system.n_c}
+    return ConstrainedSystem.from_python(**sizes, **functions_of(system) | {"mass": mass})
+
+
 def full_mass(n):
     """The chain of n with a mass matrix without zeros."""
     problem = chain(n, False)
     system, weight = problem.system, np.random.default_rng(3).normal(size=(2 * n, 2 * n))
-    made = ConstrainedSystem.from_python(
-        n_q=2 * n,
-        n_c=n,
-        mass=np.eye(2 * n) + 0.1 * weight @ weight.T / n,
-        force=lambda t, q, v: system.force(t, q, v),
-        constraint=lambda t, q: system.constraint(t, q),
-        jacobian=lambda t, q: system.jacobian(t, q),
-        gamma=lambda t, q, v: system.gamma(t, q, v),
-    )
-    return made, problem
+    mass = np.eye(2 * n) + 0.1 * weight @ weight.T / n
+    return with_mass(system, mass), problem
 
 
 def test_dense_where_the_factors_are_not_sparse(choose):
@@ -119,10 +117,8 @@ def test_an_entry_that_comes_later_is_found(choose):
     def bent(q):
         return max(q[0] - 0.05, 0.0)
 
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
+    system = pendulum(
+        constant_mass=True,
         force=lambda t, q, v: np.array([1.0, 0.0]),
         constraint=lambda t, q: np.array([q[1] - bent(q) ** 4]),
         jacobian=lambda t, q: np.array([[-4.0 * bent(q) ** 3, 1.0]]),
@@ -140,33 +136,23 @@ def test_an_entry_that_comes_later_is_found(choose):
 def test_a_mass_that_turns_negative_ends_the_run(choose, heavy):
     """The mass of the last of three links, or that of every one of them."""
 
-    def system(n=3):
-        problem = chain(n, False)
-        base = problem.system
+    def mass(t, q):
+        diagonal = np.full(6, 1.0 - 4.0 * t if heavy else 1.0)
+        diagonal[-2:] = 1.0 - 4.0 * t
+        return np.diag(diagonal)
 
-        def mass(t, q):
-            diagonal = np.full(2 * n, 1.0 - 4.0 * t if heavy else 1.0)
-            diagonal[-2:] = 1.0 - 4.0 * t
-            return np.diag(diagonal)
-
-        callbacks = {name: getattr(base, name) for name in ("force", "constraint", "jacobian", "gamma")}
-        return ConstrainedSystem.from_python(n_q=2 * n, n_c=n, mass=mass, **callbacks), problem
-
-    made, problem = system()
+    problem = chain(3, False)
     choose(True)
-    result = solve_dae(made, (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
+    result = solve_dae(with_mass(problem.system, mass), (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
     assert not result.success and result.t[-1] <= 0.26
     assert result.status is not Status.REACHED_END
 
 
 def test_a_mass_negative_at_the_start_is_refused(choose):
     problem = chain(4, False)
-    base = problem.system
-    callbacks = {name: getattr(base, name) for name in ("force", "constraint", "jacobian", "gamma")}
-    system = ConstrainedSystem.from_python(n_q=8, n_c=4, mass=-np.eye(8), **callbacks)
     choose(True)
     with pytest.raises(ValueError, match="positive definite on the velocities"):
-        solve_dae(system, (0.0, 1.0), problem.q0, problem.v0)
+        solve_dae(with_mass(problem.system, -np.eye(8)), (0.0, 1.0), problem.q0, problem.v0)
 
 
 def test_a_program_outlasts_partitions(choose):

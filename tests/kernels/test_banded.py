@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
 
-from tests.problems import called, without_tangent, worst
+from tests.problems import without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.kernels.algebra import lapack
-from twoloop.kernels.algebra.banded import factor_bordered, lu_band, solve_bordered
 from twoloop.kernels.data import common
-from twoloop.kernels.layout import make_work
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.runge_kutta import RungeKutta
@@ -79,33 +77,6 @@ def both(system, *args, monkeypatch, **options):
             results.append(solve_dae(system, *args, **options))
     assert all(result.success for result in results), [result.message for result in results]
     return results
-
-
-def random_band(rng, n, b, complex_numbers):
-    A = rng.normal(size=(n, n)) + (1j * rng.normal(size=(n, n)) if complex_numbers else 0.0)
-    A[np.abs(np.subtract.outer(np.arange(n), np.arange(n))) > b] = 0.0
-    return A
-
-
-@pytest.mark.parametrize("complex_numbers", [False, True])
-def test_bordered_system(complex_numbers):
-    rng = np.random.default_rng(2)
-    n, n_c, b = 20, 3, 2
-    w = make_work(n, n_c)
-    w.lapack[:] = lapack.addresses()
-    B = random_band(rng, n, b, complex_numbers)
-    Cq = rng.normal(size=(n_c, n))
-    numbers = np.zeros(n * n, dtype=complex if complex_numbers else float)
-    for i, j in np.argwhere(B):
-        lu_band.py_func(numbers, n, b)[j, 2 * b + i - j] = B[i, j]
-    pivots = np.zeros(n, dtype=np.int64)
-    factorize, substitute = (lapack.ZGBTRF, lapack.ZGBTRS) if complex_numbers else (lapack.DGBTRF, lapack.DGBTRS)
-    assert called(factor_bordered, w, b, Cq, numbers, pivots, factorize, substitute) == common.DONE
-    r = rng.normal(size=n) + (1j * rng.normal(size=n) if complex_numbers else 0.0)
-    x = r.copy()
-    called(solve_bordered, w, b, Cq, numbers, pivots, substitute, x)
-    whole = np.block([[B, Cq.T], [Cq, np.zeros((n_c, n_c))]])
-    assert worst(x, np.linalg.solve(whole, np.append(r, np.zeros(n_c)))[:n]) < 1e-12
 
 
 def test_other_integers_than_32_bit_are_refused(monkeypatch):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.problems import worst
-from twoloop import ESDIRK, ConstrainedSystem, RungeKutta, solve_dae
+from tests.problems import unconstrained, worst
+from twoloop import ESDIRK, RungeKutta, solve_dae
 from twoloop.kernels.steps.diagonal_step import FILTERED
 from twoloop.mechanisms import four_bar, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import tip_height
@@ -102,15 +102,7 @@ def test_without_tangents_the_jacobian_is_kept_and_the_solution_the_same():
 
 def test_damping_without_a_derivative_by_position():
     """v' = -k v with k = 1e6, beside a free coordinate: J_v is all there is."""
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=0,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([-1e6 * (v[0] - np.cos(t)), -q[1]]),
-        constraint=None,
-        jacobian=None,
-        compile=True,
-    )
+    system = unconstrained(lambda t, q, v: np.array([-1e6 * (v[0] - np.cos(t)), -q[1]]), 2, compile=True)
     result = solve_dae(system, (0.0, 2.0), [0.0, 1.0], [1.0, 0.0], "TRBDF2", 1e-5, 1e-5)
     assert worst(result.q[:, -1], [np.sin(2.0), np.cos(2.0)]) < 3e-3
     assert result.stats.n_evaluations < 5000
@@ -119,9 +111,7 @@ def test_damping_without_a_derivative_by_position():
 def test_velocities_are_tested_where_asked_for():
     """Those of a vibration, which steps otherwise pass over."""
     rates = np.array([1.0, 300.0])
-    system = ConstrainedSystem.from_python(
-        n_q=2, n_c=0, mass=np.eye(2), force=lambda t, q, v: -(rates**2) * q, constraint=None, jacobian=None
-    )
+    system = unconstrained(lambda t, q, v: -(rates**2) * q, 2)
     start, end = np.array([1.0, 1e-4]), 0.5
     off = []
     for tested in ("positions", "all"):

@@ -110,12 +110,6 @@ def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven():
         assert stats.n_outer == stats.n_accepted + stats.n_rejected_error
 
 
-def test_fixed_steps_estimate_nothing():
-    coarse, fine = (run(FOUR_BAR, 1.0, method="DOP853", step_size=0.01, rtol=tol, atol=tol) for tol in (1e-2, 1e-12))
-    assert (coarse.q == fine.q).all()
-    assert coarse.stats.n_evaluations == STAGES * 100 + 1
-
-
 @pytest.mark.parametrize("tol", TestDOP853.tolerances)
 def test_fewer_steps_are_refused_than_taken(tol):
     stats = shared_run("DOP853", tol)[0].stats

@@ -11,8 +11,6 @@ from tests.problems import (
     oblique_point,
     oblique_start,
     oblique_to_point,
-    pendulum,
-    pendulum_state,
     violations,
     worst,
 )
@@ -56,12 +54,6 @@ def test_multipliers_and_accelerations_with_a_mass_that_varies_in_time_and_place
     assert worst(speeds, u) < 1e-9
     assert worst(result.lam[0], lam) < 1e-8
     assert force_residual(system, result) < 1e-10
-
-
-def test_multiplier_is_the_tension_of_the_pendulum():
-    times = np.linspace(0.0, 3.0, 13)
-    result = solve_dae(pendulum(), (0.0, 3.0), [-1.0, 0.0], [0.0, 0.0], rtol=1e-10, atol=1e-10, t_eval=times)
-    assert worst(result.lam[0], pendulum_state(times)[2]) < 1e-8
 
 
 @pytest.mark.parametrize("gamma", [True, False])

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from tests.problems import (
-    called,
     double_pendulum,
     double_pendulum_canonical,
     double_pendulum_state,
-    kit_of,
     moving_pivot,
     moving_pivot_state,
     oblique_pendulum,
@@ -22,10 +20,6 @@ from tests.problems import (
     worst,
 )
 from twoloop import RungeKutta, solve_dae
-from twoloop.kernels import advance
-from twoloop.kernels.data import common
-from twoloop.kernels.layout import make_work
-from twoloop.kernels.steps import canonical_step as momenta
 from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 SYMPLECTIC = {"Sun": sun_radau_iib(3), "Gauss": gauss(3), "Lobatto": lobatto_iiie(4), "midpoint": gauss(1)}
@@ -111,34 +105,6 @@ def test_symplectic_where_the_mass_matrix_depends_on_the_position(gamma):
     assert defects["velocities"] > 1e-7
 
 
-def test_momentum_rates_are_the_derivative_of_the_momenta_along_the_motion():
-    # independent of the integrator: p = T^T M v along an accurate run, differenced
-    system = pendulums(True)
-    q, v = double_pendulum_state(START[:2], START[2:])
-    h = 1e-3
-    run = solve_dae(system, (0.0, 4 * h), q, v, "Gauss12", step_size=h)
-    work = make_work(4, 2)
-    state = np.concatenate([run.q[:, 2], run.v[:, 2], np.zeros(6)])
-    assert advance.start(kit_of(system), work, 0.0, state) == common.DONE
-    i, d = work.independent, work.dependent
-
-    def momentum(k):
-        Cq = system.jacobian(0.0, run.q[:, k])
-        T = np.zeros((4, 2))
-        T[i] = np.eye(2)
-        T[d] = -np.linalg.solve(Cq[:, d], Cq[:, i])
-        return T.T @ run.v[:, k]
-
-    rate = (momentum(0) - 8.0 * momentum(1) + 8.0 * momentum(3) - momentum(4)) / (12.0 * h)
-    tangent, reduced, u = np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(4)
-    Mv, shifted, found = np.zeros(4), np.zeros(4), np.zeros(4)
-    q, v = run.q[:, 2].copy(), run.v[:, 2].copy()
-    kit = kit_of(system)
-    assert called(momenta._tangents, kit, work, 0.0, q, tangent, reduced, u) == common.DONE
-    called(momenta._momentum_rates, kit, work, 0.0, q, v, tangent, Mv, shifted, found)
-    assert worst(found[i], rate) < 1e-8
-
-
 def test_variable_steps_reach_the_tolerance():
     start, times = (0.4, 0.0), np.linspace(0.25, 2.0, 8)
     begin, truth = moving_pivot_state(0.0, start, 2.0), moving_pivot_state(times, start, 2.0)
@@ -153,9 +119,9 @@ def test_variable_steps_reach_the_tolerance():
 
 @pytest.mark.parametrize("gamma", [True, False])
 def test_forces_without_a_potential_and_a_mass_that_depends_on_time_are_right_too(gamma):
-    system, times = oblique_pendulum(gamma), np.linspace(0.0, 5.0, 6)
+    system, times = oblique_pendulum(gamma), np.linspace(0.0, 2.0, 6)
     result = solve_dae(
-        system, (0.0, 5.0), *oblique_start(), RungeKutta(gauss(3), variables="momenta"), 1e-10, 1e-10, t_eval=times
+        system, (0.0, 2.0), *oblique_start(), RungeKutta(gauss(3), variables="momenta"), 1e-10, 1e-10, t_eval=times
     )
     x, u = oblique_to_point(result)
     truth = oblique_point(times)

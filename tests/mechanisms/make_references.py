@@ -43,9 +43,8 @@ def equations(system, t, q, v):
     """Whole matrix and right-hand side for acceleration and multipliers at a state."""
     J, M = system.rows(t, q), system.mass(t, q)
     kinds = [kind for kind, size in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if size]
-    gamma = np.concatenate([getattr(system, kind)(t, q, v) for kind in kinds])
     matrix = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
-    return matrix, np.concatenate([system.force(t, q, v), gamma])
+    return matrix, np.concatenate([getattr(system, kind)(t, q, v) for kind in ("force", *kinds)])
 
 
 def solution(system, t, q, v):

@@ -1,32 +1,34 @@
-"""Mechanisms are imported one by one: the first import of a mechanism compiles its callbacks and no others."""
+"""An import compiles no kernels, and mechanisms are imported one by one: each compiles its callbacks and no others."""
 
-import subprocess
-import sys
-from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from tests.processes import run_python
 from twoloop import mechanisms
-
-ROOT = Path(__file__).parents[2]
 
 
 def imported(*statements):
-    """Modules of mechanisms after each of the statements in a new process."""
-    told = "print(*(m for m in sys.modules if m.startswith('twoloop.mechanisms.')))"
+    """Modules of twoloop after each of the statements in a new process."""
+    told = "print(*(m for m in sys.modules if m.startswith('twoloop.')))"
     source = "\n".join(["import sys", *(f"{statement}; {told}" for statement in statements)])
-    done = subprocess.run([sys.executable, "-c", source], cwd=ROOT, capture_output=True, text=True, check=True)
-    lines = done.stdout.removesuffix("\n").split("\n")
-    return [{name.removeprefix("twoloop.mechanisms.") for name in line.split()} for line in lines]
+    return [set(line.split()) for line in run_python(source).stdout.splitlines()]
+
+
+def mechanisms_among(modules):
+    """Names of those of mechanisms."""
+    return {name.removeprefix("twoloop.mechanisms.") for name in modules if name.startswith("twoloop.mechanisms.")}
 
 
 def test_a_mechanism_imports_no_other_and_its_name_is_a_function_also_after_an_import_of_the_module():
-    none, one, other = imported(
+    first, *after = imported(
+        "import twoloop",
         "import twoloop.mechanisms",
         "from twoloop.mechanisms import four_bar",
         "import twoloop.mechanisms.heavy_top; from twoloop.mechanisms import heavy_top; assert callable(heavy_top)",
     )
+    assert not first & {f"twoloop.kernels.{name}" for name in ("lanes", "evaluation.calls", "advance")}
+    none, one, other = map(mechanisms_among, after)
     assert none == set() and one == {"four_bar", "points", "rotation"}
     assert {"four_bar", "heavy_top"} <= other and "andrews" not in other
 

@@ -1,23 +1,19 @@
 """Generated code: derived once, kept on disk, pickled without SymPy, its parameters free to change."""
 
-import os
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import sympy as sp
 from sympy.physics.mechanics import dynamicsymbols
 
+from tests.processes import run_python
 from twoloop import solve_dae
 from twoloop.problem import generated
 from twoloop.problem.generated import GeneratedCode
 from twoloop.symbolic import from_lagrangian
 from twoloop.symbolic.equations import Equations
 
-ROOT = Path(__file__).parents[2]
 m, length, g = sp.symbols("m l g")
 
 
@@ -116,11 +112,7 @@ except ImportError as error:
 def test_a_problem_goes_to_another_process_by_its_equations(folder):
     problem = pendulum().problem([0.3, -0.4], [0.0, 0.0], (0.0, 1.0))
     (folder / "problem.pickle").write_bytes(pickle.dumps(problem))
-    variables = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", UNPICKLED]
-    done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    numbers, energy, compiled, refusal = done.stdout.splitlines()
+    numbers, energy, compiled, refusal = run_python(UNPICKLED, folder=folder).stdout.splitlines()
     assert [float(each) for each in numbers.split()] == [2.0, -25.0]
     assert float(energy) == pytest.approx(2.0 * 9.81 * -0.4)
     assert compiled == "[]"  # all machine code was read from the disk
