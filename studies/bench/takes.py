@@ -6,6 +6,7 @@ from typing import Any
 
 from studies.bench.render import listed, number
 from studies.bench.solvers import DEFAULT
+from twoloop.methods.code_for import WITH_CODE
 from twoloop.methods.presets import PRESETS
 
 _UNDECIDED = "the default: no solver is told apart from the others"
@@ -29,31 +30,31 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         coded = with_code.issuperset(entry["name"] for entry in group)
         motions = "; ".join(f"{entry['name']}, {number(entry['t_end'])} s" for entry in group)
         what = f"{group[0]['class']} ({motions})"
-        picks = [
-            f"{call(pick['solver'], coded)} for errors of {listed(pick['accuracies'])}" for pick in group[0]["picks"]
-        ]
+        named = [(call(pick["solver"], coded), listed(pick["accuracies"])) for pick in group[0]["picks"]]
+        picks = [f"{solver} for errors of {errors}" for solver, errors in named]
         open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
         rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
     often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
     mechanisms = made.get("rivals", {}).get("mechanisms", [])
-    rows += _of_short_calls([each for each in mechanisms if each.get("tags") and not OTHER_KINDS & {*each["tags"]}])
-    rows += _of_kinds(mechanisms)
+    short = [each for each in mechanisms if each.get("tags") and not OTHER_KINDS & {*each["tags"]}]
+    rows += [*_of_short_calls(short, with_code), *_of_kinds(mechanisms, with_code)]
     return rows + ([{"what": "run many times", "take": "; ".join(often)}] if often else [])
 
 
-def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]], with_code: set[str]) -> list[dict[str, str]]:
     """Who is the cheapest on the other smooth mechanisms, whose calls take milliseconds."""
     cheapest = Counter(_cheapest(each["at"]) for each in mechanisms)
     cheapest.pop("", None)
     if not cheapest:
         return []
-    parts = [f"{call(solver, True)} on {n}" for solver, n in cheapest.most_common()]  # smooth ones are small
+    coded = with_code.issuperset(each["case"] for each in mechanisms)
+    parts = [f"{call(solver, coded)} on {n}" for solver, n in cheapest.most_common()]
     n, what = len(mechanisms), "smooth, rigid, in calls of a few milliseconds"
     return [{"what": what, "take": f"of {n} mechanisms, the cheapest at most errors: {', '.join(parts)}"}]
 
 
-def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _of_kinds(mechanisms: Sequence[Mapping[str, Any]], with_code: set[str]) -> list[dict[str, str]]:
     """Of each kind who is the cheapest on all mechanisms; of the other kinds who is it on which mechanism."""
     open_kinds, told = [], set()
     closed: dict[str, list[tuple[str, set[str]]]] = defaultdict(list)
@@ -72,8 +73,9 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
             others |= {each["case"]: each["at"] for each in own}
     rows = []
     for solver, kinds in closed.items():
-        n = len(set().union(*(cases for _, cases in kinds)))
-        said = f"{call(solver)}, the cheapest at most errors on {n} of {n} such mechanisms"
+        every = set().union(*(cases for _, cases in kinds))
+        n = len(every)
+        said = f"{call(solver, with_code >= every)}, the cheapest at most errors on {n} of {n} such mechanisms"
         rows.append({"what": "; ".join(words for words, _ in kinds), "take": said})
     left = {case: at for case, at in others.items() if case not in told}
     by_solver: dict[str, list[str]] = defaultdict(list)
@@ -82,7 +84,7 @@ def _of_kinds(mechanisms: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     open_ones = by_solver.pop("", [])
     if open_kinds:
         ranked = sorted(by_solver.items(), key=lambda item: -len(item[1]))
-        parts = [f"{call(solver)} on {listed(cases)}" for solver, cases in ranked]
+        parts = [f"{call(solver, with_code.issuperset(cases))} on {listed(cases)}" for solver, cases in ranked]
         parts += [f"none is the cheapest at most errors on {listed(open_ones)}"] if open_ones else []
         rows.append({"what": "; ".join(open_kinds), "take": "; ".join(parts) if by_solver else _UNDECIDED})
     return rows
@@ -149,7 +151,7 @@ def call(solver: str, coded: bool = False) -> str:
     name, _, compiled = solver.removesuffix(SUFFIX).partition(", ")
     if name not in PRESETS or compiled not in ("", "compiled"):
         return f"`{solver}`"
-    if name == DEFAULT and bool(compiled) is coded:
-        return "the default"
     words = [] if name == DEFAULT else [f'method="{name}"']
-    return f"`{', '.join([*words, f'compiled={bool(compiled)}'])}`"
+    if name in WITH_CODE and bool(compiled) is not coded:
+        words.append(f"compiled={bool(compiled)}")
+    return f"`{', '.join(words)}`" if words else "the default"

@@ -58,18 +58,20 @@ def test_sentences_follow_the_findings(text_of, changed, said, unsaid):
 
 
 @pytest.mark.parametrize(
-    ("solver", "asked"),
+    ("solver", "without", "with_code"),
     [
-        ("auto", "`auto`"),
-        ("auto, compiled", "`compiled=True`"),
-        ("DOP853 (twoloop)", '`method="DOP853"`'),
-        ("Taylor, compiled", '`method="Taylor", compiled=True`'),
-        ("DOP853, projected", "`DOP853, projected`"),  # SciPy's
-        ("heyoka", "`heyoka`"),
+        ("auto", "the default", "`compiled=False`"),
+        ("auto, compiled", "`compiled=True`", "the default"),
+        ("DOP853 (twoloop)", '`method="DOP853"`', '`method="DOP853", compiled=False`'),
+        ("Taylor, compiled", '`method="Taylor", compiled=True`', '`method="Taylor"`'),
+        ("TRBDF2", '`method="TRBDF2"`', '`method="TRBDF2"`'),
+        ("DOP853, projected", "`DOP853, projected`", "`DOP853, projected`"),  # SciPy's
+        ("heyoka", "`heyoka`", "`heyoka`"),
     ],
 )
-def test_a_solver_is_asked_for_as_a_user_does(solver, asked):
-    assert call(solver) == asked
+def test_a_solver_is_asked_for_as_a_user_does(solver, without, with_code):
+    """On mechanisms for which the default makes no code, and on those for which it does."""
+    assert (call(solver), call(solver, coded=True)) == (without, with_code)
 
 
 def test_the_table_has_a_row_for_each_class_with_the_cheapest():
@@ -97,7 +99,7 @@ def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pay
     line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
     theirs = {**line, "solver": "heyoka", "pays": [50.0], "never": 0}
     (row,) = takes({"work_precision": {"first_calls": [theirs, line]}}, [])
-    always = "breaks even with `auto`, at an error of 1e-8: `heyoka` on all 5 mechanisms by run 50"
+    always = "breaks even with `compiled=False`, at an error of 1e-8: `heyoka` on all 5 mechanisms by run 50"
     assert row["take"] == always + said
     (row,) = takes({"work_precision": {"first_calls": [line | {"pays": [3.0, 40.0], "never": 2}]}}, [])
     assert row["take"].endswith(": `compiled=True` on 3 of 5 by run 40")
