@@ -108,7 +108,7 @@ def test_solve_compiles_the_equations_when_asked_to(where, capsys, monkeypatch):
     monkeypatch.setattr("twoloop.__main__.solve_dae", watched)
     main(["solve", where, "--t-end", "0.1"])
     main(["solve", where, "--t-end", "0.1", "--compiled"])
-    assert [(more["method"], more["compiled"]) for more in given] == [("auto", False), ("auto", True)]
+    assert [(more["method"], more["compiled"]) for more in given] == [("auto", "auto"), ("auto", True)]
     assert capsys.readouterr().out.count("auto: REACHED_END.") == 2
 
 

@@ -15,6 +15,7 @@ from tests.compiled import pendulum_under
 from tests.problems import pendulum as bare_pendulum
 from twoloop import sweep
 from twoloop.generate import stage_code, straight_code
+from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import Problem
 from twoloop.sweeps import sweep as sweeps
 from twoloop.sweeps import workers
@@ -322,6 +323,7 @@ def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
             held.append(weakref.ref(self))
 
     monkeypatch.setattr(straight_code, "SharedCode", Watched)
+    monkeypatch.setattr(straight_code, "_MADE", Newest())  # what other tests hold has no part in it
     options = {"measure": plain, "parallel": "threads", "workers": 1, "compiled": True, "method": "DOP853", **QUICK}
     # 0, 1 and -1 stand in the code
     rows = sweep(swinging_under, [{"gravity": gravity} for gravity in (9.0, 1.0, -1.0, 0.0)], **options)

@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from studies.bench.render import listed, number
-from studies.bench.solvers import DEFAULT
-from twoloop.methods.code_for import WITH_CODE
+from studies.bench.solvers import COMPILED, DEFAULT
 from twoloop.methods.presets import PRESETS
 
 _UNDECIDED = "the default: no solver is told apart from the others"
@@ -152,6 +151,6 @@ def call(solver: str, coded: bool = False) -> str:
     if name not in PRESETS or compiled not in ("", "compiled"):
         return f"`{solver}`"
     words = [] if name == DEFAULT else [f'method="{name}"']
-    if name in WITH_CODE and bool(compiled) is not coded:
+    if name in COMPILED.values() and bool(compiled) is not coded:
         words.append(f"compiled={bool(compiled)}")
     return f"`{', '.join(words)}`" if words else "the default"

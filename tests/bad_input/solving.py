@@ -151,8 +151,8 @@ SOLVE = [
     *of_argument(
         "compiled",
         [
-            ("yes", TypeError, "must be True or False; given 'yes'", "give True or leave it out"),
-            (1, TypeError, "must be True or False; given 1", "give True or leave it out"),
+            ("yes", ValueError, "must be True, False or 'auto'; given 'yes'", "give True or leave it out"),
+            (1, TypeError, "must be True, False or 'auto'; given 1", "give True or leave it out"),
         ],
     ),
     *(

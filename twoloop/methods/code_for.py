@@ -10,13 +10,17 @@ from twoloop.generate.series import series_for
 from twoloop.generate.straight_code import OwnCode, own_code
 from twoloop.generate.traced_values import Check
 from twoloop.generate.tracing import Untraceable
+from twoloop.methods.adams import Adams
+from twoloop.methods.auto import Auto
+from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method
+from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
-WITH_CODE = ("auto", "Taylor", "DOP853", "Adams")
+WITH_CODE = (Auto, Taylor, DOP853, Adams)
 SMALL = 80  # operations of the series of its motion: the code takes up to a third of a second to build
 
 
@@ -46,12 +50,16 @@ def code_for(
     """
     if compiled is True:
         return own_code(system, t0, q0, check)
-    if compiled is False or fixed or method.name not in WITH_CODE or not is_small(system):
+    if compiled is False or fixed or not _takes_code(method) or not is_small(system):
         return None
     try:
         return own_code(system, t0, q0, check)
     except ValueError:
         return None
+
+
+def _takes_code(method: Method) -> bool:
+    return type(method) in WITH_CODE and getattr(method, "stages", "free") == "free"
 
 
 def is_small(system: ConstrainedSystem) -> bool:
