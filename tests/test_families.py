@@ -1,6 +1,7 @@
 """Code that is traced once for systems that share callbacks: with any parameters it is what they would get alone."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from twoloop.generate.series_code import compiled_series
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.straight_line import StraightLine
 from twoloop.generate.traced_values import Traced
+from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import (
     andrews,
     bricard,
@@ -133,6 +135,23 @@ def test_nothing_is_traced_for_the_next_parameters(monkeypatch):
     monkeypatch.setattr("twoloop.generate.straight_code.StraightLine", None)
     code = own_code(pendulum(PARAMETERS[0]).with_parameters([1.4, 2.9, 0.5, 1.9]), 0.0, start)
     compiled_series(code)
+
+
+def test_threads_trace_one_family_one_after_another(monkeypatch):
+    monkeypatch.setattr("twoloop.generate.families._FAMILIES", Newest())
+    lengths = np.linspace(1.1, 1.9, 8) + 0.013
+
+    def end(length, compiled="auto"):
+        problem = four_bar(lengths=(1.0, 2.0, float(length)))
+        result = solve_dae(
+            problem.system, (0.0, 0.5), problem.q0, problem.v0, rtol=1e-10, atol=1e-10, compiled=compiled
+        )
+        return result.q[:, -1]
+
+    with ThreadPoolExecutor(4) as pool:
+        made = list(pool.map(end, lengths))
+    expected = [end(length, compiled=False) for length in lengths]
+    assert np.abs(np.array(made) - np.array(expected)).max() < 1e-7
 
 
 def check(traced: Traced) -> None:

@@ -6,6 +6,7 @@ leave operations out; what is equal, but for its sign, stays equal. So systems o
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,7 @@ class Family:
             known = self._record.parameters[abs(which) - 1]
             self.parameters[place] = known if which > 0 else -known
         self._made: dict[Any, Any] = {}
+        self._tracing = RLock()  # what is traced is put down in one record
 
     def numbers(self, parameters: Array) -> Array:
         """The numbers, one for each class, of a system's parameters."""
@@ -72,7 +74,9 @@ class Family:
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
         """What `make` makes of the callbacks, once."""
         if what not in self._made:
-            self._made[what] = make()
+            with self._tracing:
+                if what not in self._made:
+                    self._made[what] = make()
         return self._made[what]
 
 
