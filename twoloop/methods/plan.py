@@ -15,7 +15,6 @@ INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # `least_error` of a Plan, of most methods
 ROUGH = 10.0  # `rough` of a Plan, as measured for most methods
 LARGEST_MOVE = 1e-14  # of a position, after which a projection is not repeated: velocities are then off by as much
-PARTS = ("interior", "substitute", "within_newton")  # fields of a Plan that are plans
 OUTER_SHARE = 0.01  # of the step tolerance, for the outer loop
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
 LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to reach them
@@ -65,13 +64,9 @@ class Plan:
         return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
 
     def fresh(self) -> "Plan":
-        """The same for another run, with memory of its own."""
+        """The same for another run, with memory of its own; not so the plans that it holds."""
         other = object.__new__(Plan)  # `replace` takes ten times as long
-        own = dict(vars(self), memory=self.memory.copy())
-        for name in PARTS:
-            if own[name] is not None:
-                own[name] = own[name].fresh()
-        vars(other).update(own)
+        vars(other).update(vars(self), memory=self.memory.copy())
         return other
 
 

@@ -11,7 +11,8 @@ from twoloop.problem.system import ConstrainedSystem
 
 MOST = 16  # that are kept with a system
 
-Plans = tuple[Plan, dict[int, Plan]]  # of steps, and of parts of steps, by kind, between which the solution is wanted
+# of steps, and of parts of steps, by kind, between which the solution is wanted: these other runs may have, too
+Plans = tuple[Plan, dict[int, Plan]]
 
 
 def plans_for(
@@ -42,7 +43,7 @@ def plans_for(
                 del kept[next(iter(kept))]
             kept[key] = made
     plan, interiors = made
-    return plan.fresh(), {kind: each.fresh() for kind, each in interiors.items()}
+    return plan.fresh(), interiors
 
 
 def _series(method: Method) -> bool:

@@ -398,7 +398,8 @@ class Run:
         if wanted.between_steps:
             ranks = (len(self.work.rows), len(self.work.rows_v))
             start, atol = self.state[: 3 * n], self.tolerances[common.ATOL :]
-            interpolator = Interpolator(self.system, self.t0, start, self.rtol, atol, ranks, self.interiors)
+            interiors = {kind: plan.fresh() for kind, plan in self.interiors.items()}
+            interpolator = Interpolator(self.system, self.t0, start, self.rtol, atol, ranks, interiors)
         return Recorder(wanted, interpolator, n, self.t0, self.state)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
@@ -415,7 +416,7 @@ class Run:
     def _give_way(self) -> None:
         """Go on with the plan that takes over where values of this one are not finite."""
         assert self.plan.substitute is not None
-        self.plan = self.plan.substitute
+        self.plan = self.plan.substitute.fresh()
         self.kit = kit_with(self.system, self.functions.flags, self.plan)
         self.functions = self.kit.functions
         self.memory = self.plan.memory.copy()
