@@ -26,7 +26,7 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
     rows, made = [], found.get("work_precision", {})
     with_code = set(made.get("rivals", {}).get("with_code", []))
     for group in groups:
-        coded = with_code.issuperset(entry["name"] for entry in group)
+        coded = with_code.issuperset(entry["name"].partition(",")[0] for entry in group)  # whatever its lengths
         motions = "; ".join(f"{entry['name']}, {number(entry['t_end'])} s" for entry in group)
         what = f"{group[0]['class']} ({motions})"
         named = [(call(pick["solver"], coded), listed(pick["accuracies"])) for pick in group[0]["picks"]]

@@ -239,7 +239,10 @@ def test_a_refusal_is_no_run(message):
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert "| the default method with code | 0 | 0 | 0 | 1 | 0 | 0 |" in text and "1 of the default, compiled." in text
+    assert (
+        "| the default method with code | 0 | 0 | 0 | 1 | 0 | 0 |" in text
+        and "1 of the default method with code." in text
+    )
 
 
 def test_what_a_refusal_says_is_what_is_said():
