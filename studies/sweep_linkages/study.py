@@ -14,6 +14,7 @@ from studies.bench.cli import StudyError
 from studies.bench.store import Array, Output, sources
 from studies.bench.study import Study
 from twoloop import Result, sweep
+from twoloop.ensembles.in_lanes import threads_of
 from twoloop.mechanisms import Problem, four_bar
 
 SEED = 2016
@@ -87,6 +88,8 @@ def _short(value: float, digits: int) -> float:
 def make(output: Output) -> pd.DataFrame:
     """The rows of all linkages, then one of each way to sweep, with its wall-clock time."""
     quick = output.call.quick
+    if not quick and threads_of(None) < 2:
+        raise StudyError("two processes are timed on two cores, and this one may use a single one: lift that")
     ways = WAYS[2:] if quick else WAYS  # new processes take seconds to start: not for a quick run
     options: dict[str, Any] = {"measure": measured, "t_span": SPAN, "events": TURNING}
     # what an interrupted run leaves is of no use to other sources

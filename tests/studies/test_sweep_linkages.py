@@ -1,5 +1,7 @@
 """The study of random linkages: its measures against closed forms, its sentences against rows that are made up."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,6 +13,12 @@ from twoloop import sweep
 from twoloop.mechanisms import four_bar
 
 ASSEMBLE = "ValueError: the linkage cannot be assembled with theta3 = 1"
+
+
+def test_two_processes_are_not_timed_on_one_core(monkeypatch):
+    monkeypatch.setattr(study, "threads_of", lambda wanted: 1)
+    with pytest.raises(StudyError, match="two processes are timed on two cores"):
+        study.make(SimpleNamespace(call=SimpleNamespace(quick=False)))
 
 
 def made_up(**changes):
