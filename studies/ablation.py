@@ -18,7 +18,7 @@ from studies.bench.collector import REPEATS, Case, Run, Solver
 from studies.bench.metrics import violations
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
-from studies.bench.tables import where
+from studies.bench.tables import LEAST, where
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
@@ -161,9 +161,9 @@ def verdict(span: list[float] | None) -> str:
         return "unknown"
     if span[0] >= 1.0 / MARGIN and span[2] <= MARGIN:
         return "equal"
-    if span[0] >= 1.0:
+    if span[0] >= 1.0 / LEAST:
         return "cheaper"
-    return "dearer" if span[2] <= 1.0 else "mixed"
+    return "dearer" if span[2] <= LEAST else "mixed"
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:

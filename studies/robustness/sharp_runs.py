@@ -32,10 +32,11 @@ Part = tuple[str, Callable[[], list[Row]]]
 
 
 def run(mechanism: Mechanism, known: Motion, method: str, tolerance: float) -> Row:
-    """One run, with code of its own where the name says so."""
+    """One run as a user gets it, or with code of its own where the name says so."""
     name, _, code = method.partition(", ")
     row: Row = {"group": SHARP, "what": mechanism.sharp.family, "name": mechanism.name, "method": method}
-    return row | {"tol": tolerance} | judged(mechanism, known, name, tolerance, TIME_LIMIT, compiled=bool(code))
+    compiled = True if code else "auto"
+    return row | {"tol": tolerance} | judged(mechanism, known, name, tolerance, TIME_LIMIT, compiled=compiled)
 
 
 def random_mechanisms(quick: bool) -> Iterator[Part]:

@@ -255,9 +255,9 @@ def picture(rows: pd.DataFrame) -> Figure:
 
 
 def heat_map(found: dict[str, Any]) -> Figure:
-    """Mechanism x decade: the time of the fastest rival over that of default, compiled default and best of ours."""
+    """Mechanism x decade: the time of the fastest rival over that of the default and of the best of ours."""
     names = [each["case"] for each in found["mechanisms"]]
-    whose = (headline.GIVEN, headline.OWN_CODE, headline.BEST)
+    whose = (headline.GIVEN, headline.BEST)
     size = (4.6 * len(whose) + 2.0, 0.28 * len(names) + 1.6)
     figure, panels = plt.subplots(1, len(whose), figsize=size, sharey=True, layout="constrained")
     colours = plt.get_cmap("RdBu").with_extremes(bad="#e6e6e6")
@@ -272,7 +272,7 @@ def heat_map(found: dict[str, Any]) -> Figure:
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
         axes.set(title=name, xlabel="error at the end, over max(1, max |q|)")
-    told = "blue: ours ahead; in brackets: undecided; a word: only these get there"
+    told = "blue: ours ahead; in brackets: undecided; a word: only these get there; grey: not reached, or not run"
     figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
     figure.colorbar(image, ax=panels, label="ratio")
     return figure

@@ -75,7 +75,7 @@ def scaled(made, variant, factor, columns=("n_evaluations", "n_factorizations", 
 
 def test_the_answer_turns_with_the_rows(made):
     text = text_of(made)
-    assert "keeps the constraints as well, and takes less time at every error compared. It takes " in text
+    assert "keeps the constraints as well, and takes no more time at any error compared. It takes " in text
     assert "under this fixed-point iteration its extra multipliers do not pay; what they cost with Newton" in text
     assert f"added with {SUN.name} and {GAUSS.name}, does this." in text and "without it" not in text
     radau = made[made["tableau"] == SUN.name].assign(tableau=RADAU.name)
@@ -84,7 +84,7 @@ def test_the_answer_turns_with_the_rows(made):
     assert "the order falls to 1 with every tableau" in text and "solving them in the loop is right" in text
     assert "violation grows: 1e-7 m" in text and "1e-5 m in the last" in text and "nothing is cheaper" in text
     text = text_of(scaled(scaled(made, PROJECTED, 4.0), STABILISED, 0.2))
-    assert "**Answer.** Yes: projecting once a step" in text and "never takes less time" in text
+    assert "**Answer.** Yes: projecting once a step" in text and "takes no less time at any error compared" in text
     assert "the extra multipliers that the paper calls inefficient save time at every error" in text
     changed = scaled(scaled(made, PROJECTED, 1.8, (TIME,)), PROJECTED, 0.9, ("n_evaluations",))
     text = text_of(scaled(changed, UNPROJECTED, 9.0))
@@ -143,9 +143,9 @@ def test_no_cost_is_told_across_a_gap_or_beyond_the_runs():
         (None, "unknown"),
         ([1.3, 1.4, 2.0], "cheaper"),
         ([1.0, 1.4, 2.0], "cheaper"),
-        ([0.99, 1.4, 2.0], "mixed"),
+        ([0.99, 1.4, 2.0], "cheaper"),
         ([0.3, 0.6, 1.0], "dearer"),
-        ([0.3, 0.6, 1.01], "mixed"),
+        ([0.3, 0.6, 1.01], "dearer"),
         ([0.9, 1.0, 1.1], "equal"),
         ([0.9, 1.0, 1.3], "mixed"),
         ([0.5, 0.8, 1.1], "mixed"),
