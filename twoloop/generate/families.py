@@ -20,7 +20,9 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 Evaluator = Callable[[Any], Array]  # of an array of numbers, some of which may be formulas, for one system
 
-APART = 0.03  # of a parameter, at most: how far the generic one that takes its place in what is traced is from it
+# between which numbers are with which callbacks are traced: all of one size, so that what cancels does so for any others
+GENERIC = 0.5, 1.5
+EXTREME = 1e-30  # what is smaller, or larger than its inverse, stays what it is: its powers would leave the range
 
 _FAMILIES = Newest()
 
@@ -43,10 +45,9 @@ class Family:
 
     def __init__(self, parameters: Array, classes: Sequence[int]):
         self._classes = np.array(classes, dtype=np.int64)
-        numbers = self.numbers(parameters)
-        away = np.random.default_rng(7).uniform(-APART, APART, len(numbers))
-        self._record = Record((numbers * (1.0 + away)).tolist(), range(len(numbers)))
-        self.parameters = parameters.astype(object)
+        n_numbers = int(np.abs(self._classes).max(initial=0))
+        self._record = Record(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
+        self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():
             which = int(self._classes[place])
             known = self._record.parameters[abs(which) - 1]
@@ -108,9 +109,11 @@ def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callab
     """What a system gets of a family, or why it cannot be had."""
     try:
         shared = family.remembered(what, partial(make, family))
+        return shared.of(system, system.remembered(("numbers", family), partial(family.evaluator, system.parameters)))
     except Untraceable as error:
         return error.with_traceback(None)
-    return shared.of(system, system.remembered(("numbers", family), partial(family.evaluator, system.parameters)))
+    except (ArithmeticError, RecursionError) as error:
+        return Untraceable(f"what it makes of its parameters cannot be written down: {error}")
 
 
 def family_of(system: ConstrainedSystem) -> Family:
@@ -134,6 +137,7 @@ def _classes(parameters: Sequence[float]) -> list[int]:
     known: dict[float, int] = {}
     classes = []
     for x in parameters:
-        which = 0 if x.is_integer() else known.setdefault(abs(x), len(known) + 1)
+        stays = x.is_integer() or not EXTREME < abs(x) < 1.0 / EXTREME
+        which = 0 if stays else known.setdefault(abs(x), len(known) + 1)
         classes.append(which if x > 0.0 else -which)
     return classes

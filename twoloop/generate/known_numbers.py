@@ -5,8 +5,9 @@ decides by values (what cancels, which forms are equal), so these must be generi
 """
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 
 Powers = tuple[tuple[int, float], ...]  # atoms and their exponents: a product; empty for 1
 
+MOST_TERMS = 200  # of a sum: each is told apart by all of its terms
 CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding leaves of two that cancel
 NUMBERS = (int, float, np.number)
 FUNCTIONS = {
@@ -38,6 +40,14 @@ FUNCTIONS = {
 NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
 
 
+class Untraceable(ValueError):
+    """Raised for a callback that does not run on symbols; the text says why."""
+
+
+class Refusal(BaseException):
+    """Leaves a callback that does not run on symbols: no `except Exception` of its own holds it."""
+
+
 class Record:
     """What numbers were made of: atoms, which are parameters, sums of products of atoms, or functions of these.
 
@@ -47,15 +57,30 @@ class Record:
         Of all parameters, generic ones where these vary.
     varying : sequence of int
         Which of them do.
+
+    Attributes
+    ----------
+    running : bool
+        Whether a callback runs on its numbers, which must not decide by what these are just now ...
+    refused : str
+        ... and that it did, which it may have caught.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
+        self.running, self.refused = False, ""
         self.atoms: list[Any] = [None] * len(values)
         self._places: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
         for place in varying:
             self.parameters[place] = Known(float(values[place]), self, 1.0, ((place, 1.0),))
+
+    def refuse(self, reason: str) -> NoReturn:
+        """Leave the callback that runs, and keep the reason."""
+        if not self.running:
+            raise Untraceable(reason)
+        self.refused = self.refused or reason
+        raise Refusal(reason)
 
     def atom(self, definition: Any) -> Powers:
         """The power of a sum or a function, the one known before if there is one."""
@@ -134,6 +159,7 @@ class Known(float):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
         name = NAMES.get(ufunc.__name__, ufunc.__name__)
         if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
+            self._decides(f"it calls numpy.{ufunc.__name__} on its parameters")
             plain = (float(each) if type(each) is Known else each for each in inputs)
             return getattr(ufunc, method)(*plain, **options)
         made = np.frompyfunc(lambda *given: applied(name, *given), len(inputs), 1)(*map(_operand, inputs))
@@ -141,6 +167,12 @@ class Known(float):
             return made
         out[0][...] = made
         return out[0]
+
+    def _decides(self, reason: str = "it branches on its parameters, or rounds them") -> None:
+        """Refuse a callback what is true of this value alone; what traces it may ask."""
+        caller = sys._getframe(2).f_globals.get("__name__", "")
+        if self.record.running and not caller.startswith(__name__.rpartition(".")[0]):
+            self.record.refuse(reason)
 
     def to(self, exponent: float) -> "Known":
         """The power with a whole exponent that is not 0."""
@@ -175,6 +207,8 @@ def _sum(one: float, other: float) -> float:
             terms.pop(powers, None)
         else:
             terms[powers] = total
+    if len(terms) > MOST_TERMS:
+        record.refuse(f"it adds up more than {MOST_TERMS} terms of its parameters")
     if len(terms) < 2:
         ((powers, c),) = terms.items() or (((), 0.0),)
         return Known(value, record, c, powers) if powers else c
@@ -261,6 +295,20 @@ def _operator(name: str, swapped: bool) -> Callable[[Known, Any], Any]:
     return operate
 
 
+def _deciding(name: str) -> Callable[..., Any]:
+    plain = getattr(float, name)
+
+    def decide(self: Known, *others: Any) -> Any:
+        self._decides()
+        return plain(self, *others)
+
+    return decide
+
+
+_DECIDING = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
+for _name in (*_DECIDING, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
+    setattr(Known, f"__{_name}__", _deciding(f"__{_name}__"))
+Known.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
     setattr(Known, f"__{_symbol}__", _operator(_name, False))
     setattr(Known, f"__r{_symbol}__", _operator(_name, True))

@@ -10,6 +10,7 @@ import numpy as np
 
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
+from twoloop.generate.known_numbers import Known
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.problem.system import ConstrainedSystem
@@ -37,6 +38,7 @@ class Equations:
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
         self.system, self.graph = system, Graph()
         self.parameters = system.parameters if parameters is None else parameters
+        self._records = {id(x.record): x.record for x in self.parameters if type(x) is Known}.values()  # one, or none
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._made: dict[str, Any] = {}
@@ -72,6 +74,8 @@ class Equations:
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
         if out.size:
+            for record in self._records:
+                record.running, record.refused = True, ""
             try:
                 if not system.called_in_python:
                     trace(getattr(system.functions, kind), self.t, *arrays, p, out)
@@ -81,8 +85,14 @@ class Equations:
                 out = as_forms(graph, out)
                 if out.shape != shape:
                     raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
+                for record in self._records:
+                    if record.refused:
+                        raise Untraceable(f"{record.refused}, and catches the exception that says so")
             except Untraceable as error:
                 raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
+            finally:
+                for record in self._records:
+                    record.running = False
         graph.traced.setdefault(kind, out.copy())
         return out
 

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from twoloop.generate.known_numbers import function_of_number, number
+from twoloop.generate.known_numbers import Known, Refusal, Untraceable, function_of_number, number
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -32,14 +32,6 @@ BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
-
-
-class Untraceable(ValueError):
-    """Raised for a callback that does not run on symbols; the text says why."""
-
-
-class Refusal(BaseException):
-    """Leaves a callback that does not run on symbols: no `except Exception` of its own holds it."""
 
 
 class Graph:
@@ -106,8 +98,10 @@ class Graph:
         return self.operation(PRODUCT, one, other).times(scale * scale_too)
 
 
-def rounded(value: float) -> float:
-    """To 41 bits, 12 digits."""
+def rounded(value: float) -> Any:
+    """To 41 bits, 12 digits; of a number that knows its parameters, what it is made of: other values may differ."""
+    if type(value) is Known:
+        return rounded(value.scale), value.powers
     value = float(value)
     split = 4097.0 * value
     return split - (split - value)
@@ -206,8 +200,8 @@ class Form:
     def __pow__(self, exponent: Any) -> Any:
         if type(exponent) is not Form and isinstance(exponent, np.ndarray):
             return _each(exponent, lambda x: self**x)
-        if type(exponent) is Form:
-            self.graph.refuse("it raises to a power that depends on t, q or v")
+        if type(exponent) is Form or type(exponent) is Known:
+            self.graph.refuse("it raises to a power that depends on t, q or v, or on parameters")
         exponent = float(exponent)
         if exponent != math.floor(exponent):
             if 2.0 * exponent == math.floor(2.0 * exponent):
