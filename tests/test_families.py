@@ -82,6 +82,50 @@ def run(system, compiled="auto", method="auto"):
     return solve_dae(system, SPAN, [length, 0.0], [0.0, 0.5], method, 1e-10, 1e-10, compiled=compiled)
 
 
+@callback("force")
+def by_sum(t, q, v, p, Q):
+    Q[0], Q[1] = -(p[0] + p[1]) * q[0] + p[0] * v[1], -p[0] * 9.81
+
+
+@callback("force")
+def by_loop(t, q, v, p, Q):
+    """A root by Newton's method, which there is for p[1] < 1 only."""
+    x = 1.0
+    while abs(x * x + p[1] - 1.0) > 1e-10:
+        x = x - 0.5 * (x * x + p[1] - 1.0) / x
+    Q[0], Q[1] = -x * q[0], -p[0] * 9.81
+
+
+@callback("force")
+def by_quadrature(t, q, v, p, Q):
+    total = 0.0
+    for i in range(2000):
+        total += math.sin(p[1] * (i + 0.5) / 2000.0) / 2000.0
+    Q[0], Q[1] = -total * q[0], -p[0] * 9.81
+
+
+@callback("force")
+def by_iteration(t, q, v, p, Q):
+    x = 1.0
+    for _ in range(400):
+        x = math.cos(p[1] * x)
+    Q[0], Q[1] = -x * q[0], -p[0] * 9.81
+
+
+@callback("force")
+def by_knock(t, q, v, p, Q):
+    """A blow late in the run, above a threshold."""
+    Q[0], Q[1] = 0.0, -p[0] * 9.81
+    if p[1] > 1.5:
+        Q[0] = 50.0 * np.exp(-((t - 0.77) ** 2) * 1e5)
+
+
+@callback("force")
+def by_arrays(t, q, v, p, Q):
+    roots = np.sqrt(p)
+    Q[0], Q[1] = -roots[1] * q[0], -p[0] * 9.81
+
+
 PARAMETERS = [
     *([1.3, 2.7, 0.4, 1.9], [2.6, 1.4, 0.1, 1.7], [1.3, 1.3, 0.4, 1.9], [1.3, -1.3, 0.4, 1.9], [2.0, 2.7, 0.0, 1.9]),
     *([2.0, -1.0, 0.5, 1.0], [0.7, 0.7, 0.7, 0.7], [1e-3, 2.5e4, 0.3, 1.1]),
@@ -111,6 +155,24 @@ def test_numbers_of_other_parameters_are_those_that_are_traced_for_them(make):
     states = np.column_stack([np.linspace(0.0, 0.1, 5), near.reshape(5, -1)])
     assert code.traced.wrong(other, states) is None
     assert expected.traced.wrong(other, states) is None
+
+
+@pytest.mark.parametrize("first", [1e-14, 5e-324, 1e30, 1.3000000001, 0.4])
+def test_what_ran_before_has_no_part_in_it(first):
+    """Parameters that are alike, tiny or huge once are told apart all the same."""
+    run(pendulum([1.3, first, 0.4, 1.9], by_sum))
+    system = pendulum([1.3, 0.31, 0.4, 1.9], by_sum)
+    made, expected = run(system, method="DOP853"), run(system, compiled=False, method="DOP853")
+    assert np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-11
+
+
+@pytest.mark.parametrize("force", [by_loop, by_quadrature, by_iteration, by_arrays, by_knock])
+@pytest.mark.parametrize("parameter", [0.995, 0.7, 1.0 - 2.0**-30])
+@pytest.mark.parametrize("whole", [2.0, 1.3])
+def test_callbacks_that_make_no_formulas_run_all_the_same(force, parameter, whole):
+    system = pendulum([whole, parameter + 0.5 * (force is by_knock), 0.4, 1.9], force)
+    made, expected = run(system), run(system, compiled=False, method="DOP853")
+    assert made.success and np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
 
 
 @pytest.mark.parametrize("force", [by_what_is_left, by_whole_part, by_threshold])

@@ -20,7 +20,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 Evaluator = Callable[[Any], Array]  # of an array of numbers, some of which may be formulas, for one system
 
-# between which numbers are with which callbacks are traced: all of one size, so that what cancels does so for any others
+# between which numbers callbacks are traced with are: all of one size, so that what cancels does so for any others
 GENERIC = 0.5, 1.5
 EXTREME = 1e-30  # what is smaller, or larger than its inverse, stays what it is: its powers would leave the range
 
