@@ -179,13 +179,15 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "| the best of our methods in hindsight" + count(None, 1),
         "At errors of 1e-3 to 1e-6 on the 2 mechanisms without singular positions, the default is "
         + count(("auto, compiled", "auto"), None),
-        "The default makes code for mechanisms whose equations take few operations, 1 of 2 here; in figures these",
-        "is 15 to 48 times slower than the cheapest of them at errors of 1e-2, 1e-4 and 1e-6 (",
+        "for mechanisms with compiled callbacks whose equations take few operations, 1 of 2 here;",
+        "is 15 to 48 times slower than the cheapest of them, without code for the mechanism, at errors of 1e-2, 1e-4 "
+        "and 1e-6 (",
         "off by over 1000 tolerances (1e-5 at 1e-8), or never ends. A tolerance bounds the local errors of steps, not",
         "Silently wrong runs under 17 kinds of sharp everyday forces, with parameters not used during development (",
         "in brackets: off by over 1e-3): ",
-        "the default method without code 1 of 61 (1); with code 1 of 62 (1); our other methods 1 of 63 (1); "
-        "heyoka 1 of 66 (1); IDA and CVODE 1 of 64 (0). Other traps: ",
+        "`auto` with `compiled=False` 1 of 61 (1); with `compiled=True` (by the mechanism the default is one of these) "
+        "1 of 62 (1); our other methods 1 of 63 (1); "
+        "heyoka 1 of 66 (1); IDA and CVODE 1 of 64 (0). Our steps look",
         " 1 of 144 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-12, misleads the "
         "default (gust of 3 ms: off by 0.060 at 1e-6)",
     ]

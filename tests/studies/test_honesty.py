@@ -181,7 +181,7 @@ def test_trust_is_counted_over_mistakes_and_forces():
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
     wrong = dict.fromkeys(KINDS, 0) | {"compiled": 1, "ours": 1, "scipy": 1, "others": 1}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
-    assert "| the default method with code | 0 | 0 | 0 | 2 | 0 | 1 |" in text
+    assert "| `auto` with `compiled=True` | 0 | 0 | 0 | 2 | 0 | 1 |" in text
     for who in ("SciPy's LSODA, DOP853, Radau and BDF", "other projects' solvers without max_step"):
         assert f"| {who} | 0 | 0 | 0 | 2 | 0 | 1 |" in text
     assert "| other projects' solvers with max_step | 0 | 0 | 0 | 2 | 0 | 0 |" in text and "| heyoka |" not in text
@@ -196,7 +196,7 @@ def test_an_error_is_large_or_small_and_a_run_without_an_end_is_large():
     found, text = told_of_forces(rows)
     got = {who: (found["trust"][who]["gross"], found["trust"][who]["slight"]) for who in ("default", "scipy")}
     assert got == {"default": (1, 1), "scipy": (1, 0)}
-    assert "| the default method without code | 0 | 0 | 0 | 2 | 1 | 1 |" in text and "off by 1e-5 to 1e-3 |" in text
+    assert "| `auto` with `compiled=False` | 0 | 0 | 0 | 2 | 1 | 1 |" in text and "off by 1e-5 to 1e-3 |" in text
 
 
 def test_every_solver_is_of_one_kind():
@@ -218,7 +218,7 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (
         "- Of ours 1 run is silently wrong or hangs: a." in text and "None of ours is silently wrong, and" not in text
     )
-    assert "so that the force was never evaluated: 1 of the default method without code, 1 of SciPy's" in text
+    assert "so that the force was never evaluated: 1 of `auto` with `compiled=False`, 1 of SciPy's" in text
 
 
 @pytest.mark.parametrize(
@@ -240,8 +240,8 @@ def test_a_refusal_is_no_run(message):
     found, text = told_of_forces(rows)
     assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
     assert (
-        "| the default method with code | 0 | 0 | 0 | 1 | 0 | 0 |" in text
-        and "1 of the default method with code." in text
+        "| `auto` with `compiled=True` | 0 | 0 | 0 | 1 | 0 | 0 |" in text
+        and "1 of `auto` with `compiled=True`." in text
     )
 
 

@@ -182,7 +182,10 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     text = front(tmp_path, [case()], honesty=honesty)
     assert "off by over 1000 tolerances (1e-5 at 1e-8), or never ends." in text
     assert "under 15 kinds of sharp everyday forces, with parameters not used during development (in brackets" in text
-    assert "the default method without code 1 of 30 (1); with code 4 of 30 (1); our other methods 6 of 30 (1); " in text
+    assert (
+        "`auto` with `compiled=False` 1 of 30 (1); with `compiled=True` (by the mechanism the default is one of" in text
+    )
+    assert " these) 4 of 30 (1); our other methods 6 of 30 (1); " in text
     assert "heyoka 3 of 30 (1); IDA and CVODE 2 of 30 (1); SciPy's LSODA and BDF 5 of 30 (1). " in text
     assert "andom mechanisms under sharp forces" not in text
     trust["default"] |= {"wrong": 3, "unasked": 2}
