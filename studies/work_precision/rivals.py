@@ -142,10 +142,7 @@ def standing(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     """The cheapest of ours and of others at one error on one mechanism, and how default and best of ours stand."""
     both = tables.of_both(tables.ranking(rows, error))
-    found: dict[str, Any] = {
-        "error": error,
-        "standing": standing(rows, error),
-    }
+    found: dict[str, Any] = {"error": error, "standing": standing(rows, error)}
     for which, best in both.items():
         found[which] = (
             None if best is None else {key: best[key] for key in ("solver", "call_s", "n_evaluations", "keeps")}

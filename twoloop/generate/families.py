@@ -2,6 +2,7 @@
 
 Parameters that are whole numbers stay what they are, as these may be counts, places or switches, and zeros and ones
 leave operations out; what is equal, but for its sign, stays equal. So systems of one family differ in other numbers.
+A callback that branches on its parameters, or rounds them, has no formulas: it is traced for each system alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,8 +21,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 Evaluator = Callable[[Any], Array]  # of an array of numbers, some of which may be formulas, for one system
 
-# between which numbers callbacks are traced with are: all of one size, so that what cancels does so for any others
-GENERIC = 0.5, 1.5
+GENERIC = 0.5, 1.5  # range of the numbers with which callbacks are traced: of one size, so that none hides another
 EXTREME = 1e-30  # what is smaller, or larger than its inverse, stays what it is: its powers would leave the range
 
 _FAMILIES = Newest()
@@ -117,7 +117,7 @@ def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callab
 
 
 def family_of(system: ConstrainedSystem) -> Family:
-    """The family of a system of compiled callbacks: what others find around them may change."""
+    """The family of a system of compiled callbacks, which depend on their arguments alone."""
     parameters = system.parameters
     classes = _classes(parameters.tolist())
     fixed = [x for x, which in zip(parameters.tolist(), classes, strict=True) if which == 0]
