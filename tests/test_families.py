@@ -113,6 +113,12 @@ def by_iteration(t, q, v, p, Q):
 
 
 @callback("force")
+def by_root(t, q, v, p, Q):
+    """Of what is negative for p[1] > 1, as the number may be with which it is traced."""
+    Q[0], Q[1] = -math.sqrt(1.0 - p[1] * p[1]) * q[0], -p[0] * 9.81
+
+
+@callback("force")
 def by_knock(t, q, v, p, Q):
     """A blow late in the run, above a threshold."""
     Q[0], Q[1] = 0.0, -p[0] * 9.81
@@ -166,7 +172,7 @@ def test_what_ran_before_has_no_part_in_it(first):
     assert np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-11
 
 
-@pytest.mark.parametrize("force", [by_loop, by_quadrature, by_iteration, by_arrays, by_knock])
+@pytest.mark.parametrize("force", [by_loop, by_quadrature, by_iteration, by_arrays, by_root, by_knock])
 @pytest.mark.parametrize("parameter", [0.995, 0.7, 1.0 - 2.0**-30])
 @pytest.mark.parametrize("whole", [2.0, 1.3])
 def test_callbacks_that_make_no_formulas_run_all_the_same(force, parameter, whole):

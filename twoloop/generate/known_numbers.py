@@ -266,7 +266,9 @@ def applied(name: str, *arguments: Any) -> Any:
 def _function(name: str, *numbers: float) -> Known:
     record = _record(*numbers)
     made = tuple((each.powers, each.scale) if isinstance(each, Known) else ((), each) for each in numbers)
-    return Known(float(FUNCTIONS[name](*map(float, numbers))), record, 1.0, record.atom((name, made)))
+    with np.errstate(all="ignore"):  # a generic number may be where the function has no value
+        value = float(FUNCTIONS[name](*map(float, numbers)))
+    return Known(value, record, 1.0, record.atom((name, made)))
 
 
 _WITH_SYMBOLS: dict[str, Callable[[Any, Any], Any]] = {
