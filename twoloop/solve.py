@@ -2,9 +2,9 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,21 +20,17 @@ from twoloop.checks.arguments import (
     check_vector,
     shown,
 )
-from twoloop.checks.consistency import check_start
-from twoloop.generate.derived import standing_for
-from twoloop.generate.exact_derivatives import exact_near
-from twoloop.generate.traced_values import Traced
+from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.layout import give_back
-from twoloop.methods.code_for import Compiled, check_compiled, code_for
+from twoloop.methods.code_for import Compiled, check_compiled
 from twoloop.methods.plan import Method
-from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import PRESETS
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.interrupts import Interrupts, not_begun
+from twoloop.run.launch import Asked, run_from
 from twoloop.run.recorder import Wanted
-from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
@@ -181,32 +177,15 @@ def solve_dae(
         )
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     with Interrupts() as interrupts:
-        system.remembered_at(
-            ("start", check_derivatives),
-            t0,
-            (q0, v0),
-            lambda: check_start(
-                system, t0, q0, v0, derivatives=check_derivatives, exact=lambda: exact_near(system, t0, q0, v0)
-            ),
+        asked = Asked(
+            *(chosen, float(rtol), atol, t1, step_size, first_step, float(max_step), max_steps),
+            *(compiled, check_derivatives),
         )
-
-        def check(traced: Traced) -> None:
-            traced.refuse(system, t0, t1, q0, v0)
-
-        given = system
-        system, derived = standing_for(given, check)
-        fixed = step_size is not None
-        code = code_for(system, chosen, fixed, compiled, t0, q0, check)
-        plan, interiors = plans_for(system, chosen, float(rtol), float(atol.min()), fixed, code, check)
-        if derived:
-            plan = replace(plan, traced=(*plan.traced, *derived))
-        run = Run(system, plan, t0, q0, v0, float(rtol), atol, step_size, interiors)
-        if step_size is None:
-            run.set_sizes(first_step, float(max_step), t1)
-        if max_steps is not None:
-            run.control[run.a.MAX_STEPS] = max_steps
+        run = run_from(system, t0, q0, v0, asked)
+        if run.said_of_rows:
+            warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
         with _progress_bar(progress, chosen.name, t0, t1) as report:
-            lands = plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
+            lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
             record = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
         give_back(run.work)
@@ -214,7 +193,7 @@ def solve_dae(
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
-        own = {"system": given, "method": chosen.name, "rtol": float(rtol), "atol": atol, "untested": untested}
+        own = {"system": system, "method": chosen.name, "rtol": float(rtol), "atol": atol, "untested": untested}
         return Result(**vars(record) | own)
     return Result(**vars(not_begun(system, t0, event_functions, chosen.name)))
 

@@ -44,7 +44,7 @@ class LaneRuns:
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", choice, tuple(varying))  # of which the latest is kept
         make = partial(OwnLanes, system, choice, generic, varying)
-        self.own: OwnLanes = system.remembered_at(kind, 0.0, (generic,), make)
+        self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
 
     def off(self) -> tuple[Array, Array]:
         """max|C| and max|C_q v + C_t| of the starts, over what rounding may leave of their terms."""

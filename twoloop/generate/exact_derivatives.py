@@ -81,11 +81,14 @@ class Territory:
         self._runs = 0
         self._least, self._largest = np.zeros(0), np.zeros(0)
 
-    def covers(self, states: Array) -> bool:
-        """Whether there is nothing new in a run through these states, rows; the 1st, 2nd, 4th, 8th, ... always is."""
+    def is_due(self) -> bool:
+        """Whether callbacks are to be compared wherever the next run goes: the 1st, 2nd, 4th, 8th, ..."""
         self._runs += 1
-        anew = self._runs & (self._runs - 1) == 0
-        return not anew and bool((states >= self._least).all() and (states <= self._largest).all())
+        return self._runs & (self._runs - 1) == 0
+
+    def covers(self, states: Array) -> bool:
+        """Whether there is nothing new in a run through these states, rows."""
+        return bool((states >= self._least).all() and (states <= self._largest).all())
 
     def add(self, states: Array) -> None:
         """Take in the states of a run in which nothing was wrong."""

@@ -219,7 +219,7 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
         If its equations cannot be had.
     """
     try:
-        choice = system.remembered_at("choice", t0, (q0,), lambda: Choice.at(system, t0, q0))
+        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: Choice.at(system, t0, q0))
 
         def make(family: Family) -> SharedCode:
             return SharedCode(StraightLine(system, choice, family.parameters), family)

@@ -55,10 +55,28 @@ def make_work(
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
     sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes)
+    given_back = _given_back(sizes)
+    return _new(sizes) if given_back is None else _cleared(given_back)
+
+
+def copy_of(work: Work) -> Work:
+    """A workspace with the same in it."""
+    sizes = _sizes(work)
+    other = _given_back(sizes) or _new(sizes)
+    other.notes.base[:] = work.notes.base
+    other.counters.base[:] = work.counters.base
+    return other
+
+
+def _given_back(sizes: Sizes) -> Work | None:
     free = _free.get(sizes)
     if free:
         with suppress(IndexError):  # another thread took it
-            return _cleared(free.pop())
+            return free.pop()
+    return None
+
+
+def _new(sizes: Sizes) -> Work:
     layout = _layout(*sizes)
     numbers, integers = np.zeros(layout.n_numbers), np.zeros(layout.n_integers, dtype=np.int64)
     arrays: dict[str, Any] = {name: numbers[a:b].reshape(shape) for name, a, b, shape in layout.numbers}

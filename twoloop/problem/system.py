@@ -308,14 +308,13 @@ class ConstrainedSystem:
             self.made[what] = make()
         return self.made[what]
 
-    def remembered_at(self, what: Any, t: float, state: Sequence[Array], make: Callable[[], Any]) -> Any:
+    def remembered_at(self, what: Any, state: Any, make: Callable[[], Any]) -> Any:
         """The same of the equations at a state, as long as no other state is asked for."""
         if self.called_in_python:
             return make()
-        key = (t, *(array.tobytes() for array in state))
         known = self.made.get(what)
-        if known is None or known[0] != key:
-            known = self.made[what] = key, make()
+        if known is None or known[0] != state:
+            known = self.made[what] = state, make()
         return known[1]
 
     def arrays_of(self, kind: str) -> list[Array]:

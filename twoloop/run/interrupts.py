@@ -7,6 +7,7 @@ which may take long and from which every caller expects exceptions; elsewhere it
 
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -21,6 +22,9 @@ from twoloop.run.record import Record, Statistics, Status, explained
 Array = NDArray[np.float64]
 
 CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
+# without the enumerations that `signal` makes of what they return, which take longer than the rest of a short run
+handler_of: Callable[[int], Any] = getattr(signal.getsignal, "__wrapped__", signal.getsignal)
+handle: Callable[[int, Any], Any] = getattr(signal.signal, "__wrapped__", signal.signal)
 IMPATIENCE = 3  # signals after which the next one raises at once, whatever is lost
 
 
@@ -39,15 +43,15 @@ class Interrupts:
 
     def __enter__(self) -> "Interrupts":
         if threading.current_thread() is threading.main_thread():  # no other may set handlers, and none gets signals
-            self._stands_in = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+            self._stands_in = handler_of(signal.SIGINT) is signal.default_int_handler
         if self._stands_in:
-            signal.signal(signal.SIGINT, self._heard)
+            handle(signal.SIGINT, self._heard)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:
         """Whether what was raised is Ctrl-C: then there is nothing to raise."""
         if self._stands_in:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            handle(signal.SIGINT, signal.default_int_handler)
         return kind is KeyboardInterrupt
 
     def _heard(self, number: int, frame: FrameType | None) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.methods.dop853 import DOP853
@@ -82,9 +80,7 @@ class Remaker:
         chosen, nodes = method
         self.spacing = float(np.diff(np.unique(np.concatenate([[0.0], nodes, [1.0]]))).max())
         plan = chosen.plan(system.n_q, rtol, float(atol.min()), False)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConstraintWarning)  # of redundant rows, which the run has named
-            self.run = Run(system, plan, t, q, v, rtol, atol, None)
+        self.run = Run(system, plan, t, q, v, rtol, atol, None)
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK

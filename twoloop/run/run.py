@@ -1,7 +1,6 @@
 """One run: its arrays, the chunks that the compiled `advance` returns, and what to say of how it ended."""
 
 import time
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
@@ -11,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import (
-    ConstraintWarning,
     dependent_rows,
     in_words,
     least_inertia,
@@ -20,6 +18,7 @@ from twoloop.checks.consistency import (
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common, intervals
+from twoloop.kernels.layout import copy_of
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compared
@@ -88,7 +87,7 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        self.pattern = system.remembered_at("pattern", t0, (q0,), lambda: pattern_of(system, t0, q0))
+        self.pattern = system.remembered_at("pattern", (t0, q0.tobytes()), lambda: pattern_of(system, t0, q0))
         self.work = self._workspace()
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.ATOL + system.n_q)
@@ -113,7 +112,22 @@ class Run:
         self.clock[advance.ROUGH_TO] = -np.inf
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
+        self.compared_to = [-np.inf]  # how far callbacks were compared along the motion, in this run or the same before
         self._begin()
+        self.rank = len(self.work.rows_v)
+        self.redundant, self.said_of_rows = self._redundant_rows()
+
+    def again(self) -> "Run":
+        """The same run from its start, of which this one may not have taken a step."""
+        other = object.__new__(Run)
+        vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
+        for name in ("state", "new_state", "tolerances", "control", "clock"):
+            setattr(other, name, getattr(self, name).copy())
+        if self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
+            other.kit = kit_with(self.system, self.kit.flags, other.plan)
+            other.functions = other.kit.functions
+        other.work = copy_of(self.work)
+        return other
 
     def _control_by(self, plan: Plan) -> None:
         """Step-size control as a plan wants it."""
@@ -134,20 +148,20 @@ class Run:
         return work
 
     def _begin(self) -> None:
-        code = self.a.start(self.kit, self.work, self.t0, self.state)
+        start = direct(self.a.start)
+        code = start(self.kit, self.work, self.t0, self.state)
         if code == common.RANK_DIFFERS:
             ranks = [int(self.work.notes[place]) for place in (common.RANK, common.RANK_V)]
             self.work = self._workspace(*ranks)
-            code = self.a.start(self.kit, self.work, self.t0, self.state)
+            code = start(self.kit, self.work, self.t0, self.state)
         if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
             required = self.work.notes[common.GAMMA_REQUIRED]
             self.work.notes[common.GAMMA_REQUIRED] = np.inf
-            code = self.a.start(self.kit, self.work, self.t0, self.state)
+            code = start(self.kit, self.work, self.t0, self.state)
             self.work.notes[common.GAMMA_REQUIRED] = required
-        n = self.system.n_q
         if code == common.DONE:
-            self._warn_of_redundant_rows()
             return
+        n = self.system.n_q
         if code == common.MASS_NOT_DEFINITE:
             raise ValueError(
                 f"mass of {self.system.name!r} must be positive definite on the velocities that the constraints allow; "
@@ -163,29 +177,26 @@ class Run:
             f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {said_of_not_finite(self)}"
         )
 
-    def _warn_of_redundant_rows(self) -> None:
-        n_rows = self.system.n_c + self.system.n_a
-        self.rank = len(self.work.rows_v)
-        self.redundant = np.zeros(0, dtype=np.int64)
-        if self.rank < n_rows:
-            self.redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
-            n = self.system.n_q
-            rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
-            off = np.abs(rows @ a - self.work.Gamma)
-            allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
-            wrong = np.flatnonzero(off > allowed).tolist()
-            if wrong:
-                raise ValueError(
-                    f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
-                    f"{in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
-                )
-            warnings.warn(
-                f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
-                f"{in_words(rows, self.redundant.tolist())}. They are left out of the solution and checked at every "
-                "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows",
-                ConstraintWarning,
-                stacklevel=4,
+    def _redundant_rows(self) -> tuple[NDArray[np.int64], str]:
+        """Which rows depend on others at the start, and what is said of them."""
+        n_rows, n = self.system.n_c + self.system.n_a, self.system.n_q
+        if self.rank == n_rows:
+            return np.zeros(0, dtype=np.int64), ""
+        redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
+        rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+        off = np.abs(rows @ a - self.work.Gamma)
+        allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
+        wrong = np.flatnonzero(off > allowed).tolist()
+        if wrong:
+            raise ValueError(
+                f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
+                f"{in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
+        return redundant, (
+            f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
+            f"{in_words(rows, redundant.tolist())}. They are left out of the solution and checked at every "
+            "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
+        )
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""

@@ -28,7 +28,7 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     from twoloop.kernels.evaluation.calls import inner_loop
 
     given = ("flags", system.functions.flags.tobytes())
-    flags = system.remembered_at(given, t0, (q0,), lambda: _flags(system, t0, q0))
+    flags = system.remembered_at(given, (t0, q0.tobytes()), lambda: _flags(system, t0, q0))
     if plan is None:
         return common.Kit(system.functions._replace(flags=flags.copy()), inner_loop)
     return kit_with(system, flags, plan)

@@ -1,0 +1,84 @@
+"""The run of a call, made ready to go: checked, with its plan; kept for the next call from the same start."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import check_start
+from twoloop.generate.derived import standing_for
+from twoloop.generate.exact_derivatives import exact_near
+from twoloop.generate.traced_values import Traced
+from twoloop.methods.code_for import Compiled, code_for
+from twoloop.methods.plan import Method
+from twoloop.methods.plans_for import plans_for
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.run import Run
+
+Array = NDArray[np.float64]
+
+
+class Asked(NamedTuple):
+    """What a call asks of a run, beside what it is to keep; `solve_dae` says what the names mean."""
+
+    method: Method
+    rtol: float
+    atol: Array
+    t1: float
+    step_size: float | None
+    first_step: float | None
+    max_step: float
+    max_steps: int | None
+    compiled: Compiled
+    check_derivatives: bool
+
+
+def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
+    """The run from a start: of a call like the last two all is known already.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the start is refused, the method cannot run the system, or asked-for code cannot be had.
+    """
+    if system.called_in_python:  # what such functions find in their surroundings may change
+        return _made(system, t0, q0, v0, asked)
+    method, rtol, atol, *others = asked
+    call = (id(method), rtol, atol.tobytes(), *others, t0, q0.tobytes(), v0.tobytes())
+    known = system.made.get("run")
+    if known is not None and known[0] == call and known[1] is method:
+        if known[2] is None:  # not after one call: others may be from other starts
+            known = system.made["run"] = (call, method, _made(system, t0, q0, v0, asked))
+        run: Run = known[2].again()
+        return run
+    run = _made(system, t0, q0, v0, asked)
+    if all(traced.trusted for traced in run.traced):
+        system.made["run"] = (call, method, None)
+    return run
+
+
+def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
+    start, fixed = (t0, q0.tobytes(), v0.tobytes()), asked.step_size is not None
+    system.remembered_at(
+        ("start", asked.check_derivatives),
+        start,
+        lambda: check_start(
+            system, t0, q0, v0, derivatives=asked.check_derivatives, exact=lambda: exact_near(system, t0, q0, v0)
+        ),
+    )
+
+    def check(traced: Traced) -> None:
+        traced.refuse(system, t0, asked.t1, q0, v0)
+
+    system, derived = standing_for(system, check)
+    code = code_for(system, asked.method, fixed, asked.compiled, t0, q0, check)
+    plan, interiors = plans_for(system, asked.method, asked.rtol, float(asked.atol.min()), fixed, code, check)
+    if derived:
+        plan = replace(plan, traced=(*plan.traced, *derived))
+    run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
+    if not fixed:
+        run.set_sizes(asked.first_step, asked.max_step, asked.t1)
+    if asked.max_steps is not None:
+        run.control[run.a.MAX_STEPS] = asked.max_steps
+    return run
