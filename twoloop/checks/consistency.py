@@ -186,15 +186,11 @@ def redundant_rows(scaled: Array) -> list[int]:
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients."""
     others = [i for i in range(len(jacobian)) if i not in redundant]
+    first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
     equations = []
-    for i in redundant[:5]:
-        factors = np.linalg.lstsq(jacobian[others].T, jacobian[i], rcond=None)[0] if others else np.zeros(0)
-        share = np.abs(factors) * np.linalg.norm(jacobian[others], axis=1) if others else np.zeros(0)
-        terms = [
-            f"{factor:.4g} row {k}"
-            for k, factor, part in zip(others, factors, share, strict=True)
-            if part > 1e-9 * np.linalg.norm(jacobian[i])
-        ]
+    for i, factors in zip(first, np.linalg.lstsq(jacobian[others].T, jacobian[first].T, rcond=None)[0].T, strict=True):
+        parts = np.abs(factors) * lengths[others]
+        terms = [f"{factors[k]:.4g} row {others[k]}" for k in np.flatnonzero(parts > 1e-9 * lengths[i])]
         equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
     more = ", ..." if len(redundant) > 5 else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"

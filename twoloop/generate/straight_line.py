@@ -12,6 +12,7 @@ is not to be used. The same factors give the nearest position and velocity on th
 M is singular, rows g of G are added, M + g^T g, which changes neither. Of redundant rows those that count are kept.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -420,13 +421,17 @@ def _independent(G: Array) -> list[int]:
         if (rest_of > 2.0 * RANK * np.linalg.norm(G, axis=1)).all():
             return list(range(len(G)))
     kept: list[int] = []
-    basis = np.zeros((0, G.shape[1]))
+    basis, squares = np.zeros((min(G.shape), G.shape[1])), (G * G).sum(axis=1).tolist()
     for k, row in enumerate(G):
-        rest = row - (basis @ row) @ basis
-        rest -= (basis @ rest) @ basis
-        if np.linalg.norm(rest) > RANK * np.linalg.norm(row):
+        if len(kept) == len(basis):
+            break
+        before = basis[: len(kept)]
+        rest = row - (before @ row) @ before
+        rest -= (before @ rest) @ before
+        square = float(rest @ rest)
+        if square > RANK**2 * squares[k]:
+            basis[len(kept)] = rest / math.sqrt(square)
             kept.append(k)
-            basis = np.vstack([basis, rest / np.linalg.norm(rest)])
     return kept
 
 
