@@ -18,6 +18,8 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
+MOST, LARGEST = 16, 30_000  # runs that are kept with a system, and numbers of each
+
 
 class Asked(NamedTuple):
     """What a call asks of a run, beside what it is to keep; `solve_dae` says what the names mean."""
@@ -35,7 +37,7 @@ class Asked(NamedTuple):
 
 
 def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
-    """The run from a start: of a call like the last two all is known already.
+    """The run from a start: all is known already of a call like one before, if none from elsewhere came between.
 
     Raises
     ------
@@ -45,16 +47,18 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
     if system.called_in_python:  # what such functions find in their surroundings may change
         return _made(system, t0, q0, v0, asked)
     method, rtol, atol, *others = asked
-    call = (id(method), rtol, atol.tobytes(), *others, t0, q0.tobytes(), v0.tobytes())
-    known = system.made.get("run")
-    if known is not None and known[0] == call and known[1] is method:
-        if known[2] is None:  # not after one call: others may be from other starts
-            known = system.made["run"] = (call, method, _made(system, t0, q0, v0, asked))
-        run: Run = known[2].again()
-        return run
+    start, call = (t0, q0.tobytes(), v0.tobytes()), (id(method), rtol, atol.tobytes(), *others)
+    came_from, kept = system.made.get("runs", (start, {}))
+    if came_from == start and call in kept:
+        again: Run = kept[call][0].again()
+        return again
     run = _made(system, t0, q0, v0, asked)
-    if all(traced.trusted for traced in run.traced):
-        system.made["run"] = (call, method, None)
+    if came_from != start:  # it may be one of many starts, each of which is taken once
+        kept = {}
+    elif all(traced.trusted for traced in run.traced) and run.work.notes.base.size <= LARGEST:
+        kept = {} if len(kept) == MOST else dict(kept)  # another thread may look at the old one
+        kept[call] = run.again(), method  # whose id is not another's as long as it is held
+    system.made["runs"] = start, kept
     return run
 
 
