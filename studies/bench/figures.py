@@ -17,7 +17,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GIVEN, HEYOKA, IRK, IRK_LINE
 from studies.bench.store import Output
 from studies.bench.tables import DECADE, astray, setting_of, time_for, used
 
@@ -115,7 +115,8 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Exudyn, GeneralizedAlpha 1": (BLACK, "8"),
     "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
 }
-SAME = {  # a tableau looks like the preset that is made of it
+SAME = {  # the default looks like the method that it is, a tableau like the preset that is made of it
+    GIVEN: DEFAULT,
     "Sun Radau IIB(3)": "SunRadau5",
     "Gauss(3)": "Gauss6",
     "Gauss(3), symmetric partition": "Gauss6",
@@ -130,7 +131,7 @@ MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
 def looks() -> dict[str, tuple[str, str]]:
     """Colour and marker of all solvers that are known: of those without an entry above, the next that are free."""
     free = [pair for pair in _pairs() if pair not in STYLES.values()]
-    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES), free, strict=False))
+    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES | SAME), free, strict=False))
 
 
 def _pairs() -> list[tuple[str, str]]:
