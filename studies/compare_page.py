@@ -28,7 +28,7 @@ MEASURES = {
 COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 OPENS = "four-bar, 10 s (work_precision)"
-ALWAYS = ("auto", "auto, compiled")  # shown at first beside the best
+ALWAYS = ("the default", "auto", "auto, compiled")  # shown at first beside the best
 POINTS = {  # marker of the figures: shape and rotation (degrees) of the nearest one of the plotting library
     **{"o": ("circle", 0), "s": ("rect", 0), "D": ("rectRot", 0), "p": ("rectRounded", 0), "d": ("rectRounded", 45)},
     **{"^": ("triangle", 0), ">": ("triangle", 90), "v": ("triangle", 180), "<": ("triangle", 270)},

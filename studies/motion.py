@@ -20,8 +20,8 @@ from studies.bench.render import number
 from studies.bench.solvers import (
     CANONICAL,
     CATALOGUE,
-    DEFAULT,
     GEAR_ORDERS,
+    GIVEN,
     IDA_C,
     IRK,
     LINE_UP,
@@ -44,7 +44,7 @@ GRIDS = {"short": np.linspace(0.0, SHORT, 201), "last": np.linspace(-LAST, 0.0, 
 EXUDYN = "Exudyn, GeneralizedAlpha"
 SMALLEST = 1e-11  # m, of the reference
 LISTED = (
-    *(IRK, NEWMARK, DEFAULT, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "DOP853, projected"),
+    *(IRK, NEWMARK, GIVEN, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "DOP853, projected"),
     *("LSODA, index 1", EXUDYN),
 )
 

@@ -14,7 +14,7 @@ from studies.bench.cases import four_bar
 from studies.bench.cases.four_bar import Y3
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, Solver
-from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.bench.solvers import CATALOGUE, GIVEN, IRK, NEWMARK, PRESETS, QUARTER
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting
@@ -37,7 +37,7 @@ def runs(quick: bool) -> list[Run]:
     """The paper's procedures at its settings; the other adaptive solvers at its Atol = Rtol."""
     case = replace(four_bar.cases(quick)[0], timed=0.0)  # times are not compared here
     made = [Run(case, CATALOGUE[name], ERR_OUT, "paper", 1) for name in (IRK, NEWMARK, QUARTER)]
-    made += [Run(case, CATALOGUE[name], TOL, "two-loop", 1) for name in PRESETS]
+    made += [Run(case, CATALOGUE[name], TOL, "two-loop", 1) for name in (GIVEN, *PRESETS)]
     # the catalogue's IDA stores its states at common instants only, and not its steps
     ida = Solver("IDA, stabilised", "SUNDIALS", "Python", True, "tol", _ida, own_accelerations=True)
     others = [*([] if quick else [ida]), *(CATALOGUE[name] for name in OTHERS)]

@@ -11,7 +11,6 @@ from studies.bench import figures, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run
-from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import CHECKED, violations
 from studies.bench.render import number
 from studies.bench.solvers import (
@@ -19,7 +18,7 @@ from studies.bench.solvers import (
     CATALOGUE,
     CVODE_C,
     CVODE_C_PROJECTED,
-    DEFAULT,
+    GIVEN,
     HEYOKA,
     IDA_C,
     IRK,
@@ -48,12 +47,12 @@ PAIRS = (  # kept, not kept
     (CVODE_C_PROJECTED, "CVODE from C, BDF"),
     ("IDA, stabilised", "IDA, index1"),
 )
-OWN = (DEFAULT, OWN_CODE, "SunRadau5", "Gauss12", OWN_EXPLICIT)
+OWN = (GIVEN, "SunRadau5", "Gauss12", OWN_EXPLICIT)
 ALONG = (*(name for pair in PAIRS for name in pair), "LSODA, index 1", IDA_C, HEYOKA, CVODE_C, *OWN)
 MORE = dict.fromkeys((HEYOKA, CVODE_C, CVODE_C_PROJECTED), 1e-8)  # tolerances, in the line-up of this study
 STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
-QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *(name for name in OWN if name != OWN_CODE))  # which compiles
-DRAWN = (*PAIRS[0], *PAIRS[1], HEYOKA, CVODE_C, IDA_C, DEFAULT, OWN_CODE)  # cost over error
+QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *OWN)
+DRAWN = (*PAIRS[0], *PAIRS[1], HEYOKA, CVODE_C, IDA_C, GIVEN)  # cost over error
 EXUDYN = ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2")
 OVER_TIME = ("DOP853, index 1", "IDA, index1", "IDA, stabilised", CVODE_C, HEYOKA, gear(2), *EXUDYN)
 LISTED = tuple(dict.fromkeys((*OVER_TIME, CVODE_C_PROJECTED, IDA_C, "DOP853, projected", gear(5))))

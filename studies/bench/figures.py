@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, HEYOKA, IRK, IRK_LINE
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GIVEN, HEYOKA, IRK, IRK_LINE
 from studies.bench.store import Output
 from studies.bench.tables import DECADE, astray, setting_of, time_for, used
 
@@ -55,22 +56,23 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
 VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default, and of Taylor and others
 
-STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
+# solver: colour, marker; those that a work-precision figure mostly draws together have markers of their own
+STYLES: dict[str, tuple[str, str]] = {
     "DOP853 (twoloop)": (RED, "o"),
-    "Adams": (BLACK, "o"),
+    "Adams": (BLACK, "d"),
     "auto": (VIOLET, "s"),
     "Taylor": (MAGENTA, "D"),
-    "auto, compiled": (VIOLET, "*"),
-    "Taylor, compiled": (MAGENTA, "*"),
-    "Adams, compiled": (BLACK, "*"),
-    "DOP853, compiled": (RED, "*"),
+    "auto, compiled": (VIOLET, "P"),
+    "Taylor, compiled": (MAGENTA, "X"),
+    "Adams, compiled": (BLACK, "^"),
+    "DOP853, compiled": (RED, "v"),
     "TRBDF2": (SKY, "v"),
     "ESDIRK4": (GREY, "v"),
-    "Gauss12": (BLUE, "s"),
+    "Gauss12": (BLUE, "D"),
     "Gauss6": (BROWN, "D"),
     "SunRadau5": (PINK, "v"),
     "RadauIIA5": (ORANGE, "^"),
-    "RadauIIA9": (BROWN, "^"),
+    "RadauIIA9": (BROWN, "o"),
     "RadauIIA13": (MAGENTA, "^"),
     "RadauIIA5, by differences": (GREY, "^"),
     "Gauss6, Newton": (BROWN, "X"),
@@ -81,26 +83,26 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "PaperNewmark (beta = 1/2)": (GREY, "X"),
     "PaperNewmark, beta = 1/4": (BLACK, "X"),
     "Gauss6, momenta, symmetric": (BLACK, "D"),
-    "Gauss16": (BLUE, "D"),
+    "Gauss16": (BLUE, "h"),
     "heyoka": (GREEN, "*"),
     "CVODE from C, Adams": (SKY, ">"),
-    "CVODE from C, BDF": (ORANGE, ">"),
-    "CVODE from C, BDF, projected": (PINK, ">"),
+    "CVODE from C, BDF": (ORANGE, "v"),
+    "CVODE from C, BDF, projected": (PINK, "^"),
     "CVODE, Adams": (ORANGE, "<"),
-    "Dopri8, diffrax": (PINK, "X"),
+    "Dopri8, diffrax": (PINK, "8"),
     "Pr9, index 1": (ORANGE, "p"),
     "IDAS, CasADi": (RED, "d"),
     "CVODES, CasADi": (BLUE, "d"),
     "CVODES, CasADi, Adams": (GREEN, "d"),
     "collocation, CasADi": (GREY, "d"),
-    "IDA from C, stabilised": (BLACK, ">"),
-    "IDA from C, q and v tested": (BLACK, "<"),
-    "IDA from C, order 2, positions tested": (BLUE, ">"),
+    "IDA from C, stabilised": (BLACK, "<"),
+    "IDA from C, q and v tested": (BLACK, "v"),
+    "IDA from C, order 2, positions tested": (BLUE, "X"),
     "IDA, stabilised": (GREY, "<"),
-    "IDA, index1": (BROWN, "<"),
+    "IDA, index1": (BROWN, "v"),
     "LSODA, index 1": (BROWN, "p"),
-    "DOP853, index 1": (PINK, "*"),
-    "DOP853, projected": (ORANGE, "*"),
+    "DOP853, index 1": (PINK, "p"),
+    "DOP853, projected": (ORANGE, "P"),
     "DOP853, Baumgarte 10": (GREEN, "s"),
     "GSTIFF stand-in, order 1": (VIOLET, "1"),
     "GSTIFF stand-in, order 2": (MAGENTA, "2"),
@@ -113,9 +115,10 @@ STYLES: dict[str, tuple[str, str]] = {  # solver: colour, marker
     "Exudyn, GeneralizedAlpha": (RED, "8"),
     "Exudyn, GeneralizedAlpha 0.6": (ORANGE, "8"),
     "Exudyn, GeneralizedAlpha 1": (BLACK, "8"),
-    "Exudyn, TrapezoidalIndex2": (BLUE, "8"),
+    "Exudyn, TrapezoidalIndex2": (BLUE, "^"),
 }
-SAME = {  # a tableau looks like the preset that is made of it
+SAME = {  # the default looks like the method that it is, a tableau like the preset that is made of it
+    GIVEN: DEFAULT,
     "Sun Radau IIB(3)": "SunRadau5",
     "Gauss(3)": "Gauss6",
     "Gauss(3), symmetric partition": "Gauss6",
@@ -130,7 +133,7 @@ MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
 def looks() -> dict[str, tuple[str, str]]:
     """Colour and marker of all solvers that are known: of those without an entry above, the next that are free."""
     free = [pair for pair in _pairs() if pair not in STYLES.values()]
-    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES), free, strict=False))
+    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES | SAME), free, strict=False))
 
 
 def _pairs() -> list[tuple[str, str]]:
@@ -168,8 +171,23 @@ def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None) -> No
     figure.legend(entries.values(), entries.keys(), loc="outside right upper", title=title)
 
 
+def label_decades(figure: Figure) -> None:
+    """Label logarithmic axes at decades alone, of which at least two are brought into view."""
+    for axes in figure.axes:
+        if axes.get_label() == "<colorbar>":  # which ends where its colours do
+            continue
+        for axis in (axis for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
+            low, high = np.log10(axis.get_view_interval())
+            while np.floor(high) - np.ceil(low) < 1.0:  # on to the nearest one beyond an end
+                below, above = np.ceil(low) - 1.0, np.floor(high) + 1.0
+                low, high = (below, high) if low - below <= above - high else (low, above)
+                axes.set(**{f"{axis.axis_name}lim": (10.0**low, 10.0**high)})
+            axis.set_minor_formatter(NullFormatter())
+
+
 def save(figure: Figure, output: Output, name: str) -> None:
     """Write NAME.png and NAME.svg, a quick one marked as such, and close the figure."""
+    label_decades(figure)
     if output.call.quick:
         figure.text(0.005, 0.005, "quick run: shorter and coarser than the report", fontsize=7, color=RED, va="top")
     for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):

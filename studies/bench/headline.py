@@ -11,10 +11,10 @@ from typing import Any
 import pandas as pd
 
 from studies.bench import tables
-from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
+from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, HEYOKA
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
-GIVEN, BEST = "the default", "best of ours"
+BEST = "best of ours"
 WHOSE = (GIVEN, OWN_CODE, DEFAULT, BEST)
 STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
 PRICED = (1e-4, 1e-6)  # errors of the price on the first screen

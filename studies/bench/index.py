@@ -94,6 +94,7 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     line["undecided"] = bool(standing) and standing[BEST]["verdict"] == "undecided"
     for which in (which for which in WHOSE if at[which]):
         line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
+        line[which]["setting"] = at[which].get("setting")
     rival = standing.get(BEST, {}).get("rival") or {}
     cheaper = bool(rival.get("solver")) and (
         line["others"] is None or tables.LEAST * rival["call_s"] < line["others"]["call_s"]
@@ -114,6 +115,7 @@ def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
         if runs:
             best = min(runs, key=lambda run: float(run["call_s"]))
             line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": not best["calm"]}
+            line[which]["setting"] = best.get("setting")
     costs = sorted(line[which]["call_s"] for which in WHOSE if line[which])
     return line | {"undecided": len(costs) > 1 and costs[0] > (1.0 - equal) * costs[1]}
 

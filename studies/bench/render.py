@@ -7,6 +7,8 @@ from typing import Any
 
 import jinja2
 
+from studies.bench.solvers import GIVEN
+
 TEMPLATES = Path(__file__).parents[1] / "templates"
 
 
@@ -48,6 +50,11 @@ def brief(stamp: str) -> str:
     return "; ".join(stamp.split("; ")[:4])
 
 
+def code(name: str) -> str:
+    """A name as code, but that of the default, which is words."""
+    return name if name == GIVEN else f"`{name}`"
+
+
 def percent(share: float) -> str:
     """A share as a percentage of two significant digits."""
     return f"{number(100.0 * share)} %"
@@ -80,7 +87,7 @@ def environment() -> jinja2.Environment:
         keep_trailing_newline=True,
         autoescape=False,  # markdown, from our own data
     )
-    made.filters |= {"code": "`{}`".format, "num": number, "power": power, "pct": percent, "listed": listed}
+    made.filters |= {"code": code, "num": number, "power": power, "pct": percent, "listed": listed}
     made.filters["brief"] = brief
     made.globals["table"] = table
     return made

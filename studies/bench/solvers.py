@@ -27,6 +27,7 @@ from references.sundials.ida_c import solve_ida_c
 from studies.bench.collector import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.auto import LOOSE, TIGHTEST
+from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
@@ -45,12 +46,13 @@ IDA_C_STATES = "IDA from C, q and v tested"
 CANONICAL = "Gauss6, momenta, symmetric"
 ADAMS, TAYLOR = "Adams", "Taylor"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (twoloop)", "BDF"  # presets; the other lines of the first name are SciPy's
-DEFAULT = "auto"  # of solve_dae
+DEFAULT = "auto"  # of solve_dae, without code made for the mechanism
+GIVEN = "the default"  # of solve_dae as it is called with no options: it makes code for small mechanisms
 # with code made for the mechanism, and the method of each
 COMPILED = {f"{method}, compiled": method for method in (DEFAULT, TAYLOR, ADAMS, "DOP853")}
 RADAU = ("RadauIIA5", "RadauIIA9", "RadauIIA13")
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", *RADAU, "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
-PRESETS = (DEFAULT, *IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
+PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
 # of ours, beside the rivals
 OWN = (
     *(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT),
@@ -88,7 +90,7 @@ COMPARED = (
 )
 
 
-def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: bool = False) -> Result:
+def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: Compiled = False) -> Result:
     limit = case.time_limit
     return solve_dae(*case.start, method, tolerance, tolerance, time_limit=limit, compiled=compiled)
 
@@ -238,7 +240,9 @@ def _all() -> Iterator[Solver]:
     yield _solver(IRK_LINE, "two-loop", "compiled", "tol", _paper_irk)
     yield paper_newmark_at(ERR_IN)
     yield paper_newmark_at(ERR_IN, 0.25)
-    for preset in dict.fromkeys((*PRESETS, *OWN)):
+    run = partial(_preset, DEFAULT, compiled="auto")
+    yield _solver(GIVEN, "two-loop", "compiled", "tol", run, used=_chosen, builds_each=True)
+    for preset in dict.fromkeys((DEFAULT, *PRESETS, *OWN)):
         run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
         if preset == TAYLOR or preset in COMPILED:
             run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
@@ -299,7 +303,7 @@ LINE_UP: dict[str, float] = {
     IRK: 1e-9,
     NEWMARK: 1e-9,
     QUARTER: 1e-9,
-    **dict.fromkeys(PRESETS, 1e-8),
+    **dict.fromkeys((GIVEN, *PRESETS), 1e-8),
     "Newmark": 1e-6,  # of order 2: ten times the steps at 1e-8
     CANONICAL: 0.01,
     **{f"IDA, {form}": 1e-8 for form in IDA_FORMS},

@@ -256,7 +256,7 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     -------
     DataFrame
         solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on the
-        log-log line between two runs), and violation_q, violation_v, energy of the cheapest run near it.
+        log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
     lines = []
     for solver, runs in _with_columns(rows, ("solver", *RANKED, *LOOKED_AT)).groupby("solver", sort=False):
@@ -269,15 +269,16 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         run = runs.loc[good["call_s"].astype(float).idxmin()]
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
         line |= {what: float(_cost(told[what].to_numpy(float), place)) for what in COSTS}
-        lines.append(line | {key: run[key] for key in ("violation_q", "violation_v", "energy")})
-    return pd.DataFrame(lines, columns=["solver", *RANKED]).sort_values("call_s", ignore_index=True)
+        line |= {key: run[key] for key in ("violation_q", "violation_v", "energy")}
+        lines.append(line | {"setting": setting(run)})
+    return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
     """The first line of a ranking as a finding; None where there is none."""
     if ranked.empty:
         return None
-    keys = ("solver", "call_s", "n_evaluations", "called_from", "violation_q", "energy")
+    keys = ("solver", "call_s", "n_evaluations", "called_from", "violation_q", "energy", "setting")
     found = {key: ranked.iloc[0][key] for key in keys}
     kept, family = ranked.iloc[0][["keeps_constraints", "family"]]
     return found | {"keeps": bool(kept), "ours": bool(family == "two-loop")}

@@ -67,7 +67,8 @@ def told(row: pd.Series) -> dict[str, Any]:
     """A run as a finding."""
     found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
     found |= {name: row[name] for name in ("verdict", "status")}
-    found["label"] = f"{row['name']}, {setting(row)}"
+    found["setting"] = setting(row)
+    found["label"] = f"{row['name']}, {found['setting']}"
     found |= {"kinetic": float(row["kinetic"]), "fixed_steps": bool(pd.notna(row["h"]))}
     found["explicit"] = row.get("used") == "explicit" or row["solver"] == OWN_EXPLICIT
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}

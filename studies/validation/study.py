@@ -21,8 +21,8 @@ from studies.bench.solvers import (
     CVODE_C,
     CVODE_C_PROJECTED,
     CVODES,
-    DEFAULT,
     EXUDYN,
+    GIVEN,
     HEYOKA,
     IDA_C,
     OWN_BDF,
@@ -59,7 +59,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
     mechanisms.governor,
 )
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
-OWN = (DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
+OWN = (GIVEN, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
     *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES),
     *("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1", "BDF, index 1"),
@@ -79,7 +79,7 @@ MODELLED_LIMIT = 30.0  # s of CPU of such a run
 TIGHT = 1e-10  # at which digits are compared
 COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a problem
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
-AIMED = (DEFAULT, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
+AIMED = (GIVEN, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 FEWEST = 3  # errors above the reference's own from which a slope is taken
 # their adapters tell states at given instants, between steps by interpolants: not where a step ends
 UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
@@ -290,7 +290,7 @@ def of_condition(name: str, own: pd.DataFrame) -> dict[str, Any]:
     line = {"case": name, "t_end": float(best["t_end"]), "best": None, "error": None, "tol": None}
     if pd.notna(best["condition"]):
         line |= {"error": float(best["condition"]), "best": best["solver"], "tol": float(best["tol"])}
-    by_default = passed[passed["solver"] == DEFAULT]["tol"].tolist()
+    by_default = passed[passed["solver"] == GIVEN]["tol"].tolist()
     return line | {"default": by_default, "passed": passed["solver"].drop_duplicates().tolist()}
 
 

@@ -72,7 +72,7 @@ def findings(**rows):
     q, v, _ = pendulum_state(0.0)
     case = Case("swing", Problem("swing", pendulum(), q, v, (0.0, 1.0), lambda t, q, v: 0.0), 1.0)
     common = {"keeps_constraints": True, "called_from": "compiled", "floor": 1e-10, "status": "REACHED_END"}
-    common |= {"violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "n_evaluations": 1.0}
+    common |= {"violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "n_evaluations": 1.0, "tol": 1e-6}
     lines = [
         {"solver": name, "family": family, "error_q": error, "call_s": cpu, "call_q1": cpu, "call_q3": cpu, **common}
         for name, (family, error, cpu) in rows.items()

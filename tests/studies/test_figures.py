@@ -10,7 +10,23 @@ from matplotlib.colors import to_hex
 
 from studies import motion, step_size, violation
 from studies.bench import figures
-from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, IRK_LINE, NEWMARK, gear
+from studies.bench.figures import FIRST
+from studies.bench.solvers import (
+    CATALOGUE,
+    CVODE_C,
+    DEFAULT,
+    GEAR_ORDERS,
+    GIVEN,
+    HEYOKA,
+    IDA_C,
+    IDA_C_ORDER_2,
+    IDA_C_STATES,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    OWN_EXPLICIT,
+    gear,
+)
 from studies.energy import study as energy
 from studies.honesty import study as honesty
 from studies.motion import GRIDS
@@ -24,6 +40,7 @@ NEW = (  # of rivals that no table of styles knows, as a study may bring them
 FAMILY = {"heyoka": "heyoka", "CVODE from C, Adams": "SUNDIALS", "CVODE, Adams": "SUNDIALS", "LSODA, index 1": "SciPy"}
 FAMILY |= {"IDA from C, stabilised": "SUNDIALS", "DOP853, index 1": "SciPy", "Dopri8, diffrax": "diffrax"}
 ERRORS = (1e-2, 1e-3, 1e-4)
+OFTEN = (*FIRST[:2], HEYOKA, CVODE_C)  # of the lines of a work-precision figure
 
 
 @pytest.fixture(autouse=True)
@@ -63,18 +80,32 @@ def drawn(axes):
 def test_no_two_solvers_look_alike():
     names = dict.fromkeys((*figures.STYLES, *CATALOGUE, *NEW))
     names.pop(IRK_LINE)  # the paper's procedure along another setting
+    names.pop(GIVEN)  # in its runs the default is auto
     alike = [pairs for pairs in itertools.combinations(names, 2) if pair(pairs[0]) == pair(pairs[1])]
-    assert alike == [] and pair(IRK) == pair(IRK_LINE)
+    assert alike == [] and pair(IRK) == pair(IRK_LINE) and pair(GIVEN) == pair(DEFAULT)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        energy.DRAWN,
+        table3.DRAWN,
+        violation.DRAWN,
+        violation.OVER_TIME,
+        (*OFTEN, IRK_LINE, "Taylor", OWN_EXPLICIT, IDA_C, "DOP853, index 1"),  # the four-bars
+        (*OFTEN, "Taylor, compiled", "DOP853, compiled", OWN_EXPLICIT, IDA_C, "LSODA, index 1"),
+        (*OFTEN, IRK, "Adams", OWN_EXPLICIT, "Gauss12", IDA_C_STATES, "DOP853, index 1"),  # the beams
+        (*OFTEN, "TRBDF2", "RadauIIA5", "RadauIIA9", IDA_C, IDA_C_ORDER_2, "DOP853, index 1", "Radau, index 1"),
+    ],
+)
+def test_solvers_of_a_figure_are_told_apart_without_colours(names):
+    assert len({pair(name)[1] for name in names}) == len(names)
 
 
 @pytest.mark.parametrize(
     "names",
     [
         (energy.SUN, energy.GAUSS, energy.RADAU, energy.NEWMARK),
-        energy.DRAWN,
-        table3.DRAWN,
-        violation.DRAWN,
-        violation.OVER_TIME,
         motion.LISTED[:7],
         step_size.PAPER,
     ],
@@ -145,6 +176,20 @@ def test_the_lines_of_a_figure_have_these_gaps():
         (line,) = (each for each in axes.lines if to_hex(each.get_color()).upper() == figures.VIOLET)
         x = np.asarray(line.get_xdata(), dtype=float)
         assert np.isnan(x).tolist() == [False, True, True, False] or np.isnan(x).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("ends", "seen"), [((0.013, 0.86), (0.1, 1.0)), ((3.0, 5e4), (10.0, 1e4)), ((3.0, 4.0), (1.0, 10.0))]
+)
+def test_logarithmic_axes_are_labelled_at_decades_of_which_two_are_in_view(ends, seen):
+    figure, axes = plt.subplots()
+    axes.set(xscale="log", yscale="log", ylim=ends)
+    figures.label_decades(figure)
+    figure.canvas.draw()
+    low, high = axes.get_ylim()
+    decades = [place for place in axes.yaxis.get_majorticklocs() if low <= place <= high]
+    assert (decades[0], decades[-1]) == pytest.approx(seen) and low <= ends[0] and high >= ends[1]
+    assert not any(label.get_text() for label in axes.yaxis.get_minorticklabels())
 
 
 def test_errors_grow_to_the_right_in_all_figures():

@@ -324,6 +324,8 @@ def test_each_of_default_compiled_default_and_best_stands_in_the_table_by_its_ve
         "`ours` 0.10 ≈",
         "`theirs`‡ (Python) 0.20",
     ]
+    at["ours"] = BEST | {"setting": "tol 1e-6"}
+    assert "| `ours` 0.10 ≈ (tol 1e-6) | `theirs`‡ (Python) 0.20 |" in screen(tmp_path, [case(at=[at])])
 
 
 def test_the_counts_of_the_headline_stand_first_on_both_screens(tmp_path):

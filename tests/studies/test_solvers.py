@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import trajectory
+from studies import motion, step_size, violation
 from studies.bench.collector import Case
+from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import violations
-from studies.bench.solvers import CATALOGUE, EXUDYN, IRK, LINE_UP, TOLERANCES, baumgarte, gear
+from studies.bench.solvers import CATALOGUE, DEFAULT, EXUDYN, GIVEN, IRK, LINE_UP, TOLERANCES, baumgarte, gear
+from studies.validation import study as validation
+from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
 T_END = 0.2
@@ -55,6 +59,20 @@ def test_a_solver_carries_what_its_rows_need():
 def test_all_tolerances_are_the_same_down_to_1e_13():
     grids = {solver.values for solver in CATALOGUE.values() if solver.setting == "tol"}
     assert grids == {TOLERANCES} and min(TOLERANCES) == 1e-13
+
+
+def test_the_default_is_what_a_call_without_options_takes():
+    case = Case("four-bar", four_bar(), T_END)
+    result, without_code = (CATALOGUE[name].run(case, 1e-8, 0) for name in (GIVEN, DEFAULT))
+    plain = solve_dae(*case.start, rtol=1e-8, atol=1e-8)
+    assert np.array_equal(result.q, plain.q) and not np.array_equal(result.q, without_code.q)
+
+
+@pytest.mark.parametrize("study", [motion, step_size, violation, validation])
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_studies_of_one_line_a_method_run_the_default(study, quick):
+    names = {run.solver.name for run in study.runs(quick)}
+    assert GIVEN in names and not names & {DEFAULT, OWN_CODE}
 
 
 def test_names_and_flags_agree():

@@ -70,8 +70,9 @@ def test_nothing_is_claimed_below_what_the_reference_resolves():
 
 
 def test_a_ranking_turns_with_the_rows():
-    made = rows(("a", 1e-4, 1.0), ("b", 1e-4, 2.0), ("c", 1e-2, 0.1))
-    assert tables.ranking(made, 1e-3)["solver"].tolist() == ["a", "b"]
+    made = rows(("a", 1e-4, 1.0), ("b", 1e-4, 2.0), ("c", 1e-2, 0.1)).assign(tol=[1e-6, 1e-7, 1e-6])
+    ranked = tables.ranking(made, 1e-3)
+    assert ranked["solver"].tolist() == ["a", "b"] and ranked["setting"].tolist() == ["tol 1e-6", "tol 1e-7"]
     made.loc[0, ["call_s", "call_q1", "call_q3"]] = 3.0
     assert tables.ranking(made, 1e-3)["solver"].tolist() == ["b", "a"]
     assert tables.ranking(made, 1e-9).empty
