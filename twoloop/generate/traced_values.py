@@ -167,23 +167,22 @@ class Traced:
 class Sample:
     """Some states [t, q, v] of a run, from its start to where it has come to."""
 
-    def __init__(self, t0: float, state: Array):
-        self.n = len(state)
-        self.states = [np.concatenate([[t0], state])[None, :]]
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._parts: list[tuple[Array, Array]] = []
 
     def add(self, t: Array, rows: Array) -> None:
-        """Take some of the states [q, v, ...] of a part of the run."""
+        """Take some of the states, rows that begin with [q, v] of n numbers, of a part of the run."""
         stride = 1 + len(t) // EACH
-        states = np.empty((-(-len(t) // stride), 1 + self.n))
-        states[:, 0], states[:, 1:] = t[::stride], rows[::stride, : self.n]
-        self.states.append(states)
-        if len(self.states) > MOST:
-            self.states = self.states[::2]
+        self._parts.append((t[::stride].copy(), rows[::stride, : self._n].copy()))
+        if len(self._parts) > MOST:
+            self._parts = self._parts[::2]
 
     def up_to(self, end: float) -> Array:
         """All of them, the last first."""
-        states = np.concatenate(self.states)[::-1]
-        return states if states[0, 0] <= end else states[states[:, 0] <= end]
+        times, rows = (np.concatenate(each)[::-1] for each in zip(*self._parts, strict=True))
+        states = np.column_stack([times, rows])
+        return states if times[0] <= end else states[times <= end]
 
 
 Check = Callable[[Traced], None]

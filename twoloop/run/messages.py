@@ -28,9 +28,9 @@ _REASONS = {
 
 def _said_of_events(run: "Run") -> str:
     """What a run that succeeded has to say of jumps and of singular positions."""
-    said = ""
     if not run.jumps and not run.crossings:
-        return said
+        return ""
+    said = ""
     if run.jumps:
         said = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse."
     now = (float(run.clock[run.a.T]), run.state)

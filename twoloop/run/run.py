@@ -252,7 +252,8 @@ class Run:
         filled = np.zeros(2, dtype=np.int64)
         advance, pace, looks = direct(a.advance), Pace(self.t0), Looks(self.plan)
         cpu = 0.0
-        sample = Sample(self.t0, self.state[: 2 * system.n_q])
+        sample = Sample(2 * system.n_q)
+        sample.add(self.clock[a.T : a.T + 1], self.state[None, :])
         code = INTERRUPTED if interrupts.asked else a.PAUSED
         out_t, out_state, out_steps = buffers = self._buffers()
         plan, control, kit = self.plan, self.control, self.kit
