@@ -5,7 +5,9 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
+from scipy.integrate import DOP853
 
+from twoloop.methods import dop853_tableau
 from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 FAMILIES = {"gauss": gauss, "radau_iia": radau_iia, "sun_radau_iib": sun_radau_iib, "lobatto_iiie": lobatto_iiie}
@@ -207,3 +209,9 @@ def test_sun_damps_nothing_and_radau_iia_everything_stiff(s):
         assert abs(stability(sun_radau_iib(s), 1j * y) - stability(gauss(s), 1j * y)) < 1e-12  # the same function
     assert abs(stability(radau_iia(s), -1e8)) < 1e-6
     assert np.abs(radau_iia(s).A[-1] - radau_iia(s).b).max() < 1e-15  # stiffly accurate
+
+
+@pytest.mark.parametrize("name", ["A", "B", "C", "E3", "E5"])
+def test_dop853_is_that_of_scipy(name):
+    known = getattr(DOP853, name)
+    assert np.array_equal(getattr(dop853_tableau, name), known[:12]) and not np.any(known[12:])

@@ -5,12 +5,15 @@ import os
 import platform
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from twoloop import ConstraintWarning
 
 ROOT = Path(__file__).parents[2]
 REPORTS = ROOT / "reports"
@@ -67,9 +70,14 @@ def parse(name: str, description: str | None, words: Sequence[str] | None) -> Ca
 
 
 def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | None = None) -> None:
-    """Run `work(words)`; a `StudyError` and Ctrl-C end the process with one line and a status that is not 0."""
+    """Run `work(words)`; a `StudyError` and Ctrl-C end the process with one line and a status that is not 0.
+
+    Redundant rows are named once, as in a loop of a user's, whatever solvers do to the filters of warnings between runs.
+    """
     try:
-        work(words)
+        with warnings.catch_warnings():
+            warnings.simplefilter("once", ConstraintWarning)
+            work(words)
     except StudyError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

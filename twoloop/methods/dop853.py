@@ -9,6 +9,7 @@ from twoloop.checks.arguments import check_choice
 from twoloop.generate.stage_code import compiled_stages
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
+from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_tolerances, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 
@@ -53,7 +54,7 @@ class DOP853:
     -----
     Tableau and error estimate, e5^2 / sqrt(e5^2 + 0.01 e3^2) of embedded estimates of orders 5 and 3: Hairer, Norsett
     and Wanner, Solving ODEs I (1993), II.5 and II.10; e5 and e3 are largest components here, not root mean squares.
-    The numbers are those of `scipy.integrate.DOP853`. The stability limits are those of the method's polynomial R(z):
+    The numbers are those of SciPy's `DOP853`. The stability limits are those of the method's polynomial R(z):
     |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
     """
 
@@ -76,20 +77,17 @@ class DOP853:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
-        import scipy.integrate
-
         from twoloop.kernels.steps import explicit_step as kernels
 
-        source = scipy.integrate.DOP853
-        s, free = len(source.B), self.stages == "free"
+        s, free = len(tableau.B), self.stages == "free"
         plan = Plan(
             kernels.EXPLICIT,
             kernels.options_array(
-                source.A,
-                source.B,
-                source.C,
-                source.E5[:s],  # the last weight, of the slope at the end, is 0 in both
-                COARSE_SHARE * source.E3[:s],
+                tableau.A,
+                tableau.B,
+                tableau.C,
+                tableau.E5,
+                COARSE_SHARE * tableau.E3,
                 INNER_TOL if self.inner_tol is None else self.inner_tol,
                 free,
                 LARGEST_MOVE,

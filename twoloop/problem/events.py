@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from twoloop.checks.arguments import shown
 
@@ -156,6 +155,8 @@ class EventSearch:
 
 def _root(event: Event, states: States, ends: tuple[float, float], values: tuple[float, float]) -> float:
     """When an event is zero between two times at which its values are known, to rounding."""
+    from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
+
     known = dict(zip(ends, values, strict=True))
     for t, value in known.items():
         if value == 0.0:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly
 
 from twoloop.checks.arguments import check_positive
 from twoloop.checks.optional import needed
@@ -103,6 +102,8 @@ def _positions(result: Record, times: Array) -> Array:
     """Coordinates (n_q, n) at the times of the frames."""
     if result.sol is not None:
         return np.asarray(result.sol(times).q)
+    from scipy.interpolate import BPoly  # takes a tenth of a second to import, and few results need it
+
     states = np.stack([result.q.T, result.v.T, result.a.T], axis=1)
     return np.asarray(BPoly.from_derivatives(result.t, states)(times)).T
 

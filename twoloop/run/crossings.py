@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from twoloop.problem.system import ConstrainedSystem
 
@@ -42,6 +41,8 @@ def _least_ratio(system: ConstrainedSystem, before: Place, behind: Place, rank: 
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
         return singular_ratio(system, t0, first[:n], rank)
+    from scipy.interpolate import CubicHermiteSpline  # takes a tenth of a second to import, and few runs need it
+
     way = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
     return min(singular_ratio(system, float(t), way(t), rank) for t in np.linspace(t0, t1, SAMPLES))
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
+from twoloop.methods import dop853_tableau
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
@@ -31,9 +32,7 @@ def tighter(tolerance: ArrayLike) -> Array:
 
 def explicit() -> tuple[Method, Array]:
     """The method for motion that is not stiff, and its nodes."""
-    import scipy.integrate
-
-    return DOP853(), scipy.integrate.DOP853.C
+    return DOP853(), dop853_tableau.C
 
 
 def implicit(velocities: bool) -> tuple[Method, Array]:
