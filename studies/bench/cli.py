@@ -72,7 +72,7 @@ def parse(name: str, description: str | None, words: Sequence[str] | None) -> Ca
 def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | None = None) -> None:
     """Run `work(words)`; a `StudyError` and Ctrl-C end the process with one line and a status that is not 0.
 
-    Redundant rows are named once, as in a loop of a user's, whatever solvers do to the filters of warnings between runs.
+    Redundant rows are named once, as in a user's loop, whatever solvers do to the filters of warnings between runs.
     """
     try:
         with warnings.catch_warnings():
