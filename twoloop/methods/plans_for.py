@@ -6,7 +6,7 @@ from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check
 from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
 from twoloop.methods.plan import Method, Plan
-from twoloop.methods.presets import PRESETS
+from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
 
 MOST = 16  # that are kept with a system
@@ -37,8 +37,7 @@ def plans_for(
     if made is None:
         ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         made = _made(system, ready, rtol, atol, fixed, code)
-        preset = any(each is method for each in PRESETS.values())  # others may go, and another have their id
-        if preset and _series(ready) == _series(method) and all(each.trusted for each in made[0].traced):
+        if is_preset(method) and _series(ready) == _series(method) and all(each.trusted for each in made[0].traced):
             if len(kept) == MOST:
                 del kept[next(iter(kept))]
             kept[key] = made

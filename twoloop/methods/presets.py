@@ -103,3 +103,8 @@ PRESETS: dict[str, Method] = {
     "PaperIRK": paper_irk(),
     "PaperNewmark": paper_newmark(),
 }
+
+
+def is_preset(method: Method) -> bool:
+    """Whether it is one of these objects: another may change between runs, or go, and a third one have its id."""
+    return any(each is method for each in PRESETS.values())

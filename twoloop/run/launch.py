@@ -13,6 +13,7 @@ from twoloop.generate.traced_values import Traced
 from twoloop.methods.code_for import Compiled, code_for
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
+from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 
@@ -50,14 +51,15 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
     start, call = (t0, q0.tobytes(), v0.tobytes()), (id(method), rtol, atol.tobytes(), *others)
     came_from, kept = system.made.get("runs", (start, {}))
     if came_from == start and call in kept:
-        again: Run = kept[call][0].again()
+        again: Run = kept[call].again()
         return again
     run = _made(system, t0, q0, v0, asked)
+    trusted = is_preset(method) and all(traced.trusted for traced in run.traced)
     if came_from != start:  # it may be one of many starts, each of which is taken once
         kept = {}
-    elif all(traced.trusted for traced in run.traced) and run.work.notes.base.size <= LARGEST:
+    elif trusted and run.work.notes.base.size <= LARGEST:
         kept = {} if len(kept) == MOST else dict(kept)  # another thread may look at the old one
-        kept[call] = run.again(), method  # whose id is not another's as long as it is held
+        kept[call] = run.again()
     system.made["runs"] = start, kept
     return run
 
