@@ -44,7 +44,7 @@ def test_they_are_those_of_the_dense_solution(default_four_bar, method):
 def test_the_chunks_of_a_run_do_not_show(default_four_bar, chunk, monkeypatch):
     usual = run(default_four_bar, 1.0, t_eval=TIMES)
     monkeypatch.setattr("twoloop.run.run.FIRST_CHUNK", chunk)
-    monkeypatch.setattr("twoloop.run.run.CHUNK_TIME", 0.0)  # chunks do not grow
+    monkeypatch.setattr("twoloop.run.course.CHUNK_TIME", 0.0)  # chunks do not grow
     other = run(default_four_bar, 1.0, t_eval=TIMES)
     assert (other.q == usual.q).all() and (other.lam == usual.lam).all()
 

@@ -28,6 +28,7 @@ from twoloop.methods.presets import PRESETS
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
+from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.launch import Asked, run_from
 from twoloop.run.recorder import Wanted
@@ -187,7 +188,7 @@ def solve_dae(
         with _progress_bar(progress, chosen.name, t0, t1) as report:
             lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
-            record = run.go(t1, wanted, report, time_limit, check_derivatives, interrupts)
+            record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
         give_back(run.work)
         untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)

@@ -15,6 +15,7 @@ from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.passage import leap
 from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
@@ -117,6 +118,6 @@ class Remaker:
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(clock[a.H_NEXT])
                 return Remade(found[0], found[-1], longest)
-            if code != a.PAUSED and not (code == a.AT_JUMP and run.leap(t1)):
+            if code != a.PAUSED and not (code == a.AT_JUMP and leap(run, t1)):
                 break
         return None

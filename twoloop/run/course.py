@@ -1,0 +1,278 @@
+"""The course of a run to its end: the chunks that the compiled `advance` returns, and the record made of them."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.traced_values import Sample
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common, intervals
+from twoloop.run.comparison import compared
+from twoloop.run.dense import Interpolator
+from twoloop.run.interrupts import Interrupts, said_of_interrupt
+from twoloop.run.messages import outcome
+from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
+from twoloop.run.passage import beyond, bridge, give_way, leap
+from twoloop.run.record import Record, Status, explained
+from twoloop.run.recorder import Recorder, Wanted
+from twoloop.run.run import Run
+from twoloop.run.stability import Looks, said_of_stiffness
+
+Array = NDArray[np.float64]
+Buffers = tuple[Array, Array, Array]  # for times, states and steps
+
+BUFFER_ROWS = 1024
+BUFFER_STEPS = 4096
+CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
+CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
+# ends of which it may be said that stability limited the steps
+EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+FIRST_PARTITION = np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])  # before all steps: it is not a renewal
+NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
+MOST_SPARE, LARGEST_SPARE = 16, 100_000  # buffers that wait for their next run, and numbers of each of them
+_spare: dict[tuple[int, int, int], Buffers] = {}  # buffers, by their sizes, for the next run
+
+
+class Course:
+    """A run on its way, with what is noted of it.
+
+    Parameters
+    ----------
+    run : Run
+    t1 : float
+        Where it ends, s.
+    wanted : Wanted
+    report : callable
+        Takes the time reached, after each chunk.
+    time_limit : float or None
+        s.
+    interrupts : Interrupts
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        t1: float,
+        wanted: Wanted,
+        report: Callable[[float], object],
+        time_limit: float | None,
+        interrupts: Interrupts,
+    ):
+        self.run, self.t1, self.wanted = run, t1, wanted
+        self.report, self.interrupts = report, interrupts
+        self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
+        self.recorder = self._recorder()
+        self.outputs = np.array([t1])
+        if wanted.times is not None and wanted.lands:
+            self.outputs = np.append(wanted.times[(wanted.times > run.t0) & (wanted.times < t1)], t1)
+        run.control[run.a.STORE_ALL] = wanted.every_step
+        self.largest_chunk = BUFFER_STEPS
+        if wanted.events is not None and any(event.terminal < np.inf for event in wanted.events):
+            self.largest_chunk = run.chunk = CHUNK_TO_EVENT
+        # the run is looked at after so many attempts, however long the chunks are that the clock allows
+        self.between_looks = self.next_look = run.chunk
+        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
+        self.step_parts = [FIRST_PARTITION]
+        self.filled = np.zeros(2, dtype=np.int64)
+        self.pace, self.looks, self.sample = Pace(run.t0), Looks(run.plan), Sample(2 * run.system.n_q)
+        self.cpu = 0.0
+        self.raised: Exception | None = None
+        self.code = INTERRUPTED if interrupts.asked else run.a.PAUSED
+
+    def to_end(self, check_derivatives: bool) -> Record:
+        """Go on chunk by chunk, look at derivatives once more at the end, and put together what the run returns."""
+        run, recorder = self.run, self.recorder
+        a, clock = run.a, run.clock
+        self.sample.add(clock[a.T : a.T + 1], run.state[None, :])
+        buffers, copied = self._buffers(), True
+        while self.code == a.PAUSED:
+            across, leaps = self.plan is not run.plan, clock[a.LEAPS] == 1.0
+            began = time.process_time()
+            self._advance(buffers)
+            n_rows, n_steps = self.filled.tolist()
+            t, rows, steps = (part[:n] for part, n in zip(buffers, (n_rows, n_rows, n_steps), strict=True))
+            copied = 2 * n_rows < len(buffers[0])  # then copies take less room
+            if copied:
+                t, rows, steps = t.copy(), rows.copy(), steps.copy()
+            self._take(t, rows, steps, self._kinds(steps, across, leaps))
+            spent = time.process_time() - began
+            self.cpu += spent
+            if recorder.ended is not None:
+                break
+            self._look(steps, across, spent)
+            if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
+                buffers = self._buffers()
+            self._go_on(across, n_steps)
+            self.report(clock[a.T])
+        if copied and buffers[1].size <= LARGEST_SPARE and len(_spare) < MOST_SPARE:
+            _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
+        if self.wanted.between_steps:
+            began = time.process_time()
+            recorder.finish()
+            self.cpu += time.process_time() - began
+        if self.raised is not None and recorder.ended is None:
+            raise self.raised
+        return self._record(check_derivatives)
+
+    def _advance(self, buffers: Buffers) -> None:
+        """One chunk, compiled."""
+        run, a = self.run, self.run.a
+        run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_look - run.attempts()))
+        self.filled[:] = 0  # for Ctrl-C before the chunk begins
+        try:
+            self.code = direct(a.advance)(
+                self.kit,
+                run.work,
+                self.plan.options,
+                self.plan.memory,
+                run.tolerances,
+                self.control,
+                run.clock,
+                run.state,
+                run.new_state,
+                self.outputs,
+                *buffers,
+                self.filled,
+            )
+        except KeyboardInterrupt:
+            self.code = INTERRUPTED
+        except Exception as error:  # of a callback; beyond a terminal event it does not matter
+            self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
+
+    def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
+        """Take over what a chunk has stored."""
+        run, a = self.run, self.run.a
+        self.sample.add(t, rows)
+        self.sample.add(run.clock[a.T : a.T + 1], run.state[None, :])
+        self.step_parts.append(steps)
+        self.recorder.add(t, rows, kinds)
+
+    def _look(self, steps: Array, across: bool, spent: float) -> None:
+        """See whether the run gets anywhere, and how long the next chunk may be."""
+        run, a = self.run, self.run.a
+        h = steps[:, a.H]
+        self.looks.pass_by(h)
+        self.pace.pass_by(h)
+        if self.code == a.PAUSED and run.attempts() >= self.next_look:
+            self.between_looks = min(2 * self.between_looks, self.largest_chunk)
+            self.next_look = run.attempts() + self.between_looks
+            if not across:
+                self.looks.take(float(run.clock[a.T]), run.state, run.system.n_q)
+            if self.pace.stagnates(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
+                self.code = STAGNATED
+        if spent < CHUNK_TIME:
+            run.chunk = min(2 * run.chunk, self.largest_chunk)
+        if self.code == a.PAUSED and time.monotonic() > self.deadline:
+            self.code = OUT_OF_TIME
+        if self.code == a.PAUSED and (self.interrupts.asked or self.recorder.interrupted):
+            self.code = INTERRUPTED
+
+    def _go_on(self, across: bool, n_steps: int) -> None:
+        """Choose what makes the next steps, where it is not what made the last ones."""
+        run, a = self.run, self.run.a
+        if self.code == a.HAS_TO_GIVE_WAY:
+            give_way(run)
+            self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
+        elif self.code == a.AT_JUMP and not across and leap(run, self.t1):
+            self.code = a.PAUSED
+        elif self.code == a.NEAR_SINGULAR:
+            self.plan, self.control = bridge(run)
+            self.kit = common.Kit(run.functions, run.kit.general, self.plan.step)
+            self.code = a.PAUSED
+        elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
+            self.plan, self.control, self.code = beyond(run, self.plan, self.control, self.code, n_steps)
+            if self.plan is run.plan:
+                self.kit = run.kit
+
+    def _record(self, check_derivatives: bool) -> Record:
+        run, recorder, code = self.run, self.recorder, self.code
+        a, n = run.a, run.system.n_q
+        t, table = recorder.output()
+        steps, statistics = np.concatenate(self.step_parts), run.statistics(self.cpu)
+        reached = float(run.clock[a.T])
+        if recorder.ended is not None:
+            event, end = recorder.ended
+            steps = steps[: recorder.n_steps + 1]
+            if recorder.n_steps > 0:
+                steps[-1, a.H] = recorder.last_step
+            status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
+        if recorder.broken_off is not None:
+            reached, steps = recorder.broken_off, steps[: recorder.n_steps + 1]
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
+        try:
+            if recorder.ended is None:
+                status, message = outcome(run, code, self.t1, self.pace)
+            if code != INTERRUPTED:
+                last = (float(run.clock[a.T]), run.state) if recorder.last is None else recorder.last
+                status, message = compared(run, t, table, last, self.sample, check_derivatives, status, message)
+            if status in EXPLAINED_BY_STIFFNESS:
+                message += said_of_stiffness(self.looks, run.kit, run.work)
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        if self.interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+            status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
+        counts = steps[:, a.ERRORS : a.JACOBIANS].T.astype(np.int64)
+        errors, failures, partitions = counts[:, 1:] - counts[:, :-1]
+        t_events, q_events, v_events = recorder.events()
+        return Record(
+            t=t,
+            q=table[:, :n].T,
+            v=table[:, n : 2 * n].T,
+            a=table[:, 2 * n : 3 * n].T,
+            lam=table[:, 3 * n :].T,
+            h=steps[1:, a.H],
+            status=status,
+            message=message + explained(status),
+            stats=statistics,
+            rank=run.rank,
+            redundant=run.redundant,
+            rejected_error=errors,
+            rejected_convergence=failures,
+            partitioned=partitions,
+            untested=steps[1:, a.JACOBIANS] > 0.0,
+            sol=recorder.solution(),
+            t_events=t_events,
+            q_events=q_events,
+            v_events=v_events,
+            defect=run.defect(),
+            widest_gap=float(run.work.notes[common.WIDEST_GAP]),
+            system=run.system,
+        )
+
+    def _buffers(self) -> Buffers:
+        """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
+        chunk, width = self.run.chunk, len(self.run.state)
+        n_rows, n_steps = min(chunk, BUFFER_ROWS), min(chunk, BUFFER_STEPS)
+        spare = _spare.pop((n_rows, n_rows * width, n_steps), None)
+        if spare is not None:
+            return spare
+        return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
+
+    def _recorder(self) -> Recorder:
+        """What takes the states; where some are to lie between steps, with what finds them."""
+        run, wanted = self.run, self.wanted
+        n, interpolator = run.system.n_q, None
+        if wanted.between_steps:
+            ranks = (len(run.work.rows), len(run.work.rows_v))
+            start, atol = run.state[: 3 * n], run.tolerances[common.ATOL :]
+            interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
+            interpolator = Interpolator(run.system, run.t0, start, run.rtol, atol, ranks, interiors)
+        return Recorder(wanted, interpolator, n, run.t0, run.state)
+
+    def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
+        """What kind of interval each of these accepted steps is, for the solution between them."""
+        run = self.run
+        if not self.wanted.between_steps:
+            return NO_KINDS
+        if leaps:
+            return np.full(len(steps), intervals.JUMP)
+        if across:
+            return np.full(len(steps), intervals.ACROSS)
+        if run.plan.apart:
+            return np.full(len(steps), intervals.APART)
+        explicit = intervals.ACROSS if run.substituted else intervals.ACCELERATIONS
+        return np.where(steps[:, run.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)

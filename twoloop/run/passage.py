@@ -1,0 +1,93 @@
+"""What goes on where a run's own steps cannot: another plan, steps across a singular position or over a jump."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
+from twoloop.methods.plan import Plan
+from twoloop.run.impulse import beyond_jump
+from twoloop.run.run import Run
+from twoloop.run.workspace import kit_with
+
+Array = NDArray[np.float64]
+
+# of the longest of the last steps: lengths tried for a step across a singular position, on which no stage should fall
+BRIDGES = tuple(0.85**k for k in range(28))
+CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
+
+
+def give_way(run: Run) -> None:
+    """Go on with the plan that takes over where values of this one are not finite."""
+    assert run.plan.substitute is not None
+    run.plan = run.plan.substitute.fresh()
+    run.kit = kit_with(run.system, run.functions.flags, run.plan)
+    run.functions = run.kit.functions
+    run.memory = run.plan.memory.copy()
+    run.substituted = True
+    run.control_by(run.plan)
+    run.limit_steps()
+    run.clock[run.a.FAILURE_CODE] = common.DONE
+    run.clock[run.a.H_NEXT] = run.clock[run.a.H_FAILED]
+    run.clock[: run.a.N_PAST] = 0.0
+
+
+def bridge(run: Run) -> tuple[Plan, Array]:
+    """The plan and the controls for steps across a singular position, see kernels/steps/bridge.py."""
+    from twoloop.kernels.steps import bridge
+    from twoloop.methods.dop853 import DOP853
+
+    a, clock = run.a, run.clock
+    run.crossings.append([(float(clock[a.T]), run.state.copy())])
+    plan = DOP853().plan(run.system.n_q, run.rtol, float(run.tolerances[common.ATOL :].min()), False)
+    control = run.control.copy()
+    control[: a.N_RULE] = replace(plan, least_error=0.0).rule
+    control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
+    control[a.GIVES_WAY] = 0.0
+    if control[a.FIXED_STEP] == 0.0:
+        control[a.MAX_STEP] = min(run.max_step, run.gap)
+    clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
+    run.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
+    clock[a.H_NEXT] = run.lengths.pop(0)
+    return replace(plan, step=bridge.BRIDGING), control
+
+
+def beyond(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
+    """What goes on after an attempt at a step across: the same, or the run's own steps again."""
+    a = run.a
+    if code == a.PAUSED and accepted == 0 and run.lengths:
+        run.clock[a.H_NEXT], run.clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
+        return plan, control, code
+    if code == a.PAUSED and accepted > 0 and (run.work.notes[common.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
+        run.lengths = [float(run.clock[a.H_LONG]) * part for part in BRIDGES]
+        return plan, control, code
+    if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
+        return plan, control, code
+    if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
+        run.control[a.BRIDGE] = 0.0
+    run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
+    run.plan.memory[:] = run.memory
+    run.clock[: a.N_PAST] = 0.0
+    return run.plan, run.control, a.PAUSED
+
+
+def leap(run: Run, t1: float) -> bool:
+    """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
+    a, clock, n = run.a, run.clock, run.system.n_q
+    end = float(clock[a.JUMP_TO])
+    beyond = beyond_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
+    if beyond is None:
+        return False
+    run.new_state[: 2 * n] = beyond
+    run.work.notes[common.KINK_BEFORE], run.work.notes[common.KINK_AFTER] = end, np.inf
+    if direct(a.start)(run.kit, run.work, end, run.new_state) != common.DONE:
+        return False
+    run.jumps.append(end)
+    run.plan.memory[:] = run.memory
+    clock[a.LEAPS] = 1.0
+    clock[a.H_LIMIT], clock[a.LIMIT_AGE] = run.plan.limit_start, 0.0
+    if end < t1:
+        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(t1 - end, run.new_state))
+    return True
