@@ -79,6 +79,7 @@ from twoloop.kernels.evaluation.partition import CHANGED, partition_is_poor
     HAS_TO_GIVE_WAY,
     AT_JUMP,  # of C_t or b; the caller is to put the state beyond it into new_state
 ) = range(10)
+GO_ON = -1  # nothing of these yet
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
@@ -172,6 +173,166 @@ def _kink(f, w, t, size, tolerances, accepted, state, new_state):
     return find_kink(f, w, t, t + size, q, v, w.y, tolerances)
 
 
+@merged
+def _on_grid(clock, t, h, target, goal):
+    """Size of a step of a fixed grid, how many of the grid it is, and whether it reaches the goal.
+
+    Times are counted, not added up; an output time within a millionth of a step of the grid is on it.
+    """
+    rounding = NEAR * np.spacing(max(abs(t), abs(target)))
+    near = max(1e-6 * h, rounding)
+    in_grid = 1.0
+    if target <= clock[T_START] + clock[N_FIXED] * h + near:
+        in_grid = 0.0  # a second output time beside the same point of the grid
+    end = clock[T_START] + (clock[N_FIXED] + in_grid) * h
+    reaches = goal <= end + near
+    size = h
+    if abs(t + h - end) > rounding:
+        size = end - t  # back to the grid after such an output time
+    if reaches and goal < target and abs(goal - end) > rounding:
+        in_grid = 0.0
+    return size, in_grid, reaches
+
+
+@merged
+def _off_grid(control, t, h, left, leaps):
+    """Size of a step with step-size control, and whether it reaches the goal, which is so far away."""
+    reaches = leaps or h >= left * (1.0 - 1e-10)
+    size = h
+    if h > 0.5 * left and not reaches:
+        size = 0.5 * left  # two equal steps rather than a long and a tiny one
+    size = representable(t, size)
+    if size > control[MAX_STEP]:
+        size = representable(t, size - np.spacing(abs(t + size)))
+    return size, reaches
+
+
+@merged
+def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state):
+    """A step: its code, its error and the factor by which the next may be longer."""
+    w.notes[ORIENTATION_NEW] = 0.0
+    if clock[FAILURE_CODE] == DONE:
+        w.notes[FAULT_KIND] = -1.0
+    if leaps:
+        w.notes[DEFECT] = 0.0
+        w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
+        return DONE, 0.0, 0.0
+    w.notes[DEFECT] = -1.0
+    code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
+    if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
+        code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
+        if code == CHANGED:
+            f.settle(f, w, options, memory, tolerances, False)
+            code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
+    if code == DONE and not np.isfinite(error):
+        code = NOT_FINITE
+    return code, error, factor
+
+
+@merged
+def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+    """Whether C_t or b jumps or bends within a step, which is then to end there."""
+    kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
+    if kind == JUMP:
+        clock[JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
+        clock[JUMP_TO] = high
+        w.notes[KINK_AFTER] = clock[JUMP_FROM]
+        return True
+    if kind == RAMP and accepted and control[FIXED_STEP] == 0.0:
+        clock[H_NEXT] = max(low - t, high - low)
+        return True
+    return False
+
+
+@merged
+def _failed(f, w, control, clock, t, size, code, retried, state):
+    """What becomes of a step that failed for such a reason: a shorter one, another partition, or the end.
+
+    A step of fixed size keeps it, and only a partition that went bad within it may be the reason; `retried` is where
+    that was tried.
+    """
+    n = w.Q.size
+    poor = code in (SINGULAR, INNER_DIVERGED)
+    w.counters[N_REJECTED_CONVERGENCE] += 1
+    clock[FAILURE_CODE] = code
+    clock[H_FAILED] = size
+    if code == NOT_FINITE and control[GIVES_WAY] == 1.0:
+        return HAS_TO_GIVE_WAY
+    if control[FIXED_STEP] > 0.0:
+        if not poor or t == retried:
+            return NEAR_SINGULAR if _near_singular(w, control, clock) else FIXED_STEP_FAILED
+    else:
+        if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
+            return NEAR_SINGULAR
+        clock[H_LIMIT] = control[LIMIT_FACTOR] * size
+        clock[LIMIT_AGE] = 0.0
+        clock[H_NEXT] = 0.5 * size
+    if poor and renew_partition(f, w, t, state[:n]) != DONE:
+        return RANK_LOST
+    return GO_ON
+
+
+@merged
+def _refused(w, control, clock, t, size, proposal):
+    """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
+    w.counters[N_REJECTED_ERROR] += 1
+    clock[FAILURE_CODE] = DONE
+    clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
+    if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
+        return NEAR_SINGULAR
+    return GO_ON
+
+
+@merged
+def _count(w, tolerances, size, out_step):
+    """Count an accepted step, and what it saw of the equations."""
+    w.counters[N_ACCEPTED] += 1
+    if w.notes[DEFECT] >= 0.0:
+        w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
+    else:
+        w.notes[UNCHECKED] += 1.0
+    gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
+    w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
+    w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
+    out_step[H] = size
+    out_step[ERRORS] = w.counters[N_REJECTED_ERROR]
+    out_step[FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
+    out_step[PARTITIONS] = w.counters[N_PARTITIONS]
+    out_step[JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
+
+
+@merged
+def _look_at_partition(f, w, control, clock, size, lands, state):
+    """Choose coordinates anew where they have become poor, and see how near a singular position is.
+
+    The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
+    """
+    n = w.Q.size
+    straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
+    every = 1
+    if f.flags[FORM] == AUGMENTED:
+        every += w.independent_v.size // FEW
+    if straight:
+        every = RARELY
+    looked = w.counters[N_ACCEPTED] % every == 0
+    if looked and (straight or f.flags[FORM] != NULL_SPACE):
+        find_tangents(f, w, clock[T], state[:n])
+    if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
+        return RANK_LOST
+    clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+    if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+        w.notes[NEARLY_SINGULAR] = 1.0
+    if size < COLLAPSED * clock[H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[BRIDGE] == 1.0:
+        # a motion may go straight towards a singular position, and its partition show nothing of it
+        if renew_partition(f, w, clock[T], state[:n]) != DONE:
+            return RANK_LOST
+        w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
+        if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+            w.notes[NEARLY_SINGULAR] = 1.0
+    short = size < SHORT * clock[H_LONG] and control[FIXED_STEP] == 0.0 and not lands
+    return NEAR_SINGULAR if short and _near_singular(w, control, clock) else GO_ON
+
+
 _ADVANCE = i8(
     KIT,
     WORK,
@@ -225,91 +386,37 @@ def advance(
         target = outputs[int(clock[NEXT_OUTPUT])]
         goal = min(target, clock[JUMP_TO] if leaps else clock[JUMP_FROM])
         h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
-        left = goal - t
-        size = h
         in_grid = 1.0  # steps of the grid that this one is
         if fixed:
-            # times are counted, not added up; an output time within a millionth of a step of the grid is on it
-            rounding = NEAR * np.spacing(max(abs(t), abs(target)))
-            near = max(1e-6 * h, rounding)
-            if target <= clock[T_START] + clock[N_FIXED] * h + near:
-                in_grid = 0.0  # a second output time beside the same point of the grid
-            end = clock[T_START] + (clock[N_FIXED] + in_grid) * h
-            reaches = goal <= end + near
-            if abs(t + h - end) > rounding:
-                size = end - t  # back to the grid after such an output time
-            if reaches and goal < target and abs(goal - end) > rounding:
-                in_grid = 0.0
-            shortened = reaches
+            size, in_grid, reaches = _on_grid(clock, t, h, target, goal)
         else:
-            reaches = leaps or h >= left * (1.0 - 1e-10)
-            shortened = reaches or h > 0.5 * left
-            if shortened and not reaches:
-                size = 0.5 * left  # two equal steps rather than a long and a tiny one
-            size = representable(t, size)
-            if size > control[MAX_STEP]:
-                size = representable(t, size - np.spacing(abs(t + size)))
+            size, reaches = _off_grid(control, t, h, goal - t, leaps)
+        shortened = reaches or (h > 0.5 * (goal - t) and not fixed)
         lands = reaches and goal == target
         if reaches:
-            size = left
+            size = goal - t
         elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
             return STEP_TOO_SMALL
-        w.notes[ORIENTATION_NEW] = 0.0
-        if clock[FAILURE_CODE] == DONE:
-            w.notes[FAULT_KIND] = -1.0
-        w.notes[DEFECT] = -1.0
-        if leaps:
-            code, error, factor = DONE, 0.0, 0.0
-            w.notes[DEFECT] = 0.0
-            w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
-        else:
-            code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
-        if code == DONE and np.isfinite(error) and not leaps and control[SYMMETRIC] == 1.0:
-            code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
-            if code == CHANGED:
-                f.settle(f, w, options, memory, tolerances, False)
-                code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
-        if code == DONE and not np.isfinite(error):
-            code = NOT_FINITE
+        code, error, factor = _attempt(
+            f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state
+        )
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
         strict = control[ROUGH] if t < clock[ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
-        if control[DRIVEN] == 1.0 and not leaps:
-            kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
-            if kind == JUMP or (kind == RAMP and accepted and not fixed):
-                f.settle(f, w, options, memory, tolerances, False)
-                w.counters[N_REJECTED_ERROR] += 1
-                clock[FAILURE_CODE] = DONE
-                if kind == JUMP:
-                    clock[JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
-                    clock[JUMP_TO] = high
-                    w.notes[KINK_AFTER] = clock[JUMP_FROM]
-                else:
-                    clock[H_NEXT] = max(low - t, high - low)
-                continue
+        driven = control[DRIVEN] == 1.0 and not leaps
+        if driven and _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+            f.settle(f, w, options, memory, tolerances, False)
+            w.counters[N_REJECTED_ERROR] += 1
+            clock[FAILURE_CODE] = DONE
+            continue
         if not leaps:
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
-            w.counters[N_REJECTED_CONVERGENCE] += 1
-            clock[FAILURE_CODE] = code
-            clock[H_FAILED] = size
-            if code == NOT_FINITE and control[GIVES_WAY] == 1.0:
-                return HAS_TO_GIVE_WAY
+            end = _failed(f, w, control, clock, t, size, code, retried, state)
+            if end != GO_ON:
+                return end
             if fixed:
-                # the step keeps its size; only a partition that went bad within it may be the reason
-                if code not in (SINGULAR, INNER_DIVERGED) or t == retried:
-                    return NEAR_SINGULAR if _near_singular(w, control, clock) else FIXED_STEP_FAILED
-                if renew_partition(f, w, t, state[:n]) != DONE:
-                    return RANK_LOST
                 retried = t
-                continue
-            if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
-                return NEAR_SINGULAR
-            clock[H_LIMIT] = control[LIMIT_FACTOR] * size
-            clock[LIMIT_AGE] = 0.0
-            clock[H_NEXT] = 0.5 * size
-            if code in (SINGULAR, INNER_DIVERGED) and renew_partition(f, w, t, state[:n]) != DONE:
-                return RANK_LOST
             continue
         if error > SUDDEN and not accepted:
             clock[ROUGH_TO] = t + size
@@ -320,23 +427,15 @@ def advance(
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
-            w.counters[N_REJECTED_ERROR] += 1
-            clock[FAILURE_CODE] = DONE
-            # shorter in any case, a tiny one by a spacing, to which it would else be rounded
-            clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
-            if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
-                return NEAR_SINGULAR
+            end = _refused(w, control, clock, t, size, proposal)
+            if end != GO_ON:
+                return end
             continue
         if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
             clock[H_FAILED] = size
             return ROWS_VIOLATED
-        w.counters[N_ACCEPTED] += 1
-        if w.notes[DEFECT] >= 0.0:
-            w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
-        else:
-            w.notes[UNCHECKED] += 1.0
-        gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
-        w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
+        _count(w, tolerances, size, out_steps[filled[1]])
+        filled[1] += 1
         clock[H_LONG] = max(size, FADING * clock[H_LONG])
         remember(control, clock, size, error)
         clock[N_FIXED] += in_grid
@@ -347,13 +446,6 @@ def advance(
         if leaps:
             clock[JUMP_FROM], clock[LEAPS] = np.inf, 0.0
         copy(new_state, state)
-        w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
-        out_steps[filled[1], H] = size
-        out_steps[filled[1], ERRORS] = w.counters[N_REJECTED_ERROR]
-        out_steps[filled[1], FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
-        out_steps[filled[1], PARTITIONS] = w.counters[N_PARTITIONS]
-        out_steps[filled[1], JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
-        filled[1] += 1
         if lands or control[STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[T]
             copy(state, out_state[filled[0]])
@@ -373,29 +465,7 @@ def advance(
             return HAS_TO_GIVE_WAY
         if leaps:
             return PAUSED
-        # the state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion
         if control[SYMMETRIC] == 0.0:
-            straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
-            every = 1
-            if f.flags[FORM] == AUGMENTED:
-                every += w.independent_v.size // FEW
-            if straight:
-                every = RARELY
-            looked = w.counters[N_ACCEPTED] % every == 0
-            if looked and (straight or f.flags[FORM] != NULL_SPACE):
-                find_tangents(f, w, clock[T], state[:n])
-            if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
-                return RANK_LOST
-            clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
-            if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
-                w.notes[NEARLY_SINGULAR] = 1.0
-            if size < COLLAPSED * clock[H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[BRIDGE] == 1.0:
-                # a motion may go straight towards a singular position, and its partition show nothing of it
-                if renew_partition(f, w, clock[T], state[:n]) != DONE:
-                    return RANK_LOST
-                w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
-                if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
-                    w.notes[NEARLY_SINGULAR] = 1.0
-            short = size < SHORT * clock[H_LONG] and not fixed and not lands
-            if short and _near_singular(w, control, clock):
-                return NEAR_SINGULAR
+            end = _look_at_partition(f, w, control, clock, size, lands, state)
+            if end != GO_ON:
+                return end
