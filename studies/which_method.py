@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from studies.bench import index
-from studies.bench.solvers import DEFAULT, GIVEN
 from studies.bench.takes import SUFFIX
 
 OURS = "two-loop"  # family of our solvers, in the findings of validation
@@ -29,8 +28,7 @@ def reliability(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     for line in found["validation"]["solvers"] if "validation" in found else ():
         if line["family"] == OURS:
             name = line["solver"].removesuffix(SUFFIX)
-            trapped = (DEFAULT if name == GIVEN else name) + SUFFIX  # honesty runs the default without code
-            traps = found["honesty"]["counts"].get(trapped) if "honesty" in found else None
+            traps = found["honesty"]["counts"].get(name + SUFFIX) if "honesty" in found else None
             silent = None if traps is None else traps["WRONG AND SILENT"] + traps["HANG"]
             kept = {key: line[key] for key in ("right", "wrong", "ratio")}
             entries.append({"method": name, "said": line["said so"], "silent": silent, **kept})

@@ -10,26 +10,27 @@ from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
+from studies.bench.solvers import GIVEN
 from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, Trap
 from twoloop import Result, solve_dae
 from twoloop.run.run import LONGEST_UNSEEN
 
-OWN = ("auto", "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
+OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
 COMPILED_ONLY = (IDA_C, CVODE_C, HEYOKA)
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
-    *("auto, compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14", "Gauss16", "SunRadau5"),
-    *("RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
+    *("auto, compiled", "auto, not compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14"),
+    *("Gauss16", "SunRadau5", "RadauIIA9", "RadauIIA13", "TRBDF2", "ESDIRK4", "Newmark"),
 )
 OURS = " (twoloop)"
-DEFAULT, DEFAULT_COMPILED = f"auto{OURS}", f"auto, compiled{OURS}"
-QUICK_OWN, QUICK_SCIPY = ("auto", "DOP853", "BDF"), ("DOP853",)
+DEFAULT = f"{GIVEN}{OURS}"
+WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, "not compiled": {"compiled": False}}
+QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
 LIMITED = ", max_step"  # of others that take no step longer than ours do by default
 
 # whose a solver is, in the words of the findings
-DEFAULTS = {DEFAULT: "default", DEFAULT_COMPILED: "compiled"}
-KINDS = ("default", "compiled", "ours", "heyoka", "sundials", "scipy", "limited")
+KINDS = ("default", "ours", "heyoka", "sundials", "scipy", "limited")
 
 Call = Callable[[Trap], Result]
 
@@ -37,7 +38,7 @@ Call = Callable[[Trap], Result]
 def kind_of(name: str) -> str:
     """Which of KINDS a solver is; others with a largest step are limited, whosever they are."""
     if name.endswith(OURS):
-        return DEFAULTS.get(name, "ours")
+        return "default" if name == DEFAULT else "ours"
     if name.endswith(LIMITED):
         return "limited"
     return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C) else "scipy"
@@ -47,8 +48,8 @@ def own(method: str, trap: Trap) -> Result:
     """One of ours, as a user calls it."""
     name, _, code = method.partition(", ")
     options: dict[str, Any] = {"rtol": trap.tolerance, "atol": trap.tolerance, "time_limit": trap.time_limit}
-    start = trap.system, (0.0, trap.t_end), trap.q0, trap.v0
-    return solve_dae(*start, method=name, compiled=bool(code), **options | dict(trap.steps))
+    options |= WITH_CODE[code] | ({} if name == GIVEN else {"method": name}) | dict(trap.steps)
+    return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **options)
 
 
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:

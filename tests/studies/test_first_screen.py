@@ -81,7 +81,7 @@ def of_table3(paper=(3.0, 9.0, 12.0), explicit=(0.2, 0.25, 0.25)):
 
 def of_honesty():
     """Findings of honesty as far as the screen needs them; the counts are made from outcomes."""
-    wrong = {"auto (twoloop)": 1, "auto, compiled (twoloop)": 2, "Taylor (twoloop)": 3, "IDA from C": 4}
+    wrong = {"the default (twoloop)": 1, "auto, compiled (twoloop)": 2, "Taylor (twoloop)": 3, "IDA from C": 4}
     wrong |= {"IDA from C, max_step": 5, "heyoka, Taylor": 6}
     lines = []
     for k, (solver, n) in enumerate(wrong.items()):
@@ -185,8 +185,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "off by over 1000 tolerances (1e-5 at 1e-8), or never ends. A tolerance bounds the local errors of steps, not",
         "Silently wrong runs under 17 kinds of sharp everyday forces, with parameters not used during development (",
         "in brackets: off by over 1e-3): ",
-        "`auto` with `compiled=False` 1 of 61 (1); with `compiled=True` (by the mechanism the default is one of these) "
-        "1 of 62 (1); our other methods 1 of 63 (1); "
+        "the default 1 of 61 (1); our other methods 2 of 125 (2); "
         "heyoka 1 of 66 (1); IDA and CVODE 1 of 64 (0). Our steps look",
         " 1 of 144 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-12, misleads the "
         "default (gust of 3 ms: off by 0.060 at 1e-6)",

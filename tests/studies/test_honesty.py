@@ -11,7 +11,7 @@ import pytest
 from studies.bench.render import render
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
-from studies.honesty.solvers import DEFAULT, DEFAULT_COMPILED, IDA_C, KINDS, LIMITED, kind_of, own, solvers, why_not
+from studies.honesty.solvers import DEFAULT, IDA_C, KINDS, LIMITED, kind_of, own, solvers, why_not
 from studies.honesty.traps import (
     FORCE,
     GROWN,
@@ -145,7 +145,7 @@ def test_sentences_turn_with_the_rows():
     assert "No solver notices: b" in told
 
 
-OURS, COMPILED, OTHER, THEIRS = DEFAULT, DEFAULT_COMPILED, "BDF (twoloop)", "LSODA, index 1"
+OURS, COMPILED, OTHER, THEIRS = DEFAULT, "auto, compiled (twoloop)", "BDF (twoloop)", "LSODA, index 1"
 BOUND = THEIRS + LIMITED
 
 
@@ -179,9 +179,9 @@ def test_trust_is_counted_over_mistakes_and_forces():
     none = dict.fromkeys(("wrong", "unasked", "gross", "slight", "refused"), 0)
     assert found["trust"]["default"] == none | {"n": 2}
     found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
-    wrong = dict.fromkeys(KINDS, 0) | {"compiled": 1, "ours": 1, "scipy": 1, "others": 1}
+    wrong = dict.fromkeys(KINDS, 0) | {"ours": 2, "scipy": 1, "others": 1}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
-    assert "| `auto` with `compiled=True` | 0 | 0 | 0 | 2 | 0 | 1 |" in text
+    assert "| our other methods | 0 | 0 | 0 | 4 | 0 | 2 |" in text
     for who in ("SciPy's LSODA, DOP853, Radau and BDF", "other projects' solvers without max_step"):
         assert f"| {who} | 0 | 0 | 0 | 2 | 0 | 1 |" in text
     assert "| other projects' solvers with max_step | 0 | 0 | 0 | 2 | 0 | 0 |" in text and "| heyoka |" not in text
@@ -196,7 +196,7 @@ def test_an_error_is_large_or_small_and_a_run_without_an_end_is_large():
     found, text = told_of_forces(rows)
     got = {who: (found["trust"][who]["gross"], found["trust"][who]["slight"]) for who in ("default", "scipy")}
     assert got == {"default": (1, 1), "scipy": (1, 0)}
-    assert "| `auto` with `compiled=False` | 0 | 0 | 0 | 2 | 1 | 1 |" in text and "off by 1e-5 to 1e-3 |" in text
+    assert "| the default | 0 | 0 | 0 | 2 | 1 | 1 |" in text and "off by 1e-5 to 1e-3 |" in text
 
 
 def test_every_solver_is_of_one_kind():
@@ -214,11 +214,11 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["traps"][0]["silent"] == [OURS, THEIRS]
-    assert "| a | 1/0/2 | 1/0/0 | auto; LSODA, index 1 |" in text
+    assert "| a | 1/0/2 | 1/0/0 | the default; LSODA, index 1 |" in text
     assert (
         "- Of ours 1 run is silently wrong or hangs: a." in text and "None of ours is silently wrong, and" not in text
     )
-    assert "so that the force was never evaluated: 1 of `auto` with `compiled=False`, 1 of SciPy's" in text
+    assert "so that the force was never evaluated: 1 of the default, 1 of SciPy's" in text
 
 
 @pytest.mark.parametrize(
@@ -238,11 +238,8 @@ def test_a_refusal_is_no_run(message):
     changed = (rows["solver"] == COMPILED) & (rows["group"] == MISTAKE)
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
     found, text = told_of_forces(rows)
-    assert found["trust"]["compiled"]["n"] == found["trust"]["compiled"]["refused"] == 1
-    assert (
-        "| `auto` with `compiled=True` | 0 | 0 | 0 | 1 | 0 | 0 |" in text
-        and "1 of `auto` with `compiled=True`." in text
-    )
+    assert found["trust"]["ours"]["n"] == 3 and found["trust"]["ours"]["refused"] == 1
+    assert "| our other methods | 0 | 0 | 0 | 3 | 0 | 0 |" in text and "1 of our other methods." in text
 
 
 def test_what_a_refusal_says_is_what_is_said():
@@ -289,7 +286,7 @@ def test_forces_held_out_are_others_and_counted_apart():
     apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
     found, text = told_of_forces(pd.concat([rows_of_forces(), apart], ignore_index=True))
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "| auto | gust | pendulum | 1e-9 |" in text and "with a seed of their own" in text
+    assert "| the default | gust | pendulum | 1e-9 |" in text and "with a seed of their own" in text
 
 
 def test_checks_of_the_input_are_counted_apart():

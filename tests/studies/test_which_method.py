@@ -42,11 +42,9 @@ def test_a_line_for_each_method_of_ours_best_first(text_of):
     assert "`IDA`" not in text
 
 
-def test_traps_of_the_default_are_those_without_code_and_the_page_says_so(text_of):
-    text = text_of([SOLVER | {"solver": "the default"}], {"auto (twoloop)": COUNTS})
+def test_the_default_has_its_own_traps(text_of):
+    text = text_of([SOLVER | {"solver": "the default"}], {"the default (twoloop)": COUNTS, "auto (twoloop)": {}})
     assert "| the default | 9 | 1 | 0 | 0.10 | 3 |" in text
-    said = "On traps the default is run with `compiled=False`."
-    assert said in text and said not in text_of([SOLVER | {"solver": "BDF"}], {})
 
 
 @pytest.mark.parametrize(
