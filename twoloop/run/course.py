@@ -229,7 +229,7 @@ class Course:
             message=message + explained(status),
             stats=statistics,
             rank=run.rank,
-            redundant=run.redundant,
+            redundant=run.redundant.copy(),  # runs of one start share it
             rejected_error=errors,
             rejected_convergence=failures,
             partitioned=partitions,
