@@ -1,6 +1,6 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Any
 
@@ -20,7 +20,6 @@ RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, a
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
-LOOKED_AT = ("error_q", "floor", "used", "times", "astray", *SETTINGS)  # columns by which costs at an error are found
 COSTS = ("call_s", "call_q1", "call_q3", "n_evaluations")
 RANKED = (
     *("family", "called_from", "keeps_constraints", *COSTS),
@@ -63,13 +62,10 @@ def _rounds(n: int) -> NDArray[np.int64]:
     return np.random.default_rng(SEED).integers(0, n, (RESAMPLES, n))
 
 
-def resampled(rows: pd.DataFrame) -> Array:
-    """Medians of the times of each row over rounds drawn again (n_rows, RESAMPLES); NaN of fewer than three."""
-    drawn = np.full((len(rows), RESAMPLES), np.nan)
-    for k, times in enumerate(rows.get("times", ())):
-        if len(times) >= FEWEST:
-            drawn[k] = _medians_drawn(tuple(times))
-    return drawn
+def resampled(times: Iterable[Sequence[float]]) -> Array:
+    """Medians of the times of each run over rounds drawn again (n_runs, RESAMPLES); NaN of fewer than three."""
+    drawn = [_medians_drawn(tuple(own)) if len(own) >= FEWEST else np.full(RESAMPLES, np.nan) for own in times]
+    return np.array(drawn).reshape(-1, RESAMPLES)
 
 
 @lru_cache(maxsize=20_000)
@@ -89,38 +85,83 @@ def setting_of(rows: pd.DataFrame) -> Array:
 Place = tuple[int, int, float | None]
 
 
-def _place(rows: pd.DataFrame, runs: pd.DataFrame, target: float) -> Place | None:
+class _Runs:
+    """The runs of one solver on one case that have an error and this cost, by error, in arrays.
+
+    A table of 70 columns takes minutes where it is sorted and cut for every solver and every error.
+    """
+
+    def __init__(self, columns: Mapping[str, NDArray[Any]], rows: NDArray[np.int64], what: str):
+        errors, settings = columns["error_q"][rows], columns["setting"][rows]
+        order = np.argsort(errors, kind="stable")  # NaN last
+        known = order[~np.isnan(errors[order]) & ~np.isnan(columns[what][rows][order])]
+        self.columns, self.rows = columns, rows[known]
+        self.floor = float(np.fmax.reduce(columns["floor"][self.rows], initial=-np.inf))
+        self.errors = np.maximum(errors[known], columns["floor"][self.rows])
+        self.settings = settings[known]
+        best = float(settings[~np.isnan(errors)].max(initial=0.0))
+        # than which none is looser that the solver can run: tried, or of no use
+        self.loosest = best if (settings[np.isnan(errors)] > best).any() else LOOSEST
+
+    def of(self, column: str) -> NDArray[Any]:
+        """What stands in a column."""
+        return self.columns[column][self.rows]
+
+    def drawn(self) -> Array:
+        """`resampled` of the times; NaN where these are not known."""
+        known = "times" in self.columns
+        return resampled(self.of("times")) if known else np.full((len(self.rows), RESAMPLES), np.nan)
+
+    def used(self, k: int) -> str:
+        """The method that the solver took in a run, if it chooses."""
+        taken = self.of("used")[k] if "used" in self.columns else ""
+        return taken if isinstance(taken, str) else ""
+
+
+def _columns(rows: pd.DataFrame, *more: str) -> dict[str, NDArray[Any]]:
+    """Columns that are looked at, and more numbers, as arrays."""
+    found: dict[str, NDArray[Any]] = {name: rows[name].to_numpy(float) for name in ("error_q", "floor", *more)}
+    found |= {name: rows[name].to_numpy() for name in ("used", "times") if name in rows}
+    return found | {"setting": setting_of(rows), "astray": astray(rows).to_numpy()}
+
+
+def _runs(rows: pd.DataFrame, what: str) -> _Runs:
+    """Those of rows of one solver."""
+    return _Runs(_columns(rows, what), np.arange(len(rows)), what)
+
+
+def _by_solver(rows: pd.DataFrame, *costs: str) -> dict[str, _Runs]:
+    """Those of each solver, in order of appearance; runs without the first of the costs are left out."""
+    columns = _columns(rows, *costs)
+    codes, names = pd.factorize(rows["solver"])
+    return {str(name): _Runs(columns, np.flatnonzero(codes == k), costs[0]) for k, name in enumerate(names)}
+
+
+def _place(runs: _Runs, target: float) -> Place | None:
     """Which runs of one solver, by error, are good enough, and where between them and the next the target is.
 
     Of those good enough the ones within a decade of the worst of them count: a run that is better by far, and cheaper
     by the scatter of its time, is not what a user asks for. The first of these, and the number of all up to the last.
-    `rows` are all of the solver, `runs` those that have an error and the cost. None: no run is so good, or none was
-    asked for about this: within a decade below the target, at the loosest setting that the solver can run, or at nearly
-    the same setting as a looser one that is not good enough (the solver leaps over the target). The place between two
-    runs, on the log-log line through them, is None where they are more than a decade apart or of different methods.
+    None: no run is so good, or none was asked for about this: within a decade below the target, at the loosest setting
+    that the solver can run, or at nearly the same setting as a looser one that is not good enough (the solver leaps
+    over the target). The place between two runs, on the log-log line through them, is None where they are more than a
+    decade apart or of different methods.
     """
-    errors = _errors(runs)
+    errors, settings = runs.errors, runs.settings
     n_good = int((errors <= target).sum())
-    if n_good == 0 or target < runs["floor"].max():
+    if n_good == 0 or target < runs.floor:
         return None
-    below, settings, end = errors[n_good - 1], setting_of(runs), n_good == len(errors)
+    below, end = errors[n_good - 1], n_good == len(errors)
     joined = not end and 0.0 < errors[n_good] <= DECADE * below
     looser = settings[n_good:, None] / settings[:n_good]
     near = ((looser >= 1.0) & (looser <= NEAR)).any()
-    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= _loosest(rows)).any()):
+    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= runs.loosest).any()):
         return None
     first = int((errors < below / DECADE).sum())
-    if not joined or used(runs.iloc[n_good - 1]) != used(runs.iloc[n_good]):
+    if not joined or runs.used(n_good - 1) != runs.used(n_good):
         return first, n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])
     return first, n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
-
-
-def _loosest(rows: pd.DataFrame) -> float:
-    """The setting than which none is looser that the solver can run: tried, or of no use."""
-    settings, good = setting_of(rows), rows["error_q"].notna().to_numpy()
-    best = float(settings[good].max(initial=0.0))
-    return best if (settings[~good] > best).any() else LOOSEST
 
 
 def used(run: pd.Series) -> str:
@@ -148,19 +189,6 @@ def _cost(costs: Array, place: Place) -> Array:
     return np.fmin(best, between)
 
 
-def _told(rows: pd.DataFrame, what: str, *more: str) -> pd.DataFrame:
-    """The runs that have an error and this cost, by error; of their columns those that are looked at, and more."""
-    errors = rows["error_q"].to_numpy(float)
-    order = np.argsort(errors, kind="stable")  # NaN last
-    known = order[~np.isnan(errors[order]) & rows[what].notna().to_numpy()[order]]
-    return _with_columns(rows, (*LOOKED_AT, what, *more)).iloc[known]
-
-
-def _with_columns(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Those of these columns that there are: to select and sort rows of 70 columns takes minutes."""
-    return rows[[name for name in dict.fromkeys(names) if name in rows]]
-
-
 def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     """Time of a call (or another cost) of one solver for an error of at most `target`.
 
@@ -168,17 +196,23 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     not made to look expensive by it. NaN where no run is so good, where the solver was not asked for about so much, and
     where the target is below what the reference resolves.
     """
-    runs = _told(rows, what)
-    place = None if runs.empty else _place(rows, runs, target)
-    return float("nan") if place is None else float(_cost(runs[what].to_numpy(float), place))
+    runs = _runs(rows, what)
+    place = _place(runs, target)
+    return float("nan") if place is None else float(_cost(runs.of(what), place))
 
 
 def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
     """The run of one solver that `time_for` prices, where there is one."""
-    runs = _told(rows, "call_s")
-    place = _place(rows, runs, target)
+    runs = _runs(rows, "call_s")
+    place = _place(runs, target)
     assert place is not None
-    return rows.loc[runs.iloc[place[0] : place[1]]["call_s"].astype(float).idxmin()]
+    return rows.iloc[_cheapest(runs, place)]
+
+
+def _cheapest(runs: _Runs, place: Place) -> int:
+    """The row of the cheapest run at a place."""
+    first, n_good, _ = place
+    return int(runs.rows[first + np.argmin(runs.of("call_s")[first:n_good])])
 
 
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
@@ -191,19 +225,18 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     either side, so that no solver is ahead of another for want of a run. A run out of phase is on neither side.
     """
     found = {}
-    for solver, own in _with_columns(rows, ("solver", "call_s", *LOOKED_AT)).groupby("solver", sort=False):
-        runs = _told(own, "call_s")
-        place = None if runs.empty else _place(own, runs, target)
-        if place is None and doubt and not runs.empty and target >= runs["floor"].max():
-            n_good = int((_errors(runs) <= target).sum())
-            looser = n_good < len(runs) and not astray(runs).to_numpy()[n_good]
+    for solver, runs in _by_solver(rows, "call_s").items():
+        place = _place(runs, target)
+        if place is None and doubt and target >= runs.floor:
+            n_good = int((runs.errors <= target).sum())
+            looser = n_good < len(runs.errors) and not runs.of("astray")[n_good]
             place = None if n_good == 0 else (n_good - 1, n_good + looser, None)
         if place is not None:
-            costs, drawn = runs["call_s"].to_numpy(float), resampled(runs)
+            costs, drawn = runs.of("call_s"), runs.drawn()
             first, n_good, _ = place
             if np.isnan(drawn[first + np.argmin(costs[first:n_good])]).any():  # of the cheapest it is not known
                 drawn[:] = np.nan
-            found[str(solver)] = float(_cost(costs, place)), _cost(drawn, place)
+            found[solver] = float(_cost(costs, place)), _cost(drawn, place)
     return found
 
 
@@ -216,7 +249,8 @@ def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
 def near_misses(rows: pd.DataFrame, target: float) -> Costs:
     """What the runs take that miss an error by little, each run by itself."""
     runs = nearly_there(rows, target)
-    costs = zip(runs["call_s"].astype(float), resampled(runs), strict=True)
+    times = runs["times"] if "times" in runs else len(runs) * [()]
+    costs = zip(runs["call_s"].astype(float), resampled(times), strict=True)
     return {f"near miss {k}": cost for k, cost in enumerate(costs)}
 
 
@@ -259,16 +293,13 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
     lines = []
-    for solver, runs in _with_columns(rows, ("solver", *RANKED, *LOOKED_AT)).groupby("solver", sort=False):
-        told = _told(runs, *COSTS)
-        place = None if told.empty else _place(runs, told, target)
+    for solver, runs in _by_solver(rows, *COSTS).items():
+        place = _place(runs, target)
         if place is None:
             continue
-        first, n_good, _ = place
-        good = told.iloc[first:n_good]
-        run = runs.loc[good["call_s"].astype(float).idxmin()]
+        run = rows.iloc[_cheapest(runs, place)]
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
-        line |= {what: float(_cost(told[what].to_numpy(float), place)) for what in COSTS}
+        line |= {what: float(_cost(runs.of(what), place)) for what in COSTS}
         line |= {key: run[key] for key in ("violation_q", "violation_v", "energy")}
         lines.append(line | {"setting": setting(run)})
     return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)

@@ -163,7 +163,7 @@ def test_the_cheapest_are_found_among_ours_and_others():
 
 
 def test_the_sentence_on_trust_is_computed(tmp_path):
-    wrong = {"default": 0, "compiled": 3, "ours": 5, "heyoka": 2, "sundials": 1, "scipy": 4, "others": 7, "limited": 6}
+    wrong = {"default": 0, "ours": 5, "heyoka": 2, "sundials": 1, "scipy": 4, "others": 7, "limited": 6}
     trust = {name: {"n": 50, "wrong": n, "unasked": 0, "gross": n, "slight": 0} for name, n in wrong.items()}
     held_out = {name: {"n": 30, "wrong": n + 1, "unasked": 0, "gross": 1, "slight": n} for name, n in wrong.items()}
     bad = {"ours_bad": [], "others_bad": [], "unasked": 0, "missed_by_all": []}
@@ -182,10 +182,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     text = front(tmp_path, [case()], honesty=honesty)
     assert "off by over 1000 tolerances (1e-5 at 1e-8), or never ends." in text
     assert "under 15 kinds of sharp everyday forces, with parameters not used during development (in brackets" in text
-    assert (
-        "`auto` with `compiled=False` 1 of 30 (1); with `compiled=True` (by the mechanism the default is one of" in text
-    )
-    assert " these) 4 of 30 (1); our other methods 6 of 30 (1); " in text
+    assert "the default 1 of 30 (1); our other methods 6 of 30 (1); " in text
     assert "heyoka 3 of 30 (1); IDA and CVODE 2 of 30 (1); SciPy's LSODA and BDF 5 of 30 (1). " in text
     assert "andom mechanisms under sharp forces" not in text
     trust["default"] |= {"wrong": 3, "unasked": 2}
