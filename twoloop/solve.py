@@ -126,7 +126,7 @@ def solve_dae(
         "DOP853" and "Adams": two to eight times as fast, after 0.1 to 6 s, which grow with the mechanism, once for
         equations of the same structure, as the code is kept on disk and reads its numbers. The callbacks must not
         branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.
-        "auto" (default): for small mechanisms with compiled callbacks, whose code takes up to a third of a second. This
+        "auto" (default): for small mechanisms with compiled callbacks, whose code takes some tenths of a second. This
         depends on the mechanism and the method alone: the same call gives the same numbers whatever ran before.
 
     Returns

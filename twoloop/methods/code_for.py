@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
 WITH_CODE = (Auto, Taylor, DOP853, Adams)
-SMALL = 80  # operations of the series of its motion: the code takes up to a third of a second to build
+SMALL = 100  # operations of the series of its motion: the code takes a few tenths of a second to build
 
 
 def check_compiled(value: Compiled) -> Compiled:
