@@ -34,7 +34,7 @@ from studies.bench.end_states import case_of
 from studies.bench.solvers import CATALOGUE, COMPILED, CVODE_C, DEFAULT, DIFFRAX, HEYOKA, IDA_C
 from studies.bench.store import KeptRows, Row
 from studies.work_precision import rivals
-from twoloop import mechanisms
+from twoloop import Result, mechanisms
 
 GROUP = "first call"
 BUILDING = (*COMPILED, HEYOKA, CVODE_C, IDA_C, DIFFRAX, "IDAS, CasADi")  # for whom code is built
@@ -49,6 +49,7 @@ QUICK = (DEFAULT, "auto, compiled")
 TOLERANCE = ERROR = 1e-8  # of the calls in processes of their own; of the calls that are laid side by side, m or rad
 TIMES = ("first_call_s", "call_s", "call_q1", "call_q3")
 LIMIT = 120.0  # s of CPU of a call
+STARTS = 20  # from which calls are made whose set-up is compared
 EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a folder of caches
 
 
@@ -94,7 +95,27 @@ def times_of(name: str, solver: str) -> Row:
         return found
     later = [timed(run, 0)[3]["call_s"] for _ in range(REPEATS)]
     low, middle, high = map(float, np.percentile(later, (25, 50, 75)))
+    if run.solver.family == "two-loop":
+        found["elsewhere_s"] = elsewhere(run, result)
     return found | {"first_call_s": spent, "call_s": middle, "call_q1": low, "call_q3": high}
+
+
+def elsewhere(run: Run, result: Result) -> float:
+    """What a call from a start that no call has had takes longer, above its steps, than one from a start again, s.
+
+    The starts are states at steps of the run, whose equations do not depend on time.
+    """
+    places = np.linspace(0, result.t.size - 1, STARTS + 1).astype(int)[1:]
+    problems = [replace(run.case.problem, q0=result.q[:, k].copy(), v0=result.v[:, k].copy()) for k in places]
+    others = [_above_steps(replace(run, case=replace(run.case, problem=problem))) for problem in problems]
+    again = [_above_steps(run) for _ in range(STARTS)]
+    return float(np.median(others) - np.median(again[len(again) // 2 :]))
+
+
+def _above_steps(run: Run) -> float:
+    result, _, message, spent = attempt(run, 0)
+    assert result is not None, message
+    return spent - result.stats.cpu_time
 
 
 def _run(problem: mechanisms.Problem, solver: str) -> Run:
@@ -152,6 +173,8 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
         line: dict[str, Any] = {"solver": solver, "tol": tol, "error": ERROR, "n": len(own), "pays": [], "never": 0}
         line["first_call_s"] = float(own["first_call_s"].median())
         line["call_s"] = float(own["call_s"].median()) if own["call_s"].notna().any() else None
+        known = own["elsewhere_s"].astype(float).dropna().tolist() if "elsewhere_s" in own else []
+        line["elsewhere_s"] = [min(known), max(known)] if known else None
         for _, row in own[own["case"].isin(default.index)].iterrows():
             pays = None if solver == DEFAULT else pays_from(row, default.loc[row["case"]])
             line["pays"] += [] if pays is None else [pays]

@@ -5,9 +5,9 @@ calls of Python that knows no way out. So the signal raises `KeyboardInterrupt` 
 which may take long and from which every caller expects exceptions; elsewhere it is kept until the run looks for it.
 """
 
+import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
 import threading
-from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -22,9 +22,6 @@ from twoloop.run.record import Record, Statistics, Status, explained
 Array = NDArray[np.float64]
 
 CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
-# without the enumerations that `signal` makes of what they return, which take longer than the rest of a short run
-handler_of: Callable[[int], Any] = getattr(signal.getsignal, "__wrapped__", signal.getsignal)
-handle: Callable[[int, Any], Any] = getattr(signal.signal, "__wrapped__", signal.signal)
 IMPATIENCE = 3  # signals after which the next one raises at once, whatever is lost
 
 
@@ -43,15 +40,15 @@ class Interrupts:
 
     def __enter__(self) -> "Interrupts":
         if threading.current_thread() is threading.main_thread():  # no other may set handlers, and none gets signals
-            self._stands_in = handler_of(signal.SIGINT) is signal.default_int_handler
+            self._stands_in = _signal.getsignal(signal.SIGINT) is signal.default_int_handler
         if self._stands_in:
-            handle(signal.SIGINT, self._heard)
+            _signal.signal(signal.SIGINT, self._heard)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:
         """Whether what was raised is Ctrl-C: then there is nothing to raise."""
         if self._stands_in:
-            handle(signal.SIGINT, signal.default_int_handler)
+            _signal.signal(signal.SIGINT, signal.default_int_handler)
         return kind is KeyboardInterrupt
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
