@@ -123,7 +123,11 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
         first_s = float(built["first_call_s"].min()) if len(built) else None
         lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error, rival) for error in PRICED]})
     found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
-    known = first[first["solver"] == OWN_CODE]["elsewhere_s"].dropna().tolist() if "elsewhere_s" in first else []
+    known = (
+        first[first["solver"] == OWN_CODE]["elsewhere_s"].dropna().tolist()
+        if len(first) and "elsewhere_s" in first
+        else []
+    )
     found["elsewhere_s"] = float(known[0]) if known else None
     return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None}
 
