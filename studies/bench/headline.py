@@ -123,13 +123,15 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
         first_s = float(built["first_call_s"].min()) if len(built) else None
         lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error, rival) for error in PRICED]})
     found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
-    known = (
-        first[first["solver"] == OWN_CODE]["elsewhere_s"].dropna().tolist()
-        if len(first) and "elsewhere_s" in first
-        else []
-    )
-    found["elsewhere_s"] = float(known[0]) if known else None
-    return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None}
+    return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None, "elsewhere_s": _elsewhere(first)}
+
+
+def _elsewhere(first: pd.DataFrame) -> float | None:
+    """What a call with code takes longer from another start, by rows of first calls on one mechanism."""
+    if first.empty or "elsewhere_s" not in first:
+        return None
+    known = first[first["solver"] == OWN_CODE]["elsewhere_s"].dropna()
+    return float(known.iloc[0]) if len(known) else None
 
 
 def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
