@@ -264,6 +264,23 @@ def test_signals_at_any_instruction_end_the_run_with_its_result(events):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_the_fourth_signal_is_not_kept(monkeypatch):
+    monkeypatch.setattr("twoloop.solve.run_from", lambda *given: [pressed() for _ in range(4)])
+    with pytest.raises(KeyboardInterrupt):
+        solve_dae(pendulum(), (0.0, 1.0), *START)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_what_a_handler_of_the_users_own_raises_comes_through(monkeypatch):
+    monkeypatch.setattr("twoloop.solve.run_from", lambda *given: pressed())
+    before = signal.signal(signal.SIGINT, lambda number, frame: interrupt())
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            solve_dae(pendulum(), (0.0, 1.0), *START)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_a_handler_of_the_users_own_stays():
     heard = []
     before = signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))

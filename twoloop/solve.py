@@ -60,7 +60,7 @@ def solve_dae(
     check_derivatives: bool = True,
     compiled: Compiled = "auto",
 ) -> Result:
-    """Integrate a constrained mechanical system by a two-loop procedure.
+    """Integrate a constrained mechanical system; its constraints hold at every step.
 
     Constraints that depend on others at the start are left out, named by a `ConstraintWarning`, checked at every step.
     Near a position where the constraints lose rank, steps of any method may give way to explicit ones across it.
@@ -119,15 +119,16 @@ def solve_dae(
         not within a step, and for a small compiled system not before a thousand steps.
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
-        tangents at a few states of runs with exact derivatives, or with differences where callbacks do not run on
-        symbols; of a system of compiled callbacks in runs that go where none has been, and the 2nd, 4th, 8th, ....
+        the tangents again at a few states of runs: with exact derivatives where the callbacks run on symbols, else with
+        differences. Of compiled callbacks only runs that reach new states are compared, and the 2nd, 4th, 8th, ....
     compiled : bool or "auto"
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
-        "DOP853" and "Adams": two to eight times as fast, after 0.1 to 6 s, which grow with the mechanism, once for
-        equations of the same structure, as the code is kept on disk and reads its numbers. The callbacks must not
+        "DOP853" and "Adams": as a rule two to four times as fast inside the integrator, less over a short call, and not
+        always on stiff motion; after 0.1 to 6 s, which grow with the mechanism, once for equations of the same
+        structure, as the code is kept on disk and reads its numbers. The callbacks must not
         branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.
         "auto" (default): for small mechanisms with compiled callbacks, whose code takes some tenths of a second. This
-        depends on the mechanism and the method alone: the same call gives the same numbers whatever ran before.
+        depends on the arguments of the call alone: the same call gives the same numbers whatever ran before.
 
     Returns
     -------

@@ -343,7 +343,7 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
     axes.set_xlim(left=0.0)
     axes.tick_params(axis="y", labelsize=8, length=0.0)
     axes.grid(False)
-    axes.set_title("Sharp forces held out: runs that did not end right (numbers: runs)")
+    axes.set_title("Sharp forces, parameters held out: runs that did not end right (numbers: runs)")
     figure.legend(loc="outside lower center", ncols=len(PARTS))
     return figure
 

@@ -169,7 +169,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"| first call on the mechanism, tolerance 1e-8 | {first} | – | – |\n",
         f"Of our calls {number(0.2 * prices[0])} to {number(0.2 * prices[1])} ms are spent in the integrator, ",
         f"up to {n_others} rival configurations, {n_put} to {n_others} of them on each mechanism (",
-        "what is left of these at the end is about as large as the error (in the median 0.10 times). ",
+        "the violation of the constraints at the end is about as large as the error (median ratio 0.10). ",
         "“Ahead” and “behind” mean by at least 5 %, even when runs of the slower side that miss the error by up to 25 "
         "% are counted:",
         f"| of {2 * N} pairs of mechanism and error | ahead | behind | undecided | alone | alone, not all rivals run | "

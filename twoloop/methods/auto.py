@@ -64,9 +64,9 @@ class Auto:
     A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
     coordinates or more. Else with `few`; with `many` from 64 coordinates on, or from 16 on with at most a quarter as
-    many constraints or tolerances below 1e-10. With code made for the mechanism (`compiled=True` of `solve_dae`) a
-    series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8 operations in all below 1e-3, and
-    `many` from 64 coordinates on.
+    many constraints or tolerances below 1e-10. With code made for the mechanism (by `compiled=True` of `solve_dae`, or
+    its default for small ones) a series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8
+    operations in all below 1e-3, and `many` from 64 coordinates on.
 
     At looser tolerances than these a run begins with `series` as well, as others may take no steps longer than a
     hundredth of the run: after 10 steps it goes on without, if the next would be no longer than that. It also goes on

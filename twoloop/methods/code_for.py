@@ -1,4 +1,4 @@
-"""Which runs get code made for their mechanism: those that ask for it, and of small ones where it is left open."""
+"""Decides whether a run gets machine code of its mechanism: if it is asked for, or by default for small mechanisms."""
 
 from typing import Literal
 
@@ -40,15 +40,16 @@ def code_for(
 ) -> OwnCode | None:
     """The code for a run, if it gets any.
 
-    What is left open depends on the system and the method alone, so that the same call gives the same numbers whatever
+    What is left open depends on the arguments of the call alone, so that the same call gives the same numbers whatever
     ran before it.
 
     Raises
     ------
     ValueError
-        If code is asked for and cannot be had.
+        If code is asked for and does not go with the method, or cannot be had.
     """
     if compiled is True:
+        _refuse(method, fixed)
         return own_code(system, t0, q0, check)
     if compiled is False or fixed or not _takes_code(method) or not is_small(system):
         return None
@@ -58,12 +59,22 @@ def code_for(
         return None
 
 
+def _refuse(method: Method, fixed: bool) -> None:
+    """Raise where code does not go with the method, before it is made."""
+    implicit = fixed and type(method) is Auto
+    if implicit or not _takes_code(method):
+        raise ValueError(
+            f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}"
+            f"{' with step_size, by which it is implicit' if implicit else ''}"
+        )
+
+
 def _takes_code(method: Method) -> bool:
     return type(method) in WITH_CODE and getattr(method, "stages", "free") == "free"
 
 
 def is_small(system: ConstrainedSystem) -> bool:
-    """Whether its callbacks are compiled, run on symbols, and make few operations."""
+    """Whether its callbacks are compiled, can be traced, and make few operations."""
     if system.called_in_python:
         return False
     try:

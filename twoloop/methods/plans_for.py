@@ -29,7 +29,7 @@ def plans_for(
     Raises
     ------
     ValueError
-        If the method cannot run the system, or does not go with code made for it.
+        If the method cannot run the system.
     """
     key = (id(method), rtol, atol, fixed, None if code is None else code.shared.equations.choice)
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
@@ -59,11 +59,7 @@ def _made(
         interiors[ACCELERATIONS] = method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
     if code is None:
         return plan, interiors
-    if not plan.compilable:
-        constant = " with step_size, by which it is implicit" if method.name == "auto" else ""
-        raise ValueError(
-            f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{constant}"
-        )
+    assert plan.compilable, method.name
     plan = replace(_with_code(plan, code), traced=(*plan.traced, code.traced))
     if plan.substitute is not None:
         plan = replace(plan, substitute=_with_code(plan.substitute, code))

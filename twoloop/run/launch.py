@@ -1,4 +1,4 @@
-"""The run of a call, made ready to go: checked, with its plan; kept for the next call from the same start."""
+"""The run of a call, made ready to go: checked, with its plan; kept for equal calls that follow."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -38,7 +38,9 @@ class Asked(NamedTuple):
 
 
 def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
-    """The run from a start: all is known already of a call like one before, if none from elsewhere came between.
+    """The run of a call: a copy of a kept one, if an equal call was made and none from another start came between.
+
+    Kept are those of presets, compiled callbacks and traces that are trusted, from the second call from a start on.
 
     Raises
     ------

@@ -26,7 +26,7 @@ _REASONS = {
 }
 
 
-def _said_of_events(run: "Run") -> str:
+def _said_of_passages(run: "Run") -> str:
     """What a run that succeeded has to say of jumps and of singular positions."""
     if not run.jumps and not run.crossings:
         return ""
@@ -44,7 +44,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     failure = int(run.clock[a.FAILURE_CODE])
     if code == a.ALL_OUTPUT_DONE:
         fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
-        said = _said_of_events(run) + _said_of_end(run)
+        said = _said_of_passages(run) + _said_of_end(run)
         return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
     if code == INTERRUPTED:
         return Status.INTERRUPTED, ""

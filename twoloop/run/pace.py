@@ -1,4 +1,4 @@
-"""The pace of a run: what it does not get anywhere by, and how it ends then."""
+"""Lengths of steps by which a run is seen to stand still, and the codes of ends that Python decides."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -77,10 +77,10 @@ def leap(run: Run, t1: float) -> bool:
     """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
     a, clock, n = run.a, run.clock, run.system.n_q
     end = float(clock[a.JUMP_TO])
-    beyond = beyond_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
-    if beyond is None:
+    state = beyond_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
+    if state is None:
         return False
-    run.new_state[: 2 * n] = beyond
+    run.new_state[: 2 * n] = state
     run.work.notes[common.KINK_BEFORE], run.work.notes[common.KINK_AFTER] = end, np.inf
     if direct(a.start)(run.kit, run.work, end, run.new_state) != common.DONE:
         return False

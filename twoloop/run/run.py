@@ -97,7 +97,7 @@ class Run:
         self.redundant, self.said_of_rows = self._redundant_rows()
 
     def again(self) -> "Run":
-        """The same run from its start, of which this one may not have taken a step."""
+        """A copy of this run at its start; this one must not have taken a step."""
         other = object.__new__(Run)
         vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
         for name in ("state", "new_state", "tolerances", "control", "clock"):
