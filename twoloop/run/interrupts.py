@@ -46,7 +46,7 @@ class Interrupts:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:
-        """Whether what was raised is Ctrl-C to be answered by a result: not the impatient one, nor a user's handler's."""
+        """Whether what was raised is Ctrl-C to be answered by a result: not the fourth, nor a user's handler's."""
         if self._stands_in:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
         return kind is KeyboardInterrupt and self._stands_in and self.asked <= IMPATIENCE
