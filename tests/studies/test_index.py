@@ -273,8 +273,10 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "right on 17, only ours on 2, only others on 0, none on 2. Wrong runs" in text
-    assert "1 of 500 of ours, 57 of 300 of others" in text
+    assert "right on 17, only ours on 2, only others on 0, none on 2. Of the runs" in text
+    assert "1 of 500 of ours and 57 of 300 of others are wrong." in text
+    stopped = VALID | {"only_ours": [{"limit": ["a", "b"]}, {"limit": []}], "time_limit": 1.5}
+    assert "only ours on 2 (where we stopped 2 of the others after 1.5 s)," in screen(tmp_path, validation=stopped)
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
     planted = {
         "n": 73,
