@@ -40,7 +40,7 @@ class Asked(NamedTuple):
 def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
     """The run of a call: a copy of a kept one, if an equal call was made and none from another start came between.
 
-    Kept are those of presets, compiled callbacks and traces that are trusted, from the second call from a start on.
+    Kept are those of presets, compiled callbacks and trusted traces, if no call before was from another start.
 
     Raises
     ------
