@@ -8,14 +8,13 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-import scipy.integrate
 
 from studies.bench import metrics, render, solvers, tables
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem, Result, callback, mechanisms
 from twoloop.mechanisms import Problem
+from twoloop.methods import dop853_tableau, tableaux
 from twoloop.methods import presets as methods
-from twoloop.methods import tableaux
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
 
@@ -242,9 +241,9 @@ def in_tableau() -> Iterator[Fault]:
     plain = lambda: patch.object(tableaux, "_symplectic_average", average)  # noqa: E731
     yield Fault("the symplectic average left out", "tableau", plain, (TABLEAUX,))
     for name in ("A", "B", "C", "E3", "E5"):
-        array = getattr(scipy.integrate.DOP853, name).copy()
+        array = getattr(dop853_tableau, name).copy()
         array[np.unravel_index(np.flatnonzero(array)[1], array.shape)] += 1e-6
-        plant = lambda name=name, array=array: patch.object(scipy.integrate.DOP853, name, array)  # noqa: E731
+        plant = lambda name=name, array=array: patch.object(dop853_tableau, name, array)  # noqa: E731
         yield Fault(f"a number of DOP853's {name} off by 1e-6", "tableau", plant, (EXPLICIT,))
 
 
