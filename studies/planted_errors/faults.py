@@ -19,7 +19,7 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
 
 TABLEAUX = "tests/test_tableaux.py"
-EXPLICIT = "tests/kernels/test_explicit.py::test_scipy_still_gives_the_numbers_that_we_take_from_it"
+EXPLICIT = "tests/kernels/test_explicit.py::test_the_tableau_satisfies_its_order_conditions"
 TABLES, METRICS, RENDER = (f"tests/studies/test_{name}.py" for name in ("tables", "metrics", "render"))
 
 

@@ -36,7 +36,7 @@ def tableau():
     return parts[0].reshape(STAGES, STAGES), *parts[1:]
 
 
-def test_scipy_still_gives_the_numbers_that_we_take_from_it():
+def test_the_tableau_satisfies_its_order_conditions():
     A, b, c, fine, coarse = tableau()
     np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-14)
     powers = np.arange(8)
