@@ -94,7 +94,8 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
         if radius[i] <= max(largest, 1.0):
             reach[i] = radius[i]
         elif largest > negligible:  # straight: the smaller half of the coordinates, so that an offset does not count
-            reach[i] = float(np.quantile(row[row > NEGLIGIBLE * largest], 0.5, method="lower"))
+            smaller = np.sort(row[row > NEGLIGIBLE * largest])
+            reach[i] = float(smaller[(len(smaller) - 1) // 2])
     return Scales(columns, rows, reach)
 
 

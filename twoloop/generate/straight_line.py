@@ -400,8 +400,12 @@ class Choice:
         if not rows:
             return cls((), (), 1.0, 0.0)
         scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
-        added = _rows_for_mass(mass, G, scale, system.name)
-        mass = mass + scale * G[list(added)].T @ G[list(added)]
+        place = None if system.constant_mass else (t, q.tobytes())
+        if system.remembered_at("definite mass", place, lambda: not _weak(np.linalg.eigvalsh(mass)).any()):
+            added: tuple[int, ...] = ()
+        else:
+            added = _rows_for_mass(mass, G, scale, system.name)
+            mass = mass + scale * G[list(added)].T @ G[list(added)]
         S = G[rows] @ np.linalg.solve(mass, G[rows].T)
         size = np.sqrt(np.diag(S))
         smallest = float(np.linalg.eigvalsh(S / np.outer(size, size))[0])  # no pivot is smaller, in any order
@@ -435,12 +439,17 @@ def _independent(G: Array) -> list[int]:
     return kept
 
 
+def _weak(values: NDArray[Any]) -> NDArray[Any]:
+    """Which of the eigenvalues of M, in order, are none."""
+    return values < SINGULAR_MASS * values[-1]
+
+
 def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int, ...]:
     """Rows of G with which M is definite, those of few entries first."""
     added: list[int] = []
     while True:
         values, vectors = np.linalg.eigh(mass)
-        weak = values < SINGULAR_MASS * values[-1]
+        weak = _weak(values)
         if not weak.any():
             return tuple(added)
         helps = np.linalg.norm(G @ vectors[:, weak], axis=1) > SINGULAR_MASS**0.5 * np.linalg.norm(G, axis=1)

@@ -36,10 +36,10 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     flags: Array = system.functions.flags.copy()
-    mass = system.mass(t0, q0)
+    place = None if system.constant_mass else (t0, q0.tobytes())
+    diagonal, definite = system.remembered_at("mass", place, lambda: _kind_of(system.mass(t0, q0)))
     if system.constant_mass:
-        flags[common.DIAGONAL_MASS] = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
-    definite = bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+        flags[common.DIAGONAL_MASS] = diagonal
     reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
     flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
@@ -50,6 +50,12 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
         flags[common.FORM] = common.AUGMENTED
     return flags
+
+
+def _kind_of(mass: Array) -> tuple[bool, bool]:
+    """Whether a mass matrix is diagonal, and definite."""
+    diagonal = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
+    return diagonal, bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:
