@@ -163,6 +163,8 @@ def try_one(call, name, value):
 @pytest.mark.parametrize(("call", "name"), ARGUMENTS)
 def test_a_result_or_an_error_that_names_the_argument(call, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where files are written
+    if name == "progress":
+        pytest.importorskip("rich")  # with which the bar is drawn
 
     @settings(max_examples=2, database=None)
     @given(st.tuples(*SORTS.values()))

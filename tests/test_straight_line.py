@@ -244,8 +244,9 @@ def test_sine_and_cosine_are_right_to_rounding(size):
     for angle, pair in zip(angles, found, strict=True):
         function(np.array([angle]), values, pair)
     sines, cosines = found.T
-    assert worst(sines, np.sin(angles)) < 2.3e-16
-    assert worst(cosines, np.cos(angles)) < 2.3e-16
+    # of the C library: those of older NumPy are off by a rounding more
+    assert worst(sines, np.array([math.sin(x) for x in angles])) < 2.3e-16
+    assert worst(cosines, np.array([math.cos(x) for x in angles])) < 2.3e-16
 
 
 def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so():

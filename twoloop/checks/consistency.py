@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
+TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 
 
@@ -163,7 +164,8 @@ class Violation:
         if excess <= 1.0:
             return
         row = int(np.abs(self.values).argmax())
-        j = int((np.abs(self.correction) / np.maximum(self.allowed, 1e-300)).argmax())
+        excesses = np.abs(self.correction) / np.maximum(self.allowed, 1e-300)
+        j = int(np.flatnonzero(excesses >= (1.0 - TIED) * excesses.max())[0])
         of = "coordinate" if name == "q0" else "the velocity of coordinate"
         raise ValueError(
             f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
