@@ -5,7 +5,7 @@ import pytest
 
 from tests import problems
 from tests.problems import kept, worst
-from twoloop import ConstrainedSystem, consistent_state, mechanisms, solve_dae
+from twoloop import ConstrainedSystem, consistent_state, consistent_states, ensemble, mechanisms, solve_dae
 from twoloop.generate.derived import standing_for
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
@@ -147,6 +147,38 @@ def test_each_callback_is_traced_once():
     for kind in ("jacobian", "gamma", "constraint", "gamma"):
         equations.of(kind)
     assert len(calls) == 1
+
+
+def driven_along_a_rail(parameters=(9.81, 0.2)):
+    """A pendulum on a pivot that moves, whose mass depends on its position; no derivative of the constraint is given."""
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=lambda t, q, p: np.array([[1.0 + 0.1 * q[0] ** 2, 0.0], [0.0, 1.0]]),
+        force=lambda t, q, v, p: np.array([np.sin(t), -p[0]]),
+        constraint=lambda t, q, p: np.array([0.5 * ((q[0] - p[1] * np.sin(3.0 * t)) ** 2 + q[1] ** 2 - 1.0)]),
+        constraint_rate=lambda t, q, p: np.array([-3.0 * p[1] * np.cos(3.0 * t) * (q[0] - p[1] * np.sin(3.0 * t))]),
+        parameters=parameters,
+        compile=True,
+    )
+
+
+@pytest.mark.parametrize("compiled", [False, "auto", True])
+@pytest.mark.parametrize("method", ["auto", "Taylor"])
+def test_a_series_follows_where_a_derivative_is_a_sum(method, compiled):
+    system = driven_along_a_rail()
+    start = consistent_state(system, 0.0, [0.3, -0.95], [0.4, 0.1])
+    implicit = solve_dae(system, (0.0, 2.0), *start, method="RadauIIA9", rtol=1e-11, atol=1e-11)
+    result = solve_dae(system, (0.0, 2.0), *start, method=method, compiled=compiled)
+    assert result.success and worst(result.q[:, -1], implicit.q[:, -1]) < 1e-6
+
+
+def test_an_ensemble_follows_where_a_derivative_is_a_sum():
+    system, parameters = driven_along_a_rail(), np.column_stack([np.linspace(9.0, 10.0, 9), np.linspace(0.1, 0.3, 9)])
+    q, v = consistent_states(system, 0.0, [0.3, -0.95], [0.4, 0.1], parameters=parameters)[:2]
+    runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
+    alone = solve_dae(driven_along_a_rail(parameters[8]), (0.0, 1.0), q[8], v[8], method="DOP853", compiled=False)
+    assert runs.success.all() and worst(runs.q[8, :, -1], alone.q[:, -1]) < 1e-6
 
 
 def test_code_made_for_a_mechanism_needs_no_jacobian():

@@ -5,7 +5,7 @@ quantities that depend on time and coordinates ("early"); Q may depend on veloci
 G^T lam + M a are written as few products: terms that share a factor are one product.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,12 +17,13 @@ from twoloop.generate.known_numbers import array_of
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
-from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE
+from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
 
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
+READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 MOST = 20_000  # operations; with more the program would take longer to make than a run
 
 
@@ -137,9 +138,10 @@ def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesP
     equations, n, n_rows = Equations(system, parameters), system.n_q, system.n_c + system.n_a
     graph, v = equations.graph, equations.v
     a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
-    mass, force = equations.of("mass"), equations.of("force")
-    G = np.vstack([equations.of("jacobian"), equations.of("nonholonomic")])
-    rates = [*equations.of("constraint_rate"), *equations.of("nonholonomic_rate")]
+    mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, READ)
+    sums = _sums_of(graph)
+    G, mass = (_each_without(sums, each) for each in (np.vstack([jacobian, nonholonomic]), mass))
+    rates, force = (_each_without(sums, each) for each in (np.append(rate, nonholonomic_rate), force))
     row_products: dict[Any, Any] = {}
     rows = [_sum_of_products(graph, G[i], v, rates[i], row_products) for i in range(n_rows)]
     reaction_products: dict[Any, Any] = {}
@@ -148,8 +150,35 @@ def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesP
         factors, others = [-each for each in G[:, i]], list(lam)
         factors += [-each for each in mass[i]]
         balance.append(_sum_of_products(graph, factors, [*others, *a], force[i], reaction_products))
-    program = _assembled(graph, n, n_rows, rows, balance, row_products, reaction_products)
+    program = _assembled(graph, sums, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
+
+
+def _sums_of(graph: Graph) -> dict[int, Form]:
+    """What the sums that are quantities are made of: series are linear, and have no recurrence for them."""
+    sums: dict[int, Form] = {}
+    for i, operation in enumerate(graph.operations):
+        if operation is not None and operation[0] == SUM:
+            sums[i] = _without_sums(sums, operation[1])
+    return sums
+
+
+def _without_sums(sums: dict[int, Form], form: Form) -> Form:
+    """A form in terms of other quantities than sums."""
+    named = [i for i in form.terms if i in sums]
+    if not named:
+        return form
+    total = _without(form, named)
+    for i in named:
+        total = total + sums[i].times(form.terms[i])
+    return total
+
+
+def _each_without(sums: dict[int, Form], forms: Any) -> Any:
+    made = np.empty(forms.shape, dtype=object)
+    for place in np.ndindex(forms.shape):
+        made[place] = _without_sums(sums, forms[place])
+    return made
 
 
 def _sum_of_products(
@@ -187,6 +216,7 @@ def _collect(groups: dict[Any, tuple[Form, Form]], factor: Form, other: Form) ->
 
 def _assembled(
     graph: Graph,
+    sums: dict[int, Form],
     n: int,
     n_rows: int,
     rows: list[Form],
@@ -197,8 +227,10 @@ def _assembled(
     early: list[Any] = []
     late: list[Any] = []
     for i, operation in enumerate(graph.operations):
-        if operation is not None:
-            (late if graph.late[i] else early).append((i, *operation))
+        if operation is not None and i not in sums:
+            kind, first, second = operation
+            made = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
+            (late if graph.late[i] else early).append((i, kind, *made))
     if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST:
         raise Untraceable(f"its equations are more than {MOST} operations")
     tables = [
@@ -230,8 +262,8 @@ def _scattered(forms: list[Form], place: dict[int, int]) -> tuple[Sums, Integers
     return sums._replace(row=places[sums.row]), places
 
 
-def _without(form: Form, inputs: range) -> Form:
-    """A form less its multiples of inputs whose coefficients of the order in question are not known yet."""
+def _without(form: Form, inputs: Container[int]) -> Form:
+    """A form less its multiples of some quantities."""
     return Form(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
