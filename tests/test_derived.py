@@ -150,7 +150,7 @@ def test_each_callback_is_traced_once():
 
 
 def driven_along_a_rail(parameters=(9.81, 0.2)):
-    """A pendulum on a pivot that moves, whose mass depends on its position; no derivative of the constraint is given."""
+    """A pendulum on a pivot that moves, with a mass that varies; without derivatives of the constraint."""
     return ConstrainedSystem.from_python(
         n_q=2,
         n_c=1,

@@ -180,8 +180,16 @@ def solve_dae(
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     with Interrupts() as interrupts:
         asked = Asked(
-            *(chosen, float(rtol), atol, t1, step_size, first_step, float(max_step), max_steps),
-            *(compiled, check_derivatives),
+            method=chosen,
+            rtol=float(rtol),
+            atol=atol,
+            t1=t1,
+            step_size=step_size,
+            first_step=first_step,
+            max_step=float(max_step),
+            max_steps=max_steps,
+            compiled=compiled,
+            check_derivatives=check_derivatives,
         )
         run = run_from(system, t0, q0, v0, asked)
         if run.said_of_rows:

@@ -46,6 +46,10 @@ class Adams:
         """Shown in messages and tables."""
         return "Adams"
 
+    def takes_code(self, fixed: bool) -> bool:
+        """Whether its steps may be run with code made for the mechanism."""
+        return True
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates.
 
@@ -67,5 +71,4 @@ class Adams:
             np.zeros(kernels.memory_size(n_q)),
             exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
-            compilable=True,
         )

@@ -145,6 +145,10 @@ class Auto:
         program = None if self.series is None else self.series.program
         return DEARER_HEAVY if program is not None and program.n_operations >= HEAVY * n_q else DEARER
 
+    def takes_code(self, fixed: bool) -> bool:
+        """Whether its steps may be run with code made for the mechanism."""
+        return not fixed  # by which it is implicit
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         if fixed:

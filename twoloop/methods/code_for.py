@@ -10,17 +10,12 @@ from twoloop.generate.series import series_for
 from twoloop.generate.straight_code import OwnCode, own_code
 from twoloop.generate.traced_values import Check
 from twoloop.generate.tracing import Untraceable
-from twoloop.methods.adams import Adams
-from twoloop.methods.auto import Auto
-from twoloop.methods.dop853 import DOP853
-from twoloop.methods.plan import Method
-from twoloop.methods.taylor import Taylor
+from twoloop.methods.plan import Method, takes_code
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
-WITH_CODE = (Auto, Taylor, DOP853, Adams)
 SMALL = 100  # operations of the series of its motion: the code takes a few tenths of a second to build
 
 
@@ -51,7 +46,7 @@ def code_for(
     if compiled is True:
         _refuse(method, fixed)
         return own_code(system, t0, q0, check)
-    if compiled is False or fixed or not _takes_code(method) or not is_small(system):
+    if compiled is False or fixed or not takes_code(method, False) or not is_small(system):
         return None
     try:
         return own_code(system, t0, q0, check)
@@ -61,16 +56,11 @@ def code_for(
 
 def _refuse(method: Method, fixed: bool) -> None:
     """Raise where code does not go with the method, before it is made."""
-    implicit = fixed and type(method) is Auto
-    if implicit or not _takes_code(method):
+    if not takes_code(method, fixed):
+        implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
         raise ValueError(
-            f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}"
-            f"{' with step_size, by which it is implicit' if implicit else ''}"
+            f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{implicit}"
         )
-
-
-def _takes_code(method: Method) -> bool:
-    return type(method) in WITH_CODE and getattr(method, "stages", "free") == "free"
 
 
 def is_small(system: ConstrainedSystem) -> bool:

@@ -75,6 +75,10 @@ class DOP853:
         """The method with what is compiled for this system."""
         return replace(self, code=code)
 
+    def takes_code(self, fixed: bool) -> bool:
+        """Whether its steps may be run with code made for the mechanism."""
+        return self.stages == "free"
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         from twoloop.kernels.steps import explicit_step as kernels
@@ -99,7 +103,6 @@ class DOP853:
             least_error=LEAST_ERROR if free else 0.0,
             rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,
-            compilable=free,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
         )
         if self.code is None or not free:

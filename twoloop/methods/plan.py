@@ -44,8 +44,7 @@ class Plan:
     lands: bool = False  # whether steps are shortened to end at output times
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
-    compilable: bool = False  # whether it asks the inner loop for what can be code made for the mechanism
-    inner: Any = None  # ... the inner loop that calls such code; None: the general one
+    inner: Any = None  # the inner loop that calls code made for the mechanism; None: the general one
     own: tuple[Any, ...] = ()  # functions made for the mechanism, see kernels/data/common.py
     numbers: Any = None  # what those of the inner loop and of stages read ...
     own_numbers: Any = None  # ... and those of series
@@ -68,6 +67,12 @@ class Plan:
         other = object.__new__(Plan)  # `replace` takes ten times as long
         vars(other).update(vars(self), memory=self.memory.copy())
         return other
+
+
+def takes_code(method: Any, fixed: bool) -> bool:
+    """Whether steps of a method, of one size or not, ask the inner loop only for what can be code for the mechanism."""
+    said = getattr(method, "takes_code", None)
+    return said is not None and bool(said(fixed))
 
 
 def least_tolerance(rtol: float, atol: float) -> float:

@@ -59,7 +59,6 @@ def _made(
         interiors[ACCELERATIONS] = method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
     if code is None:
         return plan, interiors
-    assert plan.compilable, method.name
     plan = replace(_with_code(plan, code), traced=(*plan.traced, code.traced))
     if plan.substitute is not None:
         plan = replace(plan, substitute=_with_code(plan.substitute, code))

@@ -104,6 +104,10 @@ class Taylor:
             ) from error
         return replace(self, program=program, code=code)
 
+    def takes_code(self, fixed: bool) -> bool:
+        """Whether its steps may be run with code made for the mechanism."""
+        return True
+
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         from twoloop.kernels.steps import recurrences as series
@@ -127,7 +131,6 @@ class Taylor:
             safety=1.0,
             factor_max=taylor.GROWTH,
             watchful=True,
-            compilable=True,
             looks_within=True,
             parts=min(max(highest // 3, FEWEST), MOST),
             traced=(program.traced,),

@@ -27,7 +27,7 @@ Groups = NDArray[np.int64]
 KEPT = 512  # intervals whose interior states are kept
 SOUND = 65536  # intervals of which it is kept in mind that their polynomials hold
 OFF = 10.0  # tolerances by which polynomials may be off the constraints and the equations
-MENDED = 4  # steps into which an interval is divided whose polynomials are
+REPAIRED = 4  # steps into which an interval is divided whose polynomials are
 
 
 class Table(NamedTuple):
@@ -88,8 +88,8 @@ class Interpolator:
         self.system, self.rtol, self.ranks = system, rtol, ranks
         self.tolerances = np.concatenate([np.zeros(common.ATOL), atol])
         self.tolerances[common.RTOL] = rtol
-        self.parts = max((plan.parts for plan in self.plans.values()), default=MENDED)
-        self.parts = max(self.parts, MENDED)
+        self.parts = max((plan.parts for plan in self.plans.values()), default=REPAIRED)
+        self.parts = max(self.parts, REPAIRED)
         q0 = row[: system.n_q]
         self.kits = {kind: kit_of(system, t0, q0, plan) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0)
@@ -99,7 +99,7 @@ class Interpolator:
         self.filled: dict[float, tuple[Array, Array]] = {}
         self.sound: set[float] = set()  # where intervals begin whose neighbours serve
         self.judges = True
-        self.mending: dict[bool, tuple[Plan, Any]] = {}
+        self.repairs: dict[bool, tuple[Plan, Any]] = {}
         self._make_room()
 
     def _make_room(self) -> None:
@@ -163,7 +163,7 @@ class Interpolator:
         off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
         self.sound.update(table.t[groups[~inner & (off <= OFF), names.FIRST_OWN]].tolist())
         for k in np.flatnonzero(~(off <= OFF)):
-            self._mend(table, groups[k], float(off[k]))
+            self._repair(table, groups[k], float(off[k]))
 
     def _judged(self, table: Table, groups: Groups) -> Array:
         """How far the polynomials of these intervals are off, over the tolerances."""
@@ -181,12 +181,12 @@ class Interpolator:
         direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
-    def _mend(self, table: Table, group: Groups, worst: float) -> None:
+    def _repair(self, table: Table, group: Groups, worst: float) -> None:
         """Choose what serves an interval best: its neighbours, states within it by steps, or its ends alone."""
         i, kind = int(group[names.FIRST_OWN]), int(group[names.KIND])
         begin = float(table.t[i])
         ends = (table.t[i : i + 2], table.states[i : i + 2])
-        for found in (self._fill(table, *self._mending(kind), np.array([i])).get(begin, ends), ends):
+        for found in (self._fill(table, *self._repair_plan(kind), np.array([i])).get(begin, ends), ends):
             own = Table(np.ascontiguousarray(found[0]), np.ascontiguousarray(found[1]), table.kinds)
             single = group[None, :].copy()
             single[0, [names.FIRST_OWN, names.LAST_OWN, names.LOW, names.HIGH]] = 0, len(own.t) - 1, 0, len(own.t) - 1
@@ -197,19 +197,19 @@ class Interpolator:
         if begin not in self.filled:
             self.sound.add(begin)
 
-    def _mending(self, kind: int) -> tuple[Plan, Any]:
+    def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
         """By what steps an interval of a kind is divided where its method has none of its own."""
         stiff = kind == names.VELOCITIES
-        if stiff not in self.mending:
+        if stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
             from twoloop.methods.runge_kutta import RungeKutta
             from twoloop.methods.tableaux import radau_iia
 
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
             atol = float(self.tolerances[common.ATOL :].min())
-            plan = replace(method.plan(self.system.n_q, self.rtol, atol, True), parts=MENDED)
-            self.mending[stiff] = plan, kit_of(self.system, self.made_of[1], self.made_of[2][: self.system.n_q], plan)
-        return self.mending[stiff]
+            plan = replace(method.plan(self.system.n_q, self.rtol, atol, True), parts=REPAIRED)
+            self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], self.made_of[2][: self.system.n_q], plan)
+        return self.repairs[stiff]
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
         """A table of interior states, the groups of intervals that are in it, and those of others."""
