@@ -13,6 +13,7 @@ import pandas as pd
 from studies.bench import figures, study, tables
 from studies.bench.cli import StudyError
 from studies.bench.render import TEMPLATES
+from studies.bench.runs_by_error import SETTINGS
 from studies.bench.store import Output, plain, read_rows
 
 FILE = "compare.html"
@@ -61,7 +62,7 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
     rows = pd.concat(parts, ignore_index=True)
     # rows of cost against size have no setting, and no error to compare
-    settings = [name for name in tables.SETTINGS if name in rows]
+    settings = [name for name in SETTINGS if name in rows]
     return rows[rows[settings].notna().any(axis=1)].reset_index(drop=True), stamps
 
 

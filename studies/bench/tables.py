@@ -1,7 +1,6 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, lru_cache
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,13 +9,21 @@ from numpy.typing import NDArray
 
 from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
+from studies.bench.runs_by_error import (
+    astray,
+    by_solver,
+    cheapest,
+    cost_at,
+    errors_of,
+    place_of,
+    resampled,
+    runs_with,
+    setting_of,
+)
 from studies.bench.store import Array
 
-SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
-DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
-NEAR = 2.0  # settings that differ by less are nearly the same
-LOOSEST, TIGHTEST = 1e-1, 1e-13  # tolerances of which looser and tighter ones are of no use
-RESAMPLES, SEED, INTERVAL = 1000, 25, (2.5, 97.5)  # draws of the repetitions, and the percentiles that count of these
+TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
+INTERVAL = (2.5, 97.5)  # percentiles that count of times drawn again
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
@@ -25,7 +32,6 @@ RANKED = (
     *("family", "called_from", "keeps_constraints", *COSTS),
     *("violation_q", "violation_v", "energy"),
 )
-FEWEST = 3  # repetitions that an interval asks for
 NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
@@ -56,139 +62,6 @@ def where(rows: pd.DataFrame, **equal: Any) -> pd.DataFrame:
     return rows
 
 
-@cache
-def _rounds(n: int) -> NDArray[np.int64]:
-    """Rounds of n repetitions, drawn again (RESAMPLES, n): the same for all runs, as rounds are interleaved."""
-    return np.random.default_rng(SEED).integers(0, n, (RESAMPLES, n))
-
-
-def resampled(times: Iterable[Sequence[float]]) -> Array:
-    """Medians of the times of each run over rounds drawn again (n_runs, RESAMPLES); NaN of fewer than three."""
-    drawn = [_medians_drawn(tuple(own)) if len(own) >= FEWEST else np.full(RESAMPLES, np.nan) for own in times]
-    return np.array(drawn).reshape(-1, RESAMPLES)
-
-
-@lru_cache(maxsize=20_000)
-def _medians_drawn(times: tuple[float, ...]) -> Array:
-    return np.asarray(np.median(np.array(times)[_rounds(len(times))], axis=1))
-
-
-def setting_of(rows: pd.DataFrame) -> Array:
-    """Value of the setting that varies, of each row; NaN where there is none."""
-    found = np.full(len(rows), np.nan)
-    for name in SETTINGS:
-        if name in rows:
-            found = np.where(np.isnan(found), rows[name].to_numpy(float), found)
-    return found
-
-
-Place = tuple[int, int, float | None]
-
-
-class _Runs:
-    """The runs of one solver on one case that have an error and this cost, by error, in arrays.
-
-    A table of 70 columns takes minutes where it is sorted and cut for every solver and every error.
-    """
-
-    def __init__(self, columns: Mapping[str, NDArray[Any]], rows: NDArray[np.int64], what: str):
-        errors, settings = columns["error_q"][rows], columns["setting"][rows]
-        order = np.argsort(errors, kind="stable")  # NaN last
-        known = order[~np.isnan(errors[order]) & ~np.isnan(columns[what][rows][order])]
-        self.columns, self.rows = columns, rows[known]
-        self.floor = float(np.fmax.reduce(columns["floor"][self.rows], initial=-np.inf))
-        self.errors = np.maximum(errors[known], columns["floor"][self.rows])
-        self.settings = settings[known]
-        best = float(settings[~np.isnan(errors)].max(initial=0.0))
-        # than which none is looser that the solver can run: tried, or of no use
-        self.loosest = best if (settings[np.isnan(errors)] > best).any() else LOOSEST
-
-    def of(self, column: str) -> NDArray[Any]:
-        """What stands in a column."""
-        return self.columns[column][self.rows]
-
-    def drawn(self) -> Array:
-        """`resampled` of the times; NaN where these are not known."""
-        known = "times" in self.columns
-        return resampled(self.of("times")) if known else np.full((len(self.rows), RESAMPLES), np.nan)
-
-    def used(self, k: int) -> str:
-        """The method that the solver took in a run, if it chooses."""
-        taken = self.of("used")[k] if "used" in self.columns else ""
-        return taken if isinstance(taken, str) else ""
-
-
-def _columns(rows: pd.DataFrame, *more: str) -> dict[str, NDArray[Any]]:
-    """Columns that are looked at, and more numbers, as arrays."""
-    found: dict[str, NDArray[Any]] = {name: rows[name].to_numpy(float) for name in ("error_q", "floor", *more)}
-    found |= {name: rows[name].to_numpy() for name in ("used", "times") if name in rows}
-    return found | {"setting": setting_of(rows), "astray": astray(rows).to_numpy()}
-
-
-def _runs(rows: pd.DataFrame, what: str) -> _Runs:
-    """Those of rows of one solver."""
-    return _Runs(_columns(rows, what), np.arange(len(rows)), what)
-
-
-def _by_solver(rows: pd.DataFrame, *costs: str) -> dict[str, _Runs]:
-    """Those of each solver, in order of appearance; runs without the first of the costs are left out."""
-    columns = _columns(rows, *costs)
-    codes, names = pd.factorize(rows["solver"])
-    return {str(name): _Runs(columns, np.flatnonzero(codes == k), costs[0]) for k, name in enumerate(names)}
-
-
-def _place(runs: _Runs, target: float) -> Place | None:
-    """Which runs of one solver, by error, are good enough, and where between them and the next the target is.
-
-    Of those good enough the ones within a decade of the worst of them count: a run that is better by far, and cheaper
-    by the scatter of its time, is not what a user asks for. The first of these, and the number of all up to the last.
-    None: no run is so good, or none was asked for about this: within a decade below the target, at the loosest setting
-    that the solver can run, or at nearly the same setting as a looser one that is not good enough (the solver leaps
-    over the target). The place between two runs, on the log-log line through them, is None where they are more than a
-    decade apart or of different methods.
-    """
-    errors, settings = runs.errors, runs.settings
-    n_good = int((errors <= target).sum())
-    if n_good == 0 or target < runs.floor:
-        return None
-    below, end = errors[n_good - 1], n_good == len(errors)
-    joined = not end and 0.0 < errors[n_good] <= DECADE * below
-    looser = settings[n_good:, None] / settings[:n_good]
-    near = ((looser >= 1.0) & (looser <= NEAR)).any()
-    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= runs.loosest).any()):
-        return None
-    first = int((errors < below / DECADE).sum())
-    if not joined or runs.used(n_good - 1) != runs.used(n_good):
-        return first, n_good, None
-    x = np.log(errors[n_good - 1 : n_good + 1])
-    return first, n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
-
-
-def used(run: pd.Series) -> str:
-    """The method that a solver took which chooses; a file has nothing where there is none."""
-    return run["used"] if isinstance(run.get("used"), str) else ""
-
-
-def astray(runs: pd.DataFrame) -> pd.Series:
-    """Which runs have another motion than the reference; none where that was not looked at."""
-    return runs["astray"].isin((True, "True")) if "astray" in runs else pd.Series(False, runs.index)
-
-
-def _errors(runs: pd.DataFrame) -> Array:
-    return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
-
-
-def _cost(costs: Array, place: Place) -> Array:
-    """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
-    first, n_good, share = place
-    best = np.fmin.reduce(costs[first:n_good])  # NaN: draws of runs made once, as others are cheaper
-    if share is None:
-        return np.asarray(best)
-    with np.errstate(invalid="ignore"):
-        between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
-    return np.fmin(best, between)
-
-
 def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     """Time of a call (or another cost) of one solver for an error of at most `target`.
 
@@ -196,23 +69,17 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     not made to look expensive by it. NaN where no run is so good, where the solver was not asked for about so much, and
     where the target is below what the reference resolves.
     """
-    runs = _runs(rows, what)
-    place = _place(runs, target)
-    return float("nan") if place is None else float(_cost(runs.of(what), place))
+    runs = runs_with(rows, what)
+    place = place_of(runs, target)
+    return float("nan") if place is None else float(cost_at(runs.of(what), place))
 
 
 def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
     """The run of one solver that `time_for` prices, where there is one."""
-    runs = _runs(rows, "call_s")
-    place = _place(runs, target)
+    runs = runs_with(rows, "call_s")
+    place = place_of(runs, target)
     assert place is not None
-    return rows.iloc[_cheapest(runs, place)]
-
-
-def _cheapest(runs: _Runs, place: Place) -> int:
-    """The row of the cheapest run at a place."""
-    first, n_good, _ = place
-    return int(runs.rows[first + np.argmin(runs.of("call_s")[first:n_good])])
+    return rows.iloc[cheapest(runs, place)]
 
 
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
@@ -225,8 +92,8 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
     either side, so that no solver is ahead of another for want of a run. A run out of phase is on neither side.
     """
     found = {}
-    for solver, runs in _by_solver(rows, "call_s").items():
-        place = _place(runs, target)
+    for solver, runs in by_solver(rows, "call_s").items():
+        place = place_of(runs, target)
         if place is None and doubt and target >= runs.floor:
             n_good = int((runs.errors <= target).sum())
             looser = n_good < len(runs.errors) and not runs.of("astray")[n_good]
@@ -236,13 +103,13 @@ def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
             first, n_good, _ = place
             if np.isnan(drawn[first + np.argmin(costs[first:n_good])]).any():  # of the cheapest it is not known
                 drawn[:] = np.nan
-            found[solver] = float(_cost(costs, place)), _cost(drawn, place)
+            found[solver] = float(cost_at(costs, place)), cost_at(drawn, place)
     return found
 
 
 def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """The runs of one case that miss an error by a factor of less than NEARLY, on the motion of the reference."""
-    errors = _errors(rows)
+    errors = errors_of(rows)
     return rows[(errors > target) & (errors <= NEARLY * target) & ~astray(rows) & rows["call_s"].notna()]
 
 
@@ -293,13 +160,13 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
         log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
     lines = []
-    for solver, runs in _by_solver(rows, *COSTS).items():
-        place = _place(runs, target)
+    for solver, runs in by_solver(rows, *COSTS).items():
+        place = place_of(runs, target)
         if place is None:
             continue
-        run = rows.iloc[_cheapest(runs, place)]
+        run = rows.iloc[cheapest(runs, place)]
         line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
-        line |= {what: float(_cost(runs.of(what), place)) for what in COSTS}
+        line |= {what: float(cost_at(runs.of(what), place)) for what in COSTS}
         line |= {key: run[key] for key in ("violation_q", "violation_v", "energy")}
         lines.append(line | {"setting": setting(run)})
     return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)

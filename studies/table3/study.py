@@ -17,6 +17,7 @@ from studies.bench.collector import REPEATS, Case, Run, Solver, collect, row_of
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.render import number, power, table
+from studies.bench.runs_by_error import used
 from studies.bench.solvers import (
     ADAMS,
     CATALOGUE,
@@ -225,7 +226,7 @@ def _of_default(first: pd.DataFrame) -> dict[str, Any]:
     alike = (both["n_steps"] == both["n_steps_series"]) & (both["error_q"] == both["error_q_series"])
     same = both["tol"][alike.cummin().astype(bool)]
     looser = default[default["tol"] > same.max()] if len(same) else default
-    explicit = len(looser) > 0 and all(tables.used(run) == "explicit" for _, run in looser.iterrows())
+    explicit = len(looser) > 0 and all(used(run) == "explicit" for _, run in looser.iterrows())
     return {"series_from": float(same.max()) if len(same) else None, "default_explicit": explicit}
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from studies.bench import headline, index, tables
 from studies.bench.render import render
+from studies.bench.runs_by_error import LOOSEST
 from studies.work_precision import rivals
 from studies.work_precision import study as work_precision
 from tests.studies.test_index import case, energy
@@ -55,7 +56,7 @@ def test_the_most_steps_that_an_adapter_allows_are_a_limit_of_ours(message):
 
 
 def standing_beside(*rivals):
-    ours = rows(("auto", 1e-7, 0.1)).assign(tol=tables.LOOSEST, times=[(0.1,) * 5])
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=LOOSEST, times=[(0.1,) * 5])
     named = [own.assign(solver=f"rival {k}") for k, own in enumerate(rivals)]
     return headline.of_error(pd.concat([ours, *named], ignore_index=True), ERROR)["auto"]["verdict"]
 
@@ -78,7 +79,7 @@ def test_ida_is_neither_cvode_nor_casadis_idas():
         ("IDA, stabilised", "SUNDIALS", 9.0),
     ]
     table = rows(*((name, 1e-7, time) for name, _, time in made)).assign(family=[family for _, family, _ in made])
-    table = table.assign(case="crane", tol=tables.LOOSEST, times=[(time,) * 5 for *_, time in made])
+    table = table.assign(case="crane", tol=LOOSEST, times=[(time,) * 5 for *_, time in made])
     found = work_precision.class_of(table, ERROR)
     assert found["ida"]["solver"] == "IDA from C, stabilised" and found["others"]["solver"] == "CVODE from C, Adams"
     (entry,) = index.classes({"work_precision": {"cases": [case(at=[found])]}})
@@ -94,7 +95,7 @@ def test_ida_is_neither_cvode_nor_casadis_idas():
 
 
 def test_the_sentence_on_ida_names_the_tightest_tolerance_that_was_run():
-    ours = rows(("auto", 1e-7, 0.1)).assign(tol=tables.LOOSEST, times=[(0.1,) * 5])
+    ours = rows(("auto", 1e-7, 0.1)).assign(tol=LOOSEST, times=[(0.1,) * 5])
     ida = runs((1e-3, 1e-3, END), (1e-5, None, FAILED)).assign(solver="IDA from C, stabilised", family="SUNDIALS")
     found = work_precision.class_of(pd.concat([ours, ida], ignore_index=True).assign(case="crane"), ERROR)
     entries = index.classes({"work_precision": {"cases": [case(at=[found])]}})

@@ -5,6 +5,7 @@ import pytest
 
 from studies.bench import tables
 from studies.bench.collector import Case
+from studies.bench.runs_by_error import LOOSEST
 from studies.work_precision import goals
 from tests.studies.test_rivals import compared, rows
 
@@ -59,7 +60,7 @@ def test_the_stiff_beam_is_compared_with_ida_from_c_at_every_error(ours, ida, to
         case="beam",
     )
     table.loc[1:2, "tol"] = tol
-    loose = table.loc[1:2].assign(error_q=ERRORS[0], tol=tables.LOOSEST)  # what it costs to miss is told
+    loose = table.loc[1:2].assign(error_q=ERRORS[0], tol=LOOSEST)  # what it costs to miss is told
     (found,) = goals.findings_of([case], pd.concat([table, loose], ignore_index=True), table)["stiff"]
     assert (found["ahead"], found["lost"]) == (ahead, lost)
     assert found["ours_miss"] == ([ERRORS[2]] if ours[0] == LOOSE else [])

@@ -8,6 +8,7 @@ import pytest
 
 from studies.bench import headline, tables
 from studies.bench.render import render
+from studies.bench.runs_by_error import LOOSEST
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
 from studies.bench.store import KeptRows
 from studies.work_precision import goals, rivals, scaling
@@ -19,7 +20,7 @@ def rows(*lines, case="four-bar"):
     made = []
     for solver, family, called_from, error, cpu in lines:
         row = {"group": rivals.GROUP, "case": case, "solver": solver, "family": family, "called_from": called_from}
-        row |= {"error_q": error, "floor": 1e-14, "tol": tables.LOOSEST, "n_evaluations": 1e6 * cpu}
+        row |= {"error_q": error, "floor": 1e-14, "tol": LOOSEST, "n_evaluations": 1e6 * cpu}
         row |= {"call_s": cpu, "call_q1": cpu, "call_q3": cpu, "times": (cpu,) * 5}
         row |= {"violation_q": 1e-15, "violation_v": 1e-15, "energy": 0.0, "keeps_constraints": True}
         made.append(row | {"status": "REACHED_END", "repeat": 0})
