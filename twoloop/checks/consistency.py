@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space, qr
 
 from twoloop.checks.bounds import check_bounds
-from twoloop.checks.derivatives import check_derivatives, unsymmetric_mass
+from twoloop.checks.derivatives import UNSYMMETRIC, check_derivatives, unsymmetric_mass
 from twoloop.checks.scales import EPS, Scales, scales_of
 from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.linking import direct
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
@@ -51,6 +52,8 @@ def check_start(
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
+    if (system.checked or not derivatives) and _in_order(system, t0, q0, v0):
+        return
     jacobian = system.jacobian(t0, q0)
     rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
     reason = not_finite(system, t0, q0, v0)
@@ -74,6 +77,23 @@ def check_start(
     if not _at_rounding(rows @ v0 + rate, rows, v0, rate):
         scales = scales_of(system, t0, q0, rows)
         Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
+
+
+def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+    """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
+    from twoloop.kernels.evaluation import first_look
+
+    if system.called_in_python:
+        return False
+    n, n_c, n_a = system.n_q, system.n_c, system.n_a
+    room, lam = np.zeros(first_look.room_size(n, n_c, n_a)), np.ones(n_c)
+    mass, rows = np.zeros((n, n)), np.zeros((n_c + n_a, n))
+    try:
+        return bool(
+            direct(first_look.in_order)(system.kit, t, q, v, lam, room, mass, rows, ROUNDING * EPS, UNSYMMETRIC)
+        )
+    except Exception:  # of a callback, which is called by itself then
+        return False
 
 
 def _at_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> bool:
@@ -227,21 +247,30 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q)."""
-    found = np.zeros((system.n_c + system.n_a, system.n_q))
-    size = np.maximum(np.abs(q), np.abs(q).max())
-    for share, direction in zip(NEARBY, _directions(system.n_q), strict=True):
+    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q); not to be written to."""
+    return system.remembered_at("pattern", (t, q.tobytes()), lambda: _pattern_of(system, t, q))
+
+
+def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    from twoloop.kernels.evaluation import first_look
+
+    note, kit = direct(first_look.note_entries), system.kit
+    found, rows = np.zeros((2, system.n_c + system.n_a, system.n_q))
+    places = q + np.maximum(np.abs(q), np.abs(q).max()) * _displacements(system.n_q)
+    for some in (places, *places[:, None]):  # all at once, or one by one
         try:
-            found[system.rows(t, q + share * size * direction) != 0.0] = 1.0
+            note(kit, t, some, system.n_c, rows, found)
         except Exception:  # outside what the callbacks are made for; what is missed is found on the way
             continue
+        if some is places:
+            break
     return found
 
 
 @cache
-def _directions(n_q: int) -> Array:
-    """Ways in which positions near one lie, (len(NEARBY), n_q): always the same."""
-    return np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+def _displacements(n_q: int) -> Array:
+    """How far positions near one are from it, (len(NEARBY), n_q), over its size: always the same."""
+    return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
 
 
 def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:

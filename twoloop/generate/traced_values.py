@@ -60,7 +60,6 @@ class Traced:
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
         self.trusted = False
-        self._kit: Any = None
         entries = (forms[kind][place] for kind, place in self.places)
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
@@ -70,7 +69,7 @@ class Traced:
         other = copy.copy(self)
         constants, coefficients = evaluate(self.program.constants), evaluate(self.program.coefficients)
         other.program = self.program._replace(constants=constants, coefficients=coefficients)
-        other.name, other.trusted, other._kit = system.name, False, None
+        other.name, other.trusted = system.name, False
         return other
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
@@ -127,14 +126,11 @@ class Traced:
         return None
 
     def _both(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
-        from twoloop.kernels.data.common import Kit
         from twoloop.kernels.evaluation import traced as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
-        if self._kit is None or self._kit.functions is not system.functions:
-            self._kit = Kit(system.functions)
         n_different = direct(kernels.compare)(
-            self._kit,
+            system.kit,
             self.sizes,
             self.which,
             np.ascontiguousarray(states),

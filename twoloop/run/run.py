@@ -65,7 +65,7 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        self.pattern = system.remembered_at("pattern", (t0, q0.tobytes()), lambda: pattern_of(system, t0, q0))
+        self.pattern = pattern_of(system, t0, q0)
         self.work = self._workspace()
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.ATOL + system.n_q)

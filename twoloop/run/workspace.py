@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from twoloop.checks.consistency import least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
@@ -54,8 +55,10 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
 
 def _kind_of(mass: Array) -> tuple[bool, bool]:
     """Whether a mass matrix is diagonal, and definite."""
-    diagonal = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
-    return diagonal, bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+    diagonal = np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
+    least = SINGULAR_MASS * float(np.abs(mass).max())
+    surely = bool(lapack.dpotrf(mass - 2.0 * least * np.eye(len(mass)))[1] == 0)  # which is cheaper than eigenvalues
+    return diagonal, surely or bool(np.linalg.eigvalsh(mass).min() > least)
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:

@@ -1,0 +1,117 @@
+"""What numbers decide at a position before equations are written down: which rows of C_q and A count, and how M helps.
+
+The choice depends on the position alone, so that the same call gets the same code whatever ran before it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from twoloop.generate.tracing import Untraceable
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
+RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
+NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
+ROUNDING = 1e-8  # smallest pivot that is not nearly lost to rounding
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is decided by numbers at a position.
+
+    Attributes
+    ----------
+    rows : tuple of int
+        Rows of G of full rank.
+    added, scale : tuple of int, float
+        Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
+    least : float
+        What the pivot of a row must be, of what it is without the others, a power of ten.
+    """
+
+    rows: tuple[int, ...]
+    added: tuple[int, ...]
+    scale: float
+    least: float
+
+    @classmethod
+    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
+        """The choice at a position.
+
+        Raises
+        ------
+        Untraceable
+            If M is singular on velocities that the constraints allow.
+        """
+        mass, G = system.mass(t, q), system.rows(t, q)
+        rows = _independent(G)
+        if not rows:
+            return cls((), (), 1.0, 0.0)
+        place = None if system.constant_mass else (t, q.tobytes())
+        added: tuple[int, ...] = ()
+        scale = 1.0
+        if not system.remembered_at("definite mass", place, lambda: not _weak(_eigenvalues(mass)).any()):
+            scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
+            added = _rows_for_mass(mass, G, scale, system.name)
+            mass = mass + scale * G[list(added)].T @ G[list(added)]
+        if len(rows) < len(G):
+            G = G[rows]
+        S = G @ lapack.dgesv(mass, G.T)[2]
+        size = np.sqrt(S.diagonal())
+        smallest = float(_eigenvalues(S / (size * size[:, None]))[0])  # no pivot is smaller, in any order
+        return cls(tuple(rows), added, scale, 10.0 ** math.floor(math.log10(max(NEAR * smallest, ROUNDING))))
+
+
+def _independent(G: Array) -> list[int]:
+    """The first rows that no rows before add up to."""
+    if 0 < len(G) <= G.shape[1]:
+        rest_of = np.abs(lapack.dgeqrf(G.T)[0].diagonal())  # a row without its part in those before
+        if (rest_of > 2.0 * RANK * np.sqrt((G * G).sum(axis=1))).all():
+            return list(range(len(G)))
+    kept: list[int] = []
+    basis, squares = np.zeros((min(G.shape), G.shape[1])), (G * G).sum(axis=1).tolist()
+    for k, row in enumerate(G):
+        if len(kept) == len(basis):
+            break
+        before = basis[: len(kept)]
+        rest = row - (before @ row) @ before
+        rest -= (before @ rest) @ before
+        square = float(rest @ rest)
+        if square > RANK**2 * squares[k]:
+            basis[len(kept)] = rest / math.sqrt(square)
+            kept.append(k)
+    return kept
+
+
+def _eigenvalues(matrix: Array) -> Array:
+    """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
+    values, _, failed = lapack.dsyevd(matrix, compute_v=0)
+    return values if failed == 0 else np.linalg.eigvalsh(matrix)
+
+
+def _weak(values: NDArray[Any]) -> NDArray[Any]:
+    """Which of the eigenvalues of M, in order, are none."""
+    return values < SINGULAR_MASS * values[-1]
+
+
+def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int, ...]:
+    """Rows of G with which M is definite, those of few entries first."""
+    added: list[int] = []
+    while True:
+        values, vectors = np.linalg.eigh(mass)
+        weak = _weak(values)
+        if not weak.any():
+            return tuple(added)
+        helps = np.linalg.norm(G @ vectors[:, weak], axis=1) > SINGULAR_MASS**0.5 * np.linalg.norm(G, axis=1)
+        free = [k for k in np.argsort(np.count_nonzero(G, axis=1), kind="stable") if helps[k] and k not in added]
+        if not free:
+            raise Untraceable(f"the mass of {name!r} stays singular with constraints added")
+        added.append(int(free[0]))
+        mass = mass + scale * np.outer(G[free[0]], G[free[0]])
