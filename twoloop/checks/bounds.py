@@ -35,6 +35,8 @@ def check_bounds(system: "ConstrainedSystem", t: float, q: Array, v: Array) -> N
     ValueError
         Naming the callback, the index and the sizes of its arrays.
     """
+    if len(system.within_bounds) == len(KINDS):
+        return
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
     for kind, entry in KINDS.items():
         check_callback(system, kind, t, [state[name] for name in entry.state])

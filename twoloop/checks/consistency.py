@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space, qr
+from scipy.linalg import lapack, null_space
 
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import UNSYMMETRIC, check_derivatives, unsymmetric_mass
-from twoloop.checks.scales import EPS, Scales, scales_of
+from twoloop.checks.rank import in_words, largest_solution, redundant_rows
+from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
 
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+SURELY = 0.1  # of that: where no more is needed, there is no doubt
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
@@ -89,11 +90,48 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     room, lam = np.zeros(first_look.room_size(n, n_c, n_a)), np.ones(n_c)
     mass, rows = np.zeros((n, n)), np.zeros((n_c + n_a, n))
     try:
-        return bool(
-            direct(first_look.in_order)(system.kit, t, q, v, lam, room, mass, rows, ROUNDING * EPS, UNSYMMETRIC)
-        )
+        found = direct(first_look.look)(system.kit, t, q, v, lam, room, mass, rows, ROUNDING * EPS, UNSYMMETRIC)
     except Exception:  # of a callback, which is called by itself then
         return False
+    if found != first_look.INEXACT:
+        return bool(found == first_look.IN_ORDER)
+    force, C, rates = np.split(room[: n + 2 * n_c + n_a], (n, n + n_c))
+    return _surely_consistent(system, t, q, v, mass, force, rows, C, rates)
+
+
+def _surely_consistent(
+    system: ConstrainedSystem,
+    t: float,
+    q: Array,
+    v: Array,
+    mass: Array,
+    force: Array,
+    rows: Array,
+    C: Array,
+    rates: Array,
+) -> bool:
+    """Whether `Violation` would accept a state beyond doubt, by what is cheaper than singular values.
+
+    The largest that corrections can be stands for each of them, the row that allows least for all, at a share of what
+    it allows, and the least that accelerations M^-1 Q can be for these; what rounding explains is left out.
+    """
+    scales = scales_of(system, t, q, rows)
+    times = largest_solution(scales.scaled(rows))
+    fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+    speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
+    if lapack.dpotrf(mass)[1] == 0:
+        pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
+        speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
+    off = float(np.linalg.norm((rows @ v + rates) / scales.rows))
+    if not times * off <= SURELY * CONSISTENT * speeds.min():
+        return False
+    if system.n_a > 0:
+        if system.n_c == 0:
+            return True
+        rows = rows[: system.n_c]
+        scales = scales_of(system, t, q, rows)
+        times = largest_solution(scales.scaled(rows))
+    return bool(times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min())
 
 
 def _at_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> bool:
@@ -195,29 +233,6 @@ class Violation:
         )
 
 
-def redundant_rows(scaled: Array) -> list[int]:
-    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
-    if scaled.size == 0:
-        return []
-    R, order = qr(scaled.T, mode="r", pivoting=True)
-    diagonal = np.abs(np.diagonal(R))
-    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
-    return sorted(order[rank:].tolist())
-
-
-def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Which rows depend on which others, with the coefficients."""
-    others = [i for i in range(len(jacobian)) if i not in redundant]
-    first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
-    equations = []
-    for i, factors in zip(first, np.linalg.lstsq(jacobian[others].T, jacobian[first].T, rcond=None)[0].T, strict=True):
-        parts = np.abs(factors) * lengths[others]
-        terms = [f"{factors[k]:.4g} row {others[k]}" for k in np.flatnonzero(parts > 1e-9 * lengths[i])]
-        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
-    more = ", ..." if len(redundant) > 5 else ""
-    return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
-
-
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
     jacobian = system.rows(t, q)
@@ -252,19 +267,9 @@ def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    from twoloop.kernels.evaluation import first_look
-
-    note, kit = direct(first_look.note_entries), system.kit
-    found, rows = np.zeros((2, system.n_c + system.n_a, system.n_q))
-    places = q + np.maximum(np.abs(q), np.abs(q).max()) * _displacements(system.n_q)
-    for some in (places, *places[:, None]):  # all at once, or one by one
-        try:
-            note(kit, t, some, system.n_c, rows, found)
-        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
-            continue
-        if some is places:
-            break
-    return found
+    size = np.maximum(np.abs(q), np.abs(q).max())
+    rows, defined = rows_at(system, t, q + size * _displacements(system.n_q))  # what is missed is found on the way
+    return (rows[defined] != 0.0).any(axis=0).astype(float)
 
 
 @cache

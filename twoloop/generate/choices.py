@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from twoloop.checks.rank import orthogonalised
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem
 
@@ -75,25 +76,13 @@ def _independent(G: Array) -> list[int]:
         rest_of = np.abs(lapack.dgeqrf(G.T)[0].diagonal())  # a row without its part in those before
         if (rest_of > 2.0 * RANK * np.sqrt((G * G).sum(axis=1))).all():
             return list(range(len(G)))
-    kept: list[int] = []
-    basis, squares = np.zeros((min(G.shape), G.shape[1])), (G * G).sum(axis=1).tolist()
-    for k, row in enumerate(G):
-        if len(kept) == len(basis):
-            break
-        before = basis[: len(kept)]
-        rest = row - (before @ row) @ before
-        rest -= (before @ rest) @ before
-        square = float(rest @ rest)
-        if square > RANK**2 * squares[k]:
-            basis[len(kept)] = rest / math.sqrt(square)
-            kept.append(k)
-    return kept
+    return orthogonalised(G, RANK)[2]
 
 
 def _eigenvalues(matrix: Array) -> Array:
     """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
-    values, _, failed = lapack.dsyevd(matrix, compute_v=0)
-    return values if failed == 0 else np.linalg.eigvalsh(matrix)
+    values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
+    return values
 
 
 def _weak(values: NDArray[Any]) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""One look at a start by all callbacks: where nothing is wrong, nothing else needs to look."""
+"""One look at a start by all callbacks: where nothing is wrong, nothing else needs to look. And rows about it."""
 
 from numba import types
 
@@ -19,10 +19,25 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.finite import finite, finite_vector
 
+# what is found: nothing wrong; a state that is off by more than rounding; something else
+IN_ORDER, INEXACT, ODD = range(3)
+
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
     """How many numbers callbacks fill, beside M and the rows."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + 3 * n * n
+
+
+@exact
+def _empty(rows):
+    """Whether there is a row without entries."""
+    for i in range(len(rows)):
+        largest = 0.0
+        for j in range(rows.shape[1]):
+            largest = max(largest, abs(rows[i, j]))
+        if largest == 0.0:
+            return True
+    return False
 
 
 @exact
@@ -46,24 +61,24 @@ def _rounding(value, row, state, rate, allowed):
 
 @exact
 def _consistent(C, rate, rows, q, v, allowed):
-    """Whether positions and velocities are on the rows but for rounding, and no row is empty."""
+    """Whether positions and velocities are on the rows but for rounding."""
     for i in range(len(rows)):
-        speed, largest = 0.0, 0.0
+        speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-            largest = max(largest, abs(rows[i, j]))
-        if largest == 0.0 or not _rounding(speed + rate[i], rows[i], v, rate[i], allowed):
+        if not _rounding(speed + rate[i], rows[i], v, rate[i], allowed):
             return False
         if i < C.size and not _rounding(C[i], rows[i], q, 0.0, allowed):
             return False
     return True
 
 
-@kernel(types.boolean(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, f8, f8))
-def in_order(f, t, q, v, lam, room, mass, rows, rounding, unsymmetric):
-    """Whether all is finite at (t, q, v), M symmetric, and the state on the rows of C_q and A but for rounding.
+@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, f8, f8))
+def look(f, t, q, v, lam, room, mass, rows, rounding, unsymmetric):
+    """IN_ORDER if all is finite at (t, q, v), M symmetric, and the state on the rows of C_q and A but for rounding.
 
-    Arrays are full of zeros. `mass` and `rows` become M, and C_q with A; `room` has `room_size` numbers.
+    Arrays are full of zeros. `mass` and `rows` become M, and C_q with A; `room`, of `room_size` numbers, begins with
+    the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # where they end
@@ -90,23 +105,17 @@ def in_order(f, t, q, v, lam, room, mass, rows, rounding, unsymmetric):
     if flags[REACTION_BY_Q_GIVEN] == 1:
         f.reaction_by_q(t, q, lam, f.p, tangents[2 * n * n : 3 * n * n].reshape((n, n)))
     if not (finite(mass) and finite(rows) and finite_vector(room)):
-        return False
-    return _symmetric(mass, unsymmetric) and _consistent(room[force:C], room[C:rate], rows, q, v, rounding)
+        return ODD
+    if not _symmetric(mass, unsymmetric) or _empty(rows):
+        return ODD
+    return IN_ORDER if _consistent(room[force:C], room[C:rate], rows, q, v, rounding) else INEXACT
 
 
-@kernel(types.void(KIT, f8, MATRIX, i8, MATRIX, MATRIX))
-def note_entries(f, t, places, n_c, rows, pattern):
-    """Put 1 where C_q, of n_c rows, or A has an entry at one of these positions; `pattern` has zeros, `rows` anything.
-
-    What a callback leaves alone is zero.
-    """
+@kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
+def rows_at(f, t, places, n_c, rows):
+    """C_q, of n_c rows, and A at each of these positions, one below the other; `rows` has zeros."""
+    n_rows = len(rows) // len(places)
     for k in range(len(places)):
-        for i in range(len(rows)):
-            for j in range(rows.shape[1]):
-                rows[i, j] = 0.0
-        f.jacobian(t, places[k], f.p, rows[:n_c])
-        f.nonholonomic(t, places[k], f.p, rows[n_c:])
-        for i in range(len(rows)):
-            for j in range(rows.shape[1]):
-                if rows[i, j] != 0.0:
-                    pattern[i, j] = 1.0
+        begin = k * n_rows
+        f.jacobian(t, places[k], f.p, rows[begin : begin + n_c])
+        f.nonholonomic(t, places[k], f.p, rows[begin + n_c : begin + n_rows])
