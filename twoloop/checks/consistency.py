@@ -4,7 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ SURELY = 0.1  # of that: where no more is needed, there is no doubt
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel takes them
 
 
 class ConstraintWarning(UserWarning):
@@ -86,16 +88,21 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
     if system.called_in_python:
         return False
-    n, n_c, n_a = system.n_q, system.n_c, system.n_a
-    room, lam = np.zeros(first_look.room_size(n, n_c, n_a)), np.ones(n_c)
-    mass, rows = np.zeros((n, n)), np.zeros((n_c + n_a, n))
+    n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
+    room, lam = np.zeros(first_look.room_size(n, n_c, system.n_a)), np.ones(n_c)
+    mass, (rows, pattern) = np.zeros((n, n)), np.zeros((2, n_rows, n))
     try:
-        found = direct(first_look.look)(system.kit, t, q, v, lam, room, mass, rows, ROUNDING * EPS, UNSYMMETRIC)
+        found = direct(first_look.look)(system.kit, t, q, v, lam, room, mass, rows, _ways(n), pattern, LEAST)
     except Exception:  # of a callback, which is called by itself then
         return False
-    if found != first_look.INEXACT:
-        return bool(found == first_look.IN_ORDER)
-    force, C, rates = np.split(room[: n + 2 * n_c + n_a], (n, n + n_c))
+    if not found & first_look.IN_ORDER:
+        return False
+    system.remember_at("pattern", (t, q.tobytes()), pattern)
+    if found & first_look.DEFINITE:
+        system.remember_at("definite mass", _place(system, t, q), True)
+    if found & first_look.CONSISTENT:
+        return True
+    force, C, rates = np.split(room[: n + n_c + n_rows], (n, n + n_c))
     return _surely_consistent(system, t, q, v, mass, force, rows, C, rates)
 
 
@@ -268,14 +275,28 @@ def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     size = np.maximum(np.abs(q), np.abs(q).max())
-    rows, defined = rows_at(system, t, q + size * _displacements(system.n_q))  # what is missed is found on the way
+    rows, defined = rows_at(system, t, q + size * _ways(system.n_q))  # what is missed is found on the way
     return (rows[defined] != 0.0).any(axis=0).astype(float)
 
 
 @cache
-def _displacements(n_q: int) -> Array:
+def _ways(n_q: int) -> Array:
     """How far positions near one are from it, (len(NEARBY), n_q), over its size: always the same."""
     return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+
+
+def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
+    """Whether M has an inverse at a position, and not only on velocities that the constraints allow."""
+    return system.remembered_at("definite mass", _place(system, t, q), lambda: _is_definite(system.mass(t, q)))
+
+
+def _is_definite(mass: Array) -> bool:
+    return bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+
+
+def _place(system: ConstrainedSystem, t: float, q: Array) -> Any:
+    """What a mass matrix depends on."""
+    return None if system.constant_mass else (t, q.tobytes())
 
 
 def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:

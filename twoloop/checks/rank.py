@@ -63,7 +63,5 @@ def _combinations(others: Array, rows: Array) -> Array:
     """Which combination of others each row is, by least squares where it is none."""
     basis, factors, kept = orthogonalised(others, RANK_TOLERANCE)
     if len(kept) < len(others):
-        made: Array = np.linalg.lstsq(others.T, rows.T, rcond=None)[0].T
-    else:
-        made = lapack.dtrtrs(factors, basis @ rows.T, lower=1, trans=1)[0].T
-    return made
+        return np.linalg.lstsq(others.T, rows.T, rcond=None)[0].T  # type: ignore[return-value]
+    return lapack.dtrtrs(factors, basis @ rows.T, lower=1, trans=1)[0].T  # type: ignore[no-any-return]

@@ -3,7 +3,6 @@
 The choice depends on the position alone, so that the same call gets the same code whatever ran before it.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from scipy.linalg import lapack
 
 from twoloop.checks.rank import orthogonalised
 from twoloop.generate.tracing import Untraceable
+from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
 RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
 NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
-ROUNDING = 1e-8  # smallest pivot that is not nearly lost to rounding
+LEAST = 10.0 ** np.arange(-2, -9, -1)  # from what pivots may be at most down to what is not nearly lost to rounding
+BOUNDS = LEAST[:-1] / NEAR
 
 
 @dataclass(frozen=True)
@@ -52,31 +53,31 @@ class Choice:
             If M is singular on velocities that the constraints allow.
         """
         mass, G = system.mass(t, q), system.rows(t, q)
-        rows = _independent(G)
+        rows = orthogonalised(G, RANK)[2]
         if not rows:
             return cls((), (), 1.0, 0.0)
         place = None if system.constant_mass else (t, q.tobytes())
         added: tuple[int, ...] = ()
         scale = 1.0
-        if not system.remembered_at("definite mass", place, lambda: not _weak(_eigenvalues(mass)).any()):
+        if not system.remembered_at("no weak mass", place, lambda: not _weak(_eigenvalues(mass)).any()):
             scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
             added = _rows_for_mass(mass, G, scale, system.name)
             mass = mass + scale * G[list(added)].T @ G[list(added)]
         if len(rows) < len(G):
             G = G[rows]
-        S = G @ lapack.dgesv(mass, G.T)[2]
-        size = np.sqrt(S.diagonal())
-        smallest = float(_eigenvalues(S / (size * size[:, None]))[0])  # no pivot is smaller, in any order
-        return cls(tuple(rows), added, scale, 10.0 ** math.floor(math.log10(max(NEAR * smallest, ROUNDING))))
+        return cls(tuple(rows), added, scale, _least_pivot(mass, G, system.name))
 
 
-def _independent(G: Array) -> list[int]:
-    """The first rows that no rows before add up to."""
-    if 0 < len(G) <= G.shape[1]:
-        rest_of = np.abs(lapack.dgeqrf(G.T)[0].diagonal())  # a row without its part in those before
-        if (rest_of > 2.0 * RANK * np.sqrt((G * G).sum(axis=1))).all():
-            return list(range(len(G)))
-    return orthogonalised(G, RANK)[2]
+def _least_pivot(mass: Array, G: Array, name: str) -> float:
+    """The largest power of ten that is not above NEAR of any pivot that a row may have, from those of LEAST."""
+    from twoloop.kernels.algebra.pivots import first_bound_kept
+
+    n_rows, n = G.shape
+    room = np.empty((n, n)), np.empty((n, n_rows)), np.empty((2 * n_rows, n_rows)), np.empty(n_rows)
+    place = direct(first_bound_kept)(mass, G, BOUNDS, *room)
+    if place < 0:
+        raise Untraceable(f"the mass of {name!r} is too nearly singular")
+    return float(LEAST[place])
 
 
 def _eigenvalues(matrix: Array) -> Array:

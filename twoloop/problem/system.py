@@ -322,6 +322,11 @@ class ConstrainedSystem:
             known = self.made[what] = state, make()
         return known[1]
 
+    def remember_at(self, what: Any, state: Any, made: Any) -> None:
+        """Let `remembered_at` have what was made beside something else."""
+        if not self.called_in_python:
+            self.made[what] = state, made
+
     def arrays_of(self, kind: str) -> list[Array]:
         """Zeros for a kind of callback to fill."""
         return [np.zeros(shape) for shape in self._shapes[kind]]

@@ -2,6 +2,7 @@
 
 from numba import types
 
+from twoloop.kernels.algebra.linalg import ldl_factor
 from twoloop.kernels.data.common import (
     FORCE_BY_Q_GIVEN,
     FORCE_BY_V_GIVEN,
@@ -19,13 +20,14 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.finite import finite, finite_vector
 
-# what is found: nothing wrong; a state that is off by more than rounding; something else
-IN_ORDER, INEXACT, ODD = range(3)
+# flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; M definite
+IN_ORDER, CONSISTENT, DEFINITE = 1, 2, 4
+SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
-    """How many numbers callbacks fill, beside M and the rows."""
-    return n + 2 * (n_c + n_a) + n_c * (n + 4) + 3 * n * n
+    """How many numbers callbacks fill, beside M and the rows, and scratch."""
+    return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * (3 * n + n_c + n_a)
 
 
 @exact
@@ -73,12 +75,51 @@ def _consistent(C, rate, rows, q, v, allowed):
     return True
 
 
-@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, f8, f8))
-def look(f, t, q, v, lam, room, mass, rows, rounding, unsymmetric):
-    """IN_ORDER if all is finite at (t, q, v), M symmetric, and the state on the rows of C_q and A but for rounding.
+@exact
+def _note_entries(rows, pattern):
+    for i in range(len(rows)):
+        for j in range(rows.shape[1]):
+            if rows[i, j] != 0.0:
+                pattern[i, j] = 1.0
 
-    Arrays are full of zeros. `mass` and `rows` become M, and C_q with A; `room`, of `room_size` numbers, begins with
-    the force, C, and C_t with b.
+
+@exact
+def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
+    """Put 1 where rows have entries at positions that lie so many times the size of q from it."""
+    largest = 0.0
+    for j in range(q.size):
+        largest = max(largest, abs(q[j]))
+    for k in range(len(ways)):
+        for j in range(q.size):
+            place[j] = q[j] + max(abs(q[j]), largest) * ways[k, j]
+        for i in range(len(rows)):
+            for j in range(q.size):
+                rows[i, j] = 0.0
+        f.jacobian(t, place, f.p, rows[:n_c])
+        f.nonholonomic(t, place, f.p, rows[n_c:])
+        _note_entries(rows, pattern)
+
+
+@exact
+def _definite(mass, least, factors):
+    """Whether no eigenvalue is below this share of the largest entry, beyond doubt."""
+    n, largest = len(mass), 0.0
+    for i in range(n):
+        for j in range(n):
+            factors[i, j] = mass[i, j]
+            largest = max(largest, abs(mass[i, j]))
+    for i in range(n):
+        factors[i, i] -= SURELY * least * largest
+    return ldl_factor(factors)
+
+
+@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR))
+def look(f, t, q, v, lam, room, mass, rows, ways, pattern, least):
+    """Flags of what is found at (t, q, v); arrays are full of zeros, but for `lam`, and these.
+
+    `least` are relative: what counts as rounding of a state, as the asymmetry of M, and as an eigenvalue of M. `ways`
+    say how far from q, over its size, rows are looked at, too. `mass` and `rows` become M, and C_q with A, `pattern` 1
+    where rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # where they end
@@ -105,10 +146,17 @@ def look(f, t, q, v, lam, room, mass, rows, rounding, unsymmetric):
     if flags[REACTION_BY_Q_GIVEN] == 1:
         f.reaction_by_q(t, q, lam, f.p, tangents[2 * n * n : 3 * n * n].reshape((n, n)))
     if not (finite(mass) and finite(rows) and finite_vector(room)):
-        return ODD
-    if not _symmetric(mass, unsymmetric) or _empty(rows):
-        return ODD
-    return IN_ORDER if _consistent(room[force:C], room[C:rate], rows, q, v, rounding) else INEXACT
+        return 0
+    found = 0
+    if _symmetric(mass, least[1]) and not _empty(rows):
+        found = IN_ORDER
+        if _consistent(room[force:C], room[C:rate], rows, q, v, least[0]):
+            found |= CONSISTENT
+    if _definite(mass, least[2], tangents[: n * n].reshape((n, n))):
+        found |= DEFINITE
+    near = tangents[n * n : n * n + n_rows * n].reshape((n_rows, n))
+    _note_entries_near(f, t, q, ways, room[rate : rate + n], near, n_c, pattern)
+    return found
 
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
