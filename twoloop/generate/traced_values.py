@@ -8,6 +8,7 @@ at states spread over the time of the run and about its start, later at states o
 import copy
 import warnings
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -190,10 +191,15 @@ def unchecked(traced: Traced) -> None:
 
 def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
     """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
-    generic = np.random.default_rng(6)
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
     times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)[:, None]
-    parts = generic.uniform(-1.0, 1.0, (2, AROUND, len(q)))
+    parts = _parts(len(q))
     around = np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])
     return np.vstack([np.concatenate([[t0], q, v]), around])
+
+
+@cache
+def _parts(n_q: int) -> Array:
+    """Between -1 and 1, (2, AROUND, n_q): always the same."""
+    return np.random.default_rng(6).uniform(-1.0, 1.0, (2, AROUND, n_q))

@@ -1,6 +1,5 @@
 """The run of a call, made ready to go: checked, with its plan; kept for equal calls that follow."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -83,7 +82,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Ask
     code = code_for(system, asked.method, fixed, asked.compiled, t0, q0, check)
     plan, interiors = plans_for(system, asked.method, asked.rtol, float(asked.atol.min()), fixed, code, check)
     if derived:
-        plan = replace(plan, traced=(*plan.traced, *derived))
+        plan = plan.changed(traced=(*plan.traced, *derived))
     run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
     if not fixed:
         run.set_sizes(asked.first_step, asked.max_step, asked.t1)
