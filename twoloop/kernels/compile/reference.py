@@ -107,14 +107,7 @@ class Reference(types.Type):
         functions = tuple([getattr(values, field) for field in self.functions])
         addresses = self._addresses.get(functions)
         if addresses is None:
-            self._addresses[functions] = addresses = [
-                function
-                if field in self.own_functions
-                else 0
-                if function is None
-                else machine_code(function, signature)
-                for function, (field, signature) in zip(functions, self.functions.items(), strict=True)
-            ]
+            self._addresses[functions] = addresses = list(map(self._address, self.functions, functions))
         words.extend(addresses)
         return np.array(words, dtype=np.int64)
 
