@@ -25,6 +25,7 @@ CONSISTENT = 1e-8  # correction that an initial state may need, relative to the 
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
 
 
 class ConstraintWarning(UserWarning):
@@ -186,13 +187,19 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Which rows depend on which others, with the coefficients."""
+    """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
     others = [i for i in range(len(jacobian)) if i not in redundant]
     first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
     equations = []
     for i, factors in zip(first, np.linalg.lstsq(jacobian[others].T, jacobian[first].T, rcond=None)[0].T, strict=True):
         parts = np.abs(factors) * lengths[others]
-        terms = [f"{factors[k]:.4g} row {others[k]}" for k in np.flatnonzero(parts > 1e-9 * lengths[i])]
+        of = np.flatnonzero(parts > 1e-9 * lengths[i])
+        if len(of) > MOST_TERMS:
+            named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
+            also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
+            equations.append(f"row {i} on rows {named}{also}")
+            continue
+        terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
         equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
     more = ", ..." if len(redundant) > 5 else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
