@@ -9,6 +9,7 @@ from twoloop.kernels.compile.linking import direct
 Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
+MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
 NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
 
 
@@ -47,13 +48,19 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Which rows depend on which others, with the coefficients."""
+    """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
     others = [i for i in range(len(jacobian)) if i not in redundant]
     first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
     equations = []
     for i, factors in zip(first, _combinations(jacobian[others], jacobian[first]), strict=True):
         parts = np.abs(factors) * lengths[others]
-        terms = [f"{factors[k]:.4g} row {others[k]}" for k in np.flatnonzero(parts > 1e-9 * lengths[i])]
+        of = np.flatnonzero(parts > 1e-9 * lengths[i])
+        if len(of) > MOST_TERMS:
+            named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
+            also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
+            equations.append(f"row {i} on rows {named}{also}")
+            continue
+        terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
         equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
     more = ", ..." if len(redundant) > 5 else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
