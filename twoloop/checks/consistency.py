@@ -55,7 +55,9 @@ def check_start(
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
-    if (system.checked or not derivatives) and _in_order(system, t0, q0, v0):
+    if _in_order(system, t0, q0, v0):
+        if derivatives:
+            check_derivatives(system, t0, q0, exact)
         return
     jacobian = system.jacobian(t0, q0)
     rows = jacobian if system.n_a == 0 else system.rows(t0, q0)

@@ -41,6 +41,8 @@ class Family:
     ----------
     parameters : ndarray of float and Known (n_p,)
         With which callbacks are traced.
+    traced : set of str
+        Kinds of callbacks that were: they do the same in all systems, at the same places of their arrays.
     """
 
     def __init__(self, parameters: Array, classes: Sequence[int]):
@@ -52,6 +54,8 @@ class Family:
             which = int(self._classes[place])
             known = self._record.parameters[abs(which) - 1]
             self.parameters[place] = known if which > 0 else -known
+        self.traced: set[str] = set()
+        self.within_bounds: set[str] = set()  # of these, what `check_bounds` has looked at in one of the systems
         self._made: dict[Any, Any] = {}
         self._powers: dict[Powers, int] = {(): 0}  # products that stand in arrays of formulas, in the order they came
         self._arrays: dict[
@@ -123,6 +127,7 @@ def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any
             if isinstance(made, Untraceable):
                 raise made
             check(made)
+            family.traced |= made.kinds
             return made
         except Untraceable as error:
             reason = error
@@ -138,6 +143,20 @@ def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callab
         return error.with_traceback(None)
     except (ArithmeticError, RecursionError) as error:
         return Untraceable(f"what it makes of its parameters cannot be written down: {error}")
+
+
+def take_bounds(system: ConstrainedSystem) -> None:
+    """Let a system have what `check_bounds` has found in others of its family, whose callbacks do the same."""
+    if not system.called_in_python:
+        family: Family = system.remembered(("family", family_of), partial(family_of, system))
+        system.within_bounds |= family.within_bounds
+
+
+def give_bounds(system: ConstrainedSystem) -> None:
+    """Let others of its family have what `check_bounds` has found in a system."""
+    if not system.called_in_python:
+        family: Family = system.remembered(("family", family_of), partial(family_of, system))
+        family.within_bounds |= family.traced & system.within_bounds
 
 
 def family_of(system: ConstrainedSystem) -> Family:

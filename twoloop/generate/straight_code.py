@@ -203,6 +203,11 @@ class OwnCode(NamedTuple):
     traced: Traced
     evaluate: Evaluator  # of other formulas of the family
 
+    @property
+    def kinds(self) -> frozenset[str]:
+        """Of callbacks that ran on symbols."""
+        return self.traced.kinds
+
 
 def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:
     """The same of one that kernels know by its name."""

@@ -60,6 +60,7 @@ class Traced:
         self.which = np.array([kind in known for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
+        self.kinds = frozenset(graph.traced)  # that ran on symbols
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import check_start
 from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
+from twoloop.generate.families import give_bounds, take_bounds
 from twoloop.generate.traced_values import Traced
 from twoloop.methods.code_for import Compiled, code_for
 from twoloop.methods.plan import Method
@@ -67,6 +68,9 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
 
 def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
     start, fixed = (t0, q0.tobytes(), v0.tobytes()), asked.step_size is not None
+    given, new = system, not system.checked
+    if new:
+        take_bounds(system)
     system.remembered_at(
         ("start", asked.check_derivatives),
         start,
@@ -83,6 +87,8 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Ask
     plan, interiors = plans_for(system, asked.method, asked.rtol, float(asked.atol.min()), fixed, code, check)
     if derived:
         plan = plan.changed(traced=(*plan.traced, *derived))
+    if new:
+        give_bounds(given)
     run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
     if not fixed:
         run.set_sizes(asked.first_step, asked.max_step, asked.t1)
