@@ -47,13 +47,19 @@ class Scales:
 def sizes(q: Array) -> Array:
     """A first guess at how far each coordinate must move to matter."""
     size = np.abs(q)
-    typical = _median(size[size > 0.0]) if size.any() else 1.0
-    return np.maximum(size, 1e-3 * typical)
+    ordered = size.copy()
+    ordered.sort()
+    n_zeros = len(q) - np.count_nonzero(size)
+    return np.maximum(size, 1e-3 * _middle(ordered[n_zeros:]) if n_zeros < len(q) else 1e-3)
 
 
 def _median(values: Array) -> float:
     """Of numbers that are finite, without what NumPy does about others."""
-    ordered = np.sort(values)
+    return _middle(np.sort(values))
+
+
+def _middle(ordered: Array) -> float:
+    """The same of numbers in order."""
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 

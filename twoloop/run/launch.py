@@ -40,7 +40,7 @@ class Asked(NamedTuple):
 def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
     """The run of a call: a copy of a kept one, if an equal call was made and none from another start came between.
 
-    Kept are those of presets, compiled callbacks and trusted traces, if no call before was from another start.
+    Kept are those of presets, compiled callbacks and trusted traces, if the call before was from the same start.
 
     Raises
     ------
@@ -51,13 +51,13 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
         return _made(system, t0, q0, v0, asked)
     method, rtol, atol, *others = asked
     start, call = (t0, q0.tobytes(), v0.tobytes()), (id(method), rtol, atol.tobytes(), *others)
-    came_from, kept = system.made.get("runs", (start, {}))
+    came_from, kept = system.made.get("runs", (None, {}))
     if came_from == start and call in kept:
         again: Run = kept[call].again()
         return again
     run = _made(system, t0, q0, v0, asked)
     trusted = is_preset(method) and all(traced.trusted for traced in run.traced)
-    if came_from != start:  # it may be one of many starts, each of which is taken once
+    if came_from != start:  # it may be one of many starts, or of many systems, each of which is taken once
         kept = {}
     elif trusted and run.work.notes.base.size <= LARGEST:
         kept = {} if len(kept) == MOST else dict(kept)  # another thread may look at the old one

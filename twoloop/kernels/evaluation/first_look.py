@@ -167,3 +167,42 @@ def rows_at(f, t, places, n_c, rows):
         begin = k * n_rows
         f.jacobian(t, places[k], f.p, rows[begin : begin + n_c])
         f.nonholonomic(t, places[k], f.p, rows[begin + n_c : begin + n_rows])
+
+
+@exact
+def _as_given(fused, given, allowed, more):
+    """Whether no number differs by more than this share of the largest, and what a row may more."""
+    largest = 0.0
+    for i in range(given.shape[0]):
+        for j in range(given.shape[1]):
+            largest = max(largest, abs(given[i, j]))
+    for i in range(given.shape[0]):
+        for j in range(given.shape[1]):
+            if abs(fused[i, j] - given[i, j]) > allowed * largest + more[i]:
+                return False
+    return True
+
+
+@kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
+def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
+    """Whether the fused callback gives what the separate ones give, but for a share of the largest number of each.
+
+    Constraints may be off by rounding of their terms, too. Arrays are full of zeros: `fused` and `given` have the rows
+    C, C_t and gamma, and C_q below, (3 + n_q, n_c); `more` has n_c numbers.
+    """
+    n, n_c = q.size, more.size
+    by_one, by_others = fused[3:].reshape((n_c, n)), given[3:].reshape((n_c, n))
+    f.kinematics(t, q, v, f.p, fused[0], by_one, fused[1], fused[2])
+    f.constraint(t, q, f.p, given[0])
+    f.jacobian(t, q, f.p, by_others)
+    f.constraint_rate(t, q, f.p, given[1])
+    f.gamma(t, q, v, f.p, given[2])
+    agree = _as_given(by_one, by_others, allowed, more)
+    for k in range(1, 3):
+        agree = agree and _as_given(
+            fused[k : k + 1].reshape((n_c, 1)), given[k : k + 1].reshape((n_c, 1)), allowed, more
+        )
+    for i in range(n_c):
+        for j in range(n):
+            more[i] += rounding * abs(by_others[i, j]) * abs(q[j])
+    return agree and _as_given(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)
