@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
-from twoloop.checks.scales import column_scales, sizes
+from twoloop.checks.scales import column_scales, generic_factors, median, sizes
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
@@ -208,8 +208,10 @@ def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """The same a little off the start, where what is zero there shows."""
-    near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
-    if system.constant_mass or _defined(lambda: system.mass(t, near)) is None:
+    if system.constant_mass:
+        return None
+    near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
+    if _defined(lambda: system.mass(t, near)) is None:
         return None
     wrong = unsymmetric_mass(system, t, near)
     return None if wrong is None else f"{wrong} (near the start: at q = {near})"
@@ -239,8 +241,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """Which entry of the tangents that are given is wrong."""
     if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
         return None
-    generic = np.random.default_rng(1)
-    v = sizes(q) * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    v = sizes(q) * generic_factors(system.n_q)
     if _defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
         q = q + NEAR_START * v
 
@@ -323,9 +324,9 @@ def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> A
 
 def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
     """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
-    generic = np.random.default_rng(1)
-    v = column_scales(jacobian, sizes(q)) * generic.uniform(0.5, 1.5, len(q)) * generic.choice((-1.0, 1.0), len(q))
-    v = v / float(np.median(np.abs(v) / sizes(q)))
+    size = sizes(q)
+    v = column_scales(jacobian, size) * generic_factors(len(q))
+    v = v / median(np.abs(v) / size)
     driven, moved = rate != 0.0, np.abs(jacobian) @ np.abs(v)
     if not (driven & (moved > 0.0)).any():
         return [v]
@@ -391,7 +392,7 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
 def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
     if not system.constant_mass:
         return
-    shift = 0.1 * sizes(q) * np.random.default_rng(1).choice((-1.0, 1.0), system.n_q)
+    shift = 0.1 * sizes(q) * np.sign(generic_factors(system.n_q))
     there = _defined(lambda: system.mass(t + 1.0, q + shift))
     if there is not None and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
         raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
@@ -402,8 +403,7 @@ def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arr
     places = np.arange(system.n_q)
     farthest, where = bandwidth, ""
     size = float(np.abs(q).max()) or 1.0
-    generic = np.random.default_rng(1)
-    v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    v = size * generic_factors(system.n_q)
     q, shift = q + 1e-3 * v, 1e-3 * size
 
     def look(what: str, j: int, column: Array, level: float) -> None:

@@ -53,7 +53,14 @@ def sizes(q: Array) -> Array:
     return np.maximum(size, 1e-3 * _middle(ordered[n_zeros:]) if n_zeros < len(q) else 1e-3)
 
 
-def _median(values: Array) -> float:
+@cache
+def generic_factors(n_q: int) -> Array:
+    """Between 0.5 and 1.5, of either sign, (n_q,): always the same."""
+    generic = np.random.default_rng(1)
+    return generic.uniform(0.5, 1.5, n_q) * generic.choice((-1.0, 1.0), n_q)
+
+
+def median(values: Array) -> float:
     """Of numbers that are finite, without what NumPy does about others."""
     return _middle(np.sort(values))
 
@@ -80,7 +87,7 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     from twoloop.kernels.algebra.scaling import NEGLIGIBLE, reaches
 
     size = np.abs(q)
-    typical = _median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
+    typical = median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
     columns = column_scales(jacobian, np.maximum(size, typical))
     in_units = np.abs(jacobian) * columns
     norms, curvature = np.sqrt((in_units * in_units).sum(axis=1)), _curvature(system, t, q, columns, len(jacobian))

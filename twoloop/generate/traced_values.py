@@ -29,6 +29,7 @@ KINDS = (
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
 AROUND = 8  # states about the start, beside it
+TIMES = np.linspace(0.0, 1.0, AROUND)  # of a run, over its length, at which these are
 AWAY = 0.3  # of the size of coordinates: how far these are from it
 EACH, MOST = 32, 64  # states of a part of a run, and of a run ...
 FEW = 9  # ... if callbacks are called in Python
@@ -194,10 +195,13 @@ def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
     """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
-    times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)[:, None]
-    parts = _parts(len(q))
-    around = np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])
-    return np.vstack([np.concatenate([[t0], q, v]), around])
+    n, parts = len(q), _parts(len(q))
+    states = np.empty((1 + AROUND, 1 + 2 * n))
+    states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
+    states[1:, 0] = t0 + (t1 - t0) * TIMES
+    states[1:, 1 : 1 + n] = q + AWAY * size * parts[0]
+    states[1:, 1 + n :] = speed * parts[1]
+    return states
 
 
 @cache
