@@ -90,6 +90,7 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
     if system.called_in_python:
         return False
+    q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
     n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
     room, lam = np.zeros(first_look.room_size(n, n_c, system.n_a)), np.ones(n_c)
     mass, (rows, pattern) = np.zeros((n, n)), np.zeros((2, n_rows, n))

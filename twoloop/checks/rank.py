@@ -22,7 +22,7 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
 
     most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
     basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
-    n = direct(independent_rows)(rows, least, basis, factors, kept)
+    n = direct(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
     return basis[:n], factors[:n, :n], kept[:n].tolist()
 
 
