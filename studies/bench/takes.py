@@ -34,7 +34,8 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
         picks = picks or ["no solver compared reaches these errors"]
-        calm = [f"{call(pick['solver'])} for {listed(pick['accuracies'])}" for pick in group[0].get("without_drift", [])]
+        free = group[0].get("without_drift", [])
+        calm = [f"{call(pick['solver'])} for {listed(pick['accuracies'])}" for pick in free]
         without = f"; its energy drifts or wanders, without drift: {'; '.join(calm)}" if calm else ""
         rows.append({"what": what, "take": "; ".join(picks) + doubt + without})
     often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
