@@ -100,7 +100,9 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
         return False
     if not found & first_look.IN_ORDER:
         return False
-    system.remember_at("pattern", (t, q.tobytes()), pattern)
+    place = (t, q.tobytes())
+    system.remember_at("pattern", place, pattern)
+    system.remember_at("mass and rows", place, (mass, rows))
     if found & first_look.DEFINITE:
         system.remember_at("definite mass", _place(system, t, q), True)
     if found & first_look.CONSISTENT:
@@ -286,6 +288,11 @@ def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
 def _ways(n_q: int) -> Array:
     """How far positions near one are from it, (len(NEARBY), n_q), over its size: always the same."""
     return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+
+
+def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
+    """M, and C_q with A, at a position; not to be written to."""
+    return system.remembered_at("mass and rows", (t, q.tobytes()), lambda: (system.mass(t, q), system.rows(t, q)))
 
 
 def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:

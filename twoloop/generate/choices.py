@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from twoloop.checks.consistency import mass_and_rows
 from twoloop.checks.rank import orthogonalised
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
@@ -52,7 +53,7 @@ class Choice:
         Untraceable
             If M is singular on velocities that the constraints allow.
         """
-        mass, G = system.mass(t, q), system.rows(t, q)
+        mass, G = mass_and_rows(system, t, q)
         rows = orthogonalised(G, RANK)[2]
         if not rows:
             return cls((), (), 1.0, 0.0)
