@@ -12,7 +12,7 @@ from scipy.linalg import lapack, null_space
 
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import UNSYMMETRIC, check_derivatives, unsymmetric_mass
-from twoloop.checks.rank import in_words, largest_solution, redundant_rows
+from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
 from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
@@ -301,7 +301,7 @@ def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
 
 
 def _is_definite(mass: Array) -> bool:
-    return bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+    return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
 
 
 def _place(system: ConstrainedSystem, t: float, q: Array) -> Any:
