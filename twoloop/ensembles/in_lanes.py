@@ -3,6 +3,7 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
 from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.straight_line import Choice
-from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ class LaneRuns:
     ----------
     system : ConstrainedSystem
     starts : Starts
+    method : LaneMethod
 
     Raises
     ------
@@ -36,14 +37,14 @@ class LaneRuns:
         Saying why lanes cannot do it.
     """
 
-    def __init__(self, system: ConstrainedSystem, starts: Starts):
+    def __init__(self, system: ConstrainedSystem, starts: Starts, method: Any):
         from twoloop.generate.own_lanes import OwnLanes  # compiled, or read from the cache, at the first ensemble
 
-        self.system, self.starts = system, starts
+        self.system, self.starts, self.method = system, starts, method
         generic, varying = generic_parameters(starts.parameters)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        kind = ("lanes", choice, tuple(varying))  # of which the latest is kept
-        make = partial(OwnLanes, system, choice, generic, varying)
+        kind = ("lanes", method.has_series, choice, tuple(varying))  # of which the latest is kept
+        make = partial(OwnLanes, system, choice, generic, varying, method.has_series)
         self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
 
     def off(self) -> tuple[Array, Array]:
@@ -93,17 +94,21 @@ class LaneRuns:
         status: Integers,
         n_steps: Integers,
     ) -> None:
-        from twoloop.kernels import lanes
+        from twoloop.kernels.lanes import lane_room, lane_runs
 
-        starts, code = self.starts, self.own.code
-        n, n_rows, order = code.n, code.n_rows, order_in_lanes(rtol, float(atol.min())) + 1
+        starts, code, method = self.starts, self.own.code, self.method
+        n, n_rows, order = code.n, code.n_rows, method.order(rtol, float(atol.min()))
+        options = method.options(n, rtol, float(atol.min()))
         numbers = self.own.numbers(starts.parameters[rows])
-        room = _aligned(lanes.places(n, n_rows, code.n_numbers, order)[-1] + code.scratch_size(order), lanes.LANES)
+        begin = lane_room.places(n, n_rows, code.n_numbers)[-1]
+        room = _aligned(begin + method.memory_size(code, order, options), lane_room.LANES)
+        kit = lane_room.LaneKit(self.own.functions, method.kernels())
         redundant = bool(code.equations.redundant.conditions)
-        settings = np.array([n, n_rows, order, redundant], dtype=np.int64)
+        settings = np.array([n, n_rows, order, redundant, code.n_numbers], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[rows]), np.ascontiguousarray(starts.v[rows])
-        lanes.advance_lanes(self.own.kit, settings, control, times, numbers, *given, *out, status, n_steps, room)
+        arrays = times, numbers, *given, *out, status, n_steps, room
+        lane_runs.advance_lanes(kit, settings, control, options, *arrays)
 
     def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
         """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""

@@ -1,0 +1,137 @@
+"""Steps of DOP853 in lanes, as `explicit_step` has them with free stages: the end alone is put on the constraints."""
+
+import numpy as np
+
+from twoloop.kernels.data.common import compiled, inlined, kernel
+from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps
+from twoloop.kernels.lanes.lane_room import (
+    AHEAD,
+    ATOL,
+    ATTEMPT_LANES,
+    ERROR,
+    FINE,
+    LANES,
+    N_NUMBERS,
+    N_ROWS,
+    ORDER,
+    REACH,
+    RTOL,
+    RUNNING,
+    T1,
+    H,
+    LaneMethod,
+    N,
+    T,
+    X,
+    fill_field,
+    places_of,
+)
+from twoloop.kernels.steps.explicit_step import tableau_of
+from twoloop.kernels.steps.weighted_sums import weighted_sum
+
+# of the method's memory, in vectors: accelerations at STATE (n), then the state at which the step begins (2n), two
+# estimates (2n each) and velocities and accelerations of the stages (s, 2n)
+N_BEFORE_SLOPES = 7
+
+
+def memory_size(s: int, n: int) -> int:
+    """Length of the method's memory, in vectors, for s stages."""
+    return (N_BEFORE_SLOPES + 2 * s) * n
+
+
+@inlined
+def _vectors(room, begin, count):
+    return room[begin * LANES : (begin + count) * LANES]
+
+
+@inlined
+def _slopes(room, memory, n, s):
+    begin, width = (memory + N_BEFORE_SLOPES * n) * LANES, 2 * n * LANES
+    return room[begin : begin + s * width].reshape((s, width))
+
+
+@compiled
+def _copy(room, source, target, count):
+    for i in range(count * LANES):
+        room[target * LANES + i] = room[source * LANES + i]
+
+
+@compiled
+def _move(room, begin, total, new, n):
+    """NEW = the beginning of the step + X times the sum of slopes."""
+    for j in range(2 * n):
+        for k in range(LANES):
+            change = room[X * LANES + k] * room[(total + j) * LANES + k]
+            room[(new + j) * LANES + k] = room[(begin + j) * LANES + k] + change
+
+
+@compiled
+def _stages(code, settings, control, options, room):
+    """NEW, X after the beginning of the step, where the slopes are those of the first stage."""
+    n, order = settings[N], settings[ORDER]
+    _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    begin, total = memory + n, memory + 3 * n
+    s, A, b, c, _, _ = tableau_of(options[N_HEAD:])
+    slopes, sums = _slopes(room, memory, n, s), _vectors(room, total, 2 * n)
+    for i in range(1, s):
+        weighted_sum(A[i, :i], slopes, sums)
+        _move(room, begin, total, new, n)
+        for k in range(LANES):
+            room[AHEAD * LANES + k] = room[T * LANES + k] + c[i] * room[X * LANES + k]
+        code.there(order, control, room)
+        place = memory + (N_BEFORE_SLOPES + 2 * i) * n
+        _copy(room, new + n, place, n)
+        _copy(room, a, place + n, n)
+    weighted_sum(b, slopes, sums)
+    _move(room, begin, total, new, n)
+
+
+@compiled
+def _estimate(control, options, room, n, state, new, memory):
+    """ERROR of the steps, as largest_error of explicit_step.py has it."""
+    s, _, _, _, fine, coarse = tableau_of(options[N_HEAD:])
+    slopes, one, other = _slopes(room, memory, n, s), memory + 3 * n, memory + 5 * n
+    weighted_sum(fine, slopes, _vectors(room, one, 2 * n))
+    weighted_sum(coarse, slopes, _vectors(room, other, 2 * n))
+    rtol = control[RTOL]
+    for k in range(LANES):
+        e = d = 0.0
+        for j in range(2 * n):
+            size = max(abs(room[(state + j) * LANES + k]), abs(room[(new + j) * LANES + k]))
+            share = room[H * LANES + k] / (control[ATOL + j % n] + rtol * size)
+            e = max(e, abs(room[(one + j) * LANES + k] * share))
+            d = max(d, abs(room[(other + j) * LANES + k] * share))
+        room[ERROR * LANES + k] = e * e / np.hypot(e, d) if e > 0.0 else 0.0
+
+
+@kernel(ATTEMPT_LANES, vectorized=True)
+def attempt_dop853(code, settings, control, options, room, status, n_steps):
+    """A step, no longer than the gap within which the equations are looked at."""
+    n = settings[N]
+    state, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    slopes = memory + N_BEFORE_SLOPES * n
+    begin_control(options, control, room, n, state, a, memory)
+    choose_steps(room, control, status, n_steps)
+    _copy(room, state, memory + n, 2 * n)
+    _copy(room, state + n, slopes, n)
+    _copy(room, memory, slopes + n, n)
+    fill_field(room, FINE, 1.0)
+    _stages(code, settings, control, options, room)
+    _estimate(control, options, room, n, state, new, memory)
+    for k in range(LANES):
+        t, h = room[T * LANES + k], room[H * LANES + k]
+        room[AHEAD * LANES + k] = control[T1] if h == control[T1] - t else t + h
+        room[FINE * LANES + k] *= room[RUNNING * LANES + k]
+    end_steps(code, settings, control, room, memory + 3 * n)
+    judge_steps(options, room, n, a, memory, status)
+
+
+@kernel(REACH, vectorized=True)
+def reach_by_stages(code, settings, control, options, room):
+    """States within a step, each by a shorter step from its beginning."""
+    _stages(code, settings, control, options, room)
+    for k in range(LANES):
+        room[AHEAD * LANES + k] = room[T * LANES + k] + room[X * LANES + k]
+
+
+DOP853_IN_LANES = LaneMethod(attempt_dop853, reach_by_stages)
