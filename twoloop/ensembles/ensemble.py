@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
-from twoloop.ensembles.in_lanes import LaneRuns, threads_of
-from twoloop.ensembles.lane_methods import DOP853InLanes, TaylorInLanes
+from twoloop.ensembles.in_lanes import LaneRuns, in_lanes_by, threads_of
+from twoloop.ensembles.lane_methods import IN_LANES, lane_methods
 from twoloop.ensembles.runs import Runs
 from twoloop.ensembles.starts import NEAR, Starts, all_starts, system_of
 from twoloop.generate.tracing import Untraceable
@@ -19,7 +19,6 @@ from twoloop.solve import check_method, solve_dae
 
 Array = NDArray[np.float64]
 
-IN_LANES = ("auto", "Taylor", "DOP853")  # methods that go in lanes
 FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
@@ -105,9 +104,9 @@ def ensemble(
                 raise Untraceable("events are looked for in single runs only")
             if method not in IN_LANES:
                 raise Untraceable(f"{chosen.name} does not go in lanes")
-            if (first.stats.n_jacobians or 0) > 0:
-                raise Untraceable("the motion is stiff, and the first run was made by Newton's method")
-            lanes = LaneRuns(system, starts, DOP853InLanes() if method == "DOP853" else TaylorInLanes())
+            stiff = (first.stats.n_jacobians or 0) > 0
+            methods = lane_methods(str(method), stiff, system.n_q, float(rtol), float(tolerance.min()))
+            lanes = in_lanes_by(system, starts, methods)
             singly = n_runs * (first.stats.cpu_time + CALL)
             if lanes.own.seconds_to_build > WORTH * singly:
                 raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")

@@ -3,14 +3,15 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
 from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.straight_line import Choice
+from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -37,14 +38,14 @@ class LaneRuns:
         Saying why lanes cannot do it.
     """
 
-    def __init__(self, system: ConstrainedSystem, starts: Starts, method: Any):
+    def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
         from twoloop.generate.own_lanes import OwnLanes  # compiled, or read from the cache, at the first ensemble
 
         self.system, self.starts, self.method = system, starts, method
         generic, varying = generic_parameters(starts.parameters)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        kind = ("lanes", method.has_series, choice, tuple(varying))  # of which the latest is kept
-        make = partial(OwnLanes, system, choice, generic, varying, method.has_series)
+        kind = ("lanes", method.series, choice, tuple(varying))  # of which the latest is kept
+        make = partial(OwnLanes, system, choice, generic, varying, method.series)
         self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
 
     def off(self) -> tuple[Array, Array]:
@@ -97,18 +98,17 @@ class LaneRuns:
         from twoloop.kernels.lanes import lane_room, lane_runs
 
         starts, code, method = self.starts, self.own.code, self.method
-        n, n_rows, order = code.n, code.n_rows, method.order(rtol, float(atol.min()))
-        options = method.options(n, rtol, float(atol.min()))
+        n, n_rows = code.n, code.n_rows
         numbers = self.own.numbers(starts.parameters[rows])
         begin = lane_room.places(n, n_rows, code.n_numbers)[-1]
-        room = _aligned(begin + method.memory_size(code, order, options), lane_room.LANES)
-        kit = lane_room.LaneKit(self.own.functions, method.kernels())
+        room = _aligned(begin + method.memory(code), lane_room.LANES)
+        kit = lane_room.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant.conditions)
-        settings = np.array([n, n_rows, order, redundant, code.n_numbers], dtype=np.int64)
+        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[rows]), np.ascontiguousarray(starts.v[rows])
         arrays = times, numbers, *given, *out, status, n_steps, room
-        lane_runs.advance_lanes(kit, settings, control, options, *arrays)
+        lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)
 
     def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
         """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""
@@ -123,6 +123,22 @@ class LaneRuns:
         chosen = (np.ascontiguousarray(each[which]) for each in arrays)
         disagreement(*kit_to_write(system), t1, AGREES, atol, *chosen, room, worst)
         return which[~(worst <= 1.0)].tolist()
+
+
+def in_lanes_by(system: ConstrainedSystem, starts: Starts, methods: list[LaneMethod]) -> LaneRuns:
+    """The runs by the first of some methods whose code can be had.
+
+    Raises
+    ------
+    Untraceable
+        Saying why there is none, as the last one has it.
+    """
+    for method in methods[:-1]:
+        try:
+            return LaneRuns(system, starts, method)
+        except Untraceable:
+            continue
+    return LaneRuns(system, starts, methods[-1])
 
 
 def _aligned(vectors: int, lanes: int) -> Array:

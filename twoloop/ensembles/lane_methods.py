@@ -1,5 +1,6 @@
-"""Methods that go in lanes: their kernels, their parameters and their memory."""
+"""Methods that go in lanes: the step of each, its parameters and its memory."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,69 +8,105 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.lane_code import LaneCode
-from twoloop.methods.plan import Plan, least_tolerance
+from twoloop.methods.auto import LOOSE, TIGHTEST
+from twoloop.methods.dop853_tableau import B
+from twoloop.methods.plan import Method, least_tolerance
 from twoloop.methods.presets import PRESETS
+from twoloop.methods.runge_kutta import RungeKutta
+from twoloop.methods.tableaux import radau_iia
 from twoloop.methods.taylor import order_in_lanes
 from twoloop.run.run import FIRST_STEP
 
 Array = NDArray[np.float64]
 
+IN_LANES = ("auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9", "RadauIIA13")  # presets that go in lanes
+
 
 @dataclass(frozen=True)
-class TaylorInLanes:
-    """Taylor series."""
+class LaneMethod:
+    """A method made ready for runs in lanes.
 
-    name = "Taylor"
-    has_series = True
+    Attributes
+    ----------
+    name : str
+    series : bool
+        Whether it needs code for Taylor series.
+    order : int
+        What code made for a mechanism gets as the order.
+    options : ndarray
+        What its step reads.
+    step, memory : callable
+        Its LaneStep, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
+    """
 
-    def kernels(self) -> Any:
-        """Its step; compiled, or read from the cache, when it is first asked for."""
+    name: str
+    series: bool
+    order: int
+    options: Array
+    step: Callable[[], Any]
+    memory: Callable[[LaneCode], int]
+
+
+def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> list[LaneMethod]:
+    """Methods for runs of n coordinates by a preset; the next one where no code can be had for one.
+
+    "auto" takes Taylor series, or DOP853 where there are none; for stiff motion the Radau method that it takes singly,
+    at loose tolerances that of order 5.
+    """
+    if name == "DOP853":
+        return [_dop853(n, rtol, atol)]
+    if name == "Taylor":
+        return [_taylor(rtol, atol)]
+    if name != "auto":
+        return [_newton(PRESETS[name], n, rtol, atol)]
+    if not stiff:
+        return [_taylor(rtol, atol), _dop853(n, rtol, atol)]
+    tolerance, auto = least_tolerance(rtol, atol), PRESETS["auto"]
+    if tolerance >= LOOSE:
+        return [_newton(RungeKutta(radau_iia(3), outer="newton", tested="positions"), n, rtol, atol)]
+    return [_newton(auto.tight if tolerance >= TIGHTEST else auto.tightest, n, rtol, atol)]
+
+
+def _taylor(rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
         from twoloop.kernels.lanes.lane_taylor import TAYLOR_IN_LANES
 
         return TAYLOR_IN_LANES
 
-    def order(self, rtol: float, atol: float) -> int:
-        """What the functions made for a mechanism get as the order."""
-        return order_in_lanes(rtol, atol) + 1
-
-    def options(self, n: int, rtol: float, atol: float) -> Array:
-        """What its step reads."""
-        return np.zeros(0)
-
-    def memory_size(self, code: LaneCode, order: int, options: Array) -> int:
-        """Length of its memory, in vectors."""
-        return code.series_size(order)
+    order = order_in_lanes(rtol, atol) + 1
+    return LaneMethod("Taylor", True, order, np.zeros(0), step, lambda code: code.series_size(order))
 
 
-@dataclass(frozen=True)
-class DOP853InLanes:
-    """The explicit method DOP853."""
-
-    name = "DOP853"
-    has_series = False
-
-    def kernels(self) -> Any:
-        """Its step; compiled, or read from the cache, when it is first asked for."""
+def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
         from twoloop.kernels.lanes.lane_dop853 import DOP853_IN_LANES
 
         return DOP853_IN_LANES
 
-    def order(self, rtol: float, atol: float) -> int:
-        """What the functions made for a mechanism get as the order."""
-        return 8
-
-    def options(self, n: int, rtol: float, atol: float) -> Array:
-        """What its step reads."""
-        return _with_head(PRESETS["DOP853"].plan(n, rtol, atol, False), rtol, atol)
-
-    def memory_size(self, code: LaneCode, order: int, options: Array) -> int:
-        """Length of its memory, in vectors."""
-        from twoloop.kernels.lanes.lane_control import N_HEAD
+    def memory(code: LaneCode) -> int:
         from twoloop.kernels.lanes.lane_dop853 import memory_size
 
-        return memory_size(int(options[N_HEAD]), code.n)
+        return memory_size(len(B), n)
+
+    return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory)
 
 
-def _with_head(plan: Plan, rtol: float, atol: float) -> Array:
-    """The parameters of a method with what lane_control.py reads."""
+def _newton(method: RungeKutta, n: int, rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_implicit import NEWTON_IN_LANES
+
+        return NEWTON_IN_LANES
+
+    def memory(code: LaneCode) -> int:
+        from twoloop.kernels.lanes.lane_newton import memory_size
+
+        return memory_size(method.tableau.stages, n)
+
+    order = method.tableau.order
+    return LaneMethod(f"RadauIIA{order}", False, order, _options(method, n, rtol, atol), step, memory)
+
+
+def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
+    """What a step reads, behind what lane_control.py reads."""
+    plan = method.plan(n, rtol, atol, False)
     return np.concatenate([plan.rule, [plan.rough, FIRST_STEP, least_tolerance(rtol, atol)], plan.options])

@@ -19,7 +19,7 @@ from twoloop.kernels.lanes.lane_room import (
     RUNNING,
     T1,
     H,
-    LaneMethod,
+    LaneStep,
     N,
     T,
     X,
@@ -134,4 +134,4 @@ def reach_by_stages(code, settings, control, options, room):
         room[AHEAD * LANES + k] = room[T * LANES + k] + room[X * LANES + k]
 
 
-DOP853_IN_LANES = LaneMethod(attempt_dop853, reach_by_stages)
+DOP853_IN_LANES = LaneStep(attempt_dop853, reach_by_stages)

@@ -80,7 +80,7 @@ MOST_REFUSED = 10
 SHORTEST = 1e-13  # step, of the time
 
 
-class LaneMethod(NamedTuple):
+class LaneStep(NamedTuple):
     """The step of a method in lanes, and states within it."""
 
     attempt: Any
@@ -90,7 +90,7 @@ class LaneMethod(NamedTuple):
 class LaneKit:
     """The functions made for a mechanism and the step of a method, as kernels get them."""
 
-    def __init__(self, own: OwnFunctions, method: LaneMethod):
+    def __init__(self, own: OwnFunctions, method: LaneStep):
         self.__dict__.update(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), 0))
         self.__dict__.update(own.addresses)
         self.own, self.attempt, self.reach = own, method.attempt, method.reach

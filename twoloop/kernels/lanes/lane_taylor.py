@@ -32,7 +32,7 @@ from twoloop.kernels.lanes.lane_room import (
     WHICH,
     WORST,
     H,
-    LaneMethod,
+    LaneStep,
     T,
     X,
     fill_field,
@@ -163,4 +163,4 @@ def reach_by_series(code, settings, control, options, room):
     code.evaluate(settings[ORDER], control, room)
 
 
-TAYLOR_IN_LANES = LaneMethod(attempt_taylor, reach_by_series)
+TAYLOR_IN_LANES = LaneStep(attempt_taylor, reach_by_series)

@@ -1,0 +1,215 @@
+"""Steps of implicit Runge-Kutta methods by Newton's method in lanes, as `newton_step` has them, for stiff motion."""
+
+import numpy as np
+
+from twoloop.kernels.data.common import compiled, kernel, merged
+from twoloop.kernels.lanes.lane_algebra import copy_vectors, solve_lanes, table, vectors
+from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps
+from twoloop.kernels.lanes.lane_newton import (
+    BEGIN_Q,
+    BEGIN_V,
+    BY_Q,
+    E_Q,
+    E_V,
+    H_PREVIOUS,
+    LASTING,
+    ONCE,
+    ONE,
+    PREVIOUS,
+    RAW,
+    STAGES,
+    START,
+    SUMS,
+    SYSTEMS,
+    block_at,
+    end_of_stages,
+    factor_systems_of_lanes,
+    find_derivatives,
+    matrix_at,
+    pivots_at,
+    predict_stages,
+    solve_stages,
+    vector_at,
+)
+from twoloop.kernels.lanes.lane_room import (
+    ACCEPTED,
+    AHEAD,
+    ATOL,
+    ATTEMPT_LANES,
+    ERROR,
+    FINE,
+    FRESH,
+    LANES,
+    N_NUMBERS,
+    N_ROWS,
+    REACH,
+    RTOL,
+    RUNNING,
+    T1,
+    H,
+    LaneStep,
+    N,
+    T,
+    X,
+    places_of,
+)
+from twoloop.kernels.steps.lasting import TURNS
+from twoloop.kernels.steps.newton_memory import GAMMA0, N_EIGEN_SCALARS, VELOCITIES, count_eigenvalues, eigen_place
+from twoloop.kernels.steps.stages import tableau_of
+from twoloop.kernels.steps.weighted_sums import weighted_sum
+
+
+@merged
+def _allowed(control, room, state, new, j, place, k):
+    """Of an error of entry `place` of a state, of coordinate j."""
+    size = max(abs(room[(state + place) * LANES + k]), abs(room[(new + place) * LANES + k]))
+    return control[ATOL + j] + control[RTOL] * size
+
+
+@compiled
+def _embedded(settings, options, room, memory):
+    """The embedded estimate of the error, not filtered, into E_Q and E_V."""
+    n, own = settings[N], options[N_HEAD:]
+    s, A, _, _, _, _ = tableau_of(own)
+    place = eigen_place(own, s)
+    gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
+    known, begin = table(room, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
+    e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
+    total = 0.0
+    for i in range(s):
+        total += e[i]
+    for i in range(n * LANES):
+        room[e_q * LANES + i] = (gamma0 + total) * room[begin * LANES + i]
+    for j in range(s):  # velocities of the stages
+        weighted_sum(A[j], known, vectors(room, sums, n))
+        for i in range(n * LANES):
+            room[e_q * LANES + i] += e[j] * room[H * LANES + i % LANES] * room[sums * LANES + i]
+    weighted_sum(e, known, vectors(room, sums, n))
+    for i in range(n * LANES):
+        h = room[H * LANES + i % LANES]
+        room[e_q * LANES + i] *= h
+        room[e_v * LANES + i] = h * (gamma0 * room[(begin + n) * LANES + i] + room[sums * LANES + i])
+
+
+@compiled
+def _filter(settings, options, room, memory):
+    """(I - z J)^-1 (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
+    n, own = settings[N], options[N_HEAD:]
+    s, _, _, _, _, _ = tableau_of(own)
+    gamma0 = own[eigen_place(own, s) + GAMMA0]
+    e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, ONE)
+    by_q = matrix_at(memory, n, s, BY_Q)
+    for i in range(n):
+        for k in range(LANES):
+            total = 0.0
+            for j in range(n):
+                total += room[(by_q + i * n + j) * LANES + k] * room[(e_q + j) * LANES + k]
+            room[(one + i) * LANES + k] = room[(e_v + i) * LANES + k] + gamma0 * room[H * LANES + k] * total
+    pivots = pivots_at(memory, n, s, count_eigenvalues(own, s), 0)
+    solve_lanes(room, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, one)
+    copy_vectors(room, one, e_v, n)
+    for i in range(n * LANES):
+        room[e_q * LANES + i] += gamma0 * room[H * LANES + i % LANES] * room[e_v * LANES + i]
+
+
+@compiled
+def _lasting_error(control, room, n, memory, z, state, new, k):
+    """What an error of the velocities makes of the positions, see lasting.py."""
+    raw, once, twice = vector_at(memory, n, RAW), vector_at(memory, n, ONCE), vector_at(memory, n, E_V)
+    begin = vector_at(memory, n, BEGIN_V)
+    largest = turn = fastest = change = 0.0
+    for j in range(n):
+        fastest = max(fastest, abs(room[(begin + j) * LANES + k]))
+        change = max(change, abs(room[(begin + n + j) * LANES + k]))
+        largest = max(largest, abs(room[(twice + j) * LANES + k]))
+        bend = room[(twice + j) * LANES + k] - 2.0 * room[(once + j) * LANES + k] + room[(raw + j) * LANES + k]
+        turn = max(turn, abs(bend))  # (z J)^2 e
+    if largest > 0.0:
+        room[(memory + LASTING) * LANES + k] = z * np.sqrt(largest / turn)
+    lasting = room[(memory + LASTING) * LANES + k]
+    if lasting * change * TURNS > fastest:
+        lasting *= min(TURNS, lasting * change * TURNS / fastest) if fastest > 0.0 else TURNS
+    error = 0.0
+    for j in range(n):
+        share_q = lasting / _allowed(control, room, state, new, j, j, k)
+        share_v = 1.0 / _allowed(control, room, state, new, j, n + j, k)
+        error = max(error, abs(room[(twice + j) * LANES + k]) * min(share_q, share_v))
+    return error
+
+
+@compiled
+def _estimate(settings, control, options, room):
+    """ERROR of the steps: the embedded estimate, filtered for stiff components, over the tolerances."""
+    n, own = settings[N], options[N_HEAD:]
+    state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    s, _, _, _, _, _ = tableau_of(own)
+    place = eigen_place(own, s)
+    e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
+    _embedded(settings, options, room, memory)
+    copy_vectors(room, e_v, vector_at(memory, n, RAW), n)
+    _filter(settings, options, room, memory)
+    for k in range(LANES):
+        error = 0.0
+        for j in range(n):
+            scale = _allowed(control, room, state, new, j, j, k)
+            error = max(error, abs(room[(e_q + j) * LANES + k]) / scale)
+            if own[place + VELOCITIES] == 1.0:
+                scale = _allowed(control, room, state, new, j, n + j, k)
+                error = max(error, abs(room[(e_v + j) * LANES + k]) / scale)
+        room[ERROR * LANES + k] = error
+    if own[place + VELOCITIES] == 1.0:
+        return
+    copy_vectors(room, e_v, vector_at(memory, n, ONCE), n)
+    _filter(settings, options, room, memory)
+    for k in range(LANES):
+        z = own[place + GAMMA0] * room[H * LANES + k]
+        error = _lasting_error(control, room, n, memory, z, state, new, k)
+        room[ERROR * LANES + k] = max(room[ERROR * LANES + k], error)
+
+
+@kernel(ATTEMPT_LANES, vectorized=True)
+def attempt_newton(code, settings, control, options, room, status, n_steps):
+    """A step, no longer than the gap within which the equations are looked at."""
+    n = settings[N]
+    state, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    s, _, _, _, _, _ = tableau_of(options[N_HEAD:])
+    start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
+    begin_control(options, control, room, n, state, a, start)
+    for k in range(LANES):
+        if room[FRESH * LANES + k] == 1.0:
+            room[(memory + H_PREVIOUS) * LANES + k] = room[(memory + LASTING) * LANES + k] = 0.0
+    choose_steps(room, control, status, n_steps)
+    copy_vectors(room, state, begin, 2 * n)
+    copy_vectors(room, start, begin + 2 * n, n)
+    copy_vectors(room, RUNNING, FINE, 1)
+    find_derivatives(code, settings, control, options, room)
+    factor_systems_of_lanes(settings, options, room)
+    predict_stages(settings, options, room, 1.0)
+    solve_stages(code, settings, control, options, room)
+    end_of_stages(settings, options, room)
+    _estimate(settings, control, options, room)
+    for k in range(LANES):
+        t, h = room[T * LANES + k], room[H * LANES + k]
+        room[AHEAD * LANES + k] = control[T1] if h == control[T1] - t else t + h
+    end_steps(code, settings, control, room, vector_at(memory, n, SUMS))
+    judge_steps(options, room, n, a, start, status)
+    stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
+    for k in range(LANES):
+        if room[ACCEPTED * LANES + k] == 1.0:
+            room[(memory + H_PREVIOUS) * LANES + k] = room[H * LANES + k]
+            for i in range(s * n):
+                room[(previous + i) * LANES + k] = room[(stages + i) * LANES + k]
+
+
+@kernel(REACH, vectorized=True)
+def reach_by_newton(code, settings, control, options, room):
+    """States within a step, each by a shorter step from its beginning."""
+    factor_systems_of_lanes(settings, options, room)
+    predict_stages(settings, options, room, 0.0)
+    solve_stages(code, settings, control, options, room)
+    end_of_stages(settings, options, room)
+    for k in range(LANES):
+        room[AHEAD * LANES + k] = room[T * LANES + k] + room[X * LANES + k]
+
+
+NEWTON_IN_LANES = LaneStep(attempt_newton, reach_by_newton)
