@@ -66,7 +66,7 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "import twoloop.kernels.evaluation.own_inner"
 	@$(RUN) -c "import twoloop.kernels.steps.newton_step" & \
-	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, lanes; \
+	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation; \
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, diagonal_step, explicit_step, \
 	fixed_point_step, newmark_step" && wait $$! && \
 	$(RUN) -c "import twoloop.kernels.control.switching"

@@ -4,6 +4,7 @@ import numpy as np
 
 from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, N_PAST, N_RULE, SAFETY, factor_of, remember
 from twoloop.kernels.data.common import compiled, inlined, merged
+from twoloop.kernels.lanes.lane_algebra import enlarge
 from twoloop.kernels.lanes.lane_projection import project_lanes
 from twoloop.kernels.lanes.lane_room import (
     ACCEPTED,
@@ -127,13 +128,13 @@ def end_steps(code, settings, control, room, predicted_v):
     if settings[CHECKS_REDUNDANT] == 1:
         code.redundant(order, control, room)
     code.judge(order, control, room)
+    for i in range(n * LANES):
+        room[predicted_v * LANES + i] -= room[(new + n) * LANES + i]
+    for j in range(n):
+        atol = control[ATOL + j]
+        enlarge(room, ERROR, predicted_v + j, RUNNING, state + n + j, new + n + j, atol, control[RTOL])
     for k in range(LANES):
-        largest = max(room[ERROR * LANES + k], room[OFF * LANES + k])
-        for j in range(n):
-            v, v1 = room[(state + n + j) * LANES + k], room[(new + n + j) * LANES + k]
-            scale = control[ATOL + j] + control[RTOL] * max(abs(v), abs(v1))
-            largest = max(largest, abs(room[(predicted_v + j) * LANES + k] - v1) / scale)
-        room[ERROR * LANES + k] = largest
+        room[ERROR * LANES + k] = max(room[ERROR * LANES + k], room[OFF * LANES + k])
 
 
 @merged

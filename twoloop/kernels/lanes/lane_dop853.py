@@ -3,6 +3,7 @@
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, inlined, kernel
+from twoloop.kernels.lanes.lane_algebra import copy_vectors, enlarge, sum_rows, table, vectors
 from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps
 from twoloop.kernels.lanes.lane_room import (
     AHEAD,
@@ -18,6 +19,7 @@ from twoloop.kernels.lanes.lane_room import (
     RTOL,
     RUNNING,
     T1,
+    WORST,
     H,
     LaneStep,
     N,
@@ -27,7 +29,6 @@ from twoloop.kernels.lanes.lane_room import (
     places_of,
 )
 from twoloop.kernels.steps.explicit_step import tableau_of
-from twoloop.kernels.steps.weighted_sums import weighted_sum
 
 # of the method's memory, in vectors: accelerations at STATE (n), then the state at which the step begins (2n), two
 # estimates (2n each) and velocities and accelerations of the stages (s, 2n)
@@ -40,20 +41,8 @@ def memory_size(s: int, n: int) -> int:
 
 
 @inlined
-def _vectors(room, begin, count):
-    return room[begin * LANES : (begin + count) * LANES]
-
-
-@inlined
 def _slopes(room, memory, n, s):
-    begin, width = (memory + N_BEFORE_SLOPES * n) * LANES, 2 * n * LANES
-    return room[begin : begin + s * width].reshape((s, width))
-
-
-@compiled
-def _copy(room, source, target, count):
-    for i in range(count * LANES):
-        room[target * LANES + i] = room[source * LANES + i]
+    return table(room, memory + N_BEFORE_SLOPES * n, s, 2 * n)
 
 
 @compiled
@@ -72,17 +61,17 @@ def _stages(code, settings, control, options, room):
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     begin, total = memory + n, memory + 3 * n
     s, A, b, c, _, _ = tableau_of(options[N_HEAD:])
-    slopes, sums = _slopes(room, memory, n, s), _vectors(room, total, 2 * n)
+    slopes, sums = _slopes(room, memory, n, s), vectors(room, total, 2 * n)
     for i in range(1, s):
-        weighted_sum(A[i, :i], slopes, sums)
+        sum_rows(A[i, :i], slopes, sums)
         _move(room, begin, total, new, n)
         for k in range(LANES):
             room[AHEAD * LANES + k] = room[T * LANES + k] + c[i] * room[X * LANES + k]
         code.there(order, control, room)
         place = memory + (N_BEFORE_SLOPES + 2 * i) * n
-        _copy(room, new + n, place, n)
-        _copy(room, a, place + n, n)
-    weighted_sum(b, slopes, sums)
+        copy_vectors(room, new + n, place, n)
+        copy_vectors(room, a, place + n, n)
+    sum_rows(b, slopes, sums)
     _move(room, begin, total, new, n)
 
 
@@ -91,16 +80,16 @@ def _estimate(control, options, room, n, state, new, memory):
     """ERROR of the steps, as largest_error of explicit_step.py has it."""
     s, _, _, _, fine, coarse = tableau_of(options[N_HEAD:])
     slopes, one, other = _slopes(room, memory, n, s), memory + 3 * n, memory + 5 * n
-    weighted_sum(fine, slopes, _vectors(room, one, 2 * n))
-    weighted_sum(coarse, slopes, _vectors(room, other, 2 * n))
-    rtol = control[RTOL]
+    sum_rows(fine, slopes, vectors(room, one, 2 * n))
+    sum_rows(coarse, slopes, vectors(room, other, 2 * n))
+    fill_field(room, ERROR, 0.0)
+    fill_field(room, WORST, 0.0)
+    for j in range(2 * n):
+        atol, rtol = control[ATOL + j % n], control[RTOL]
+        enlarge(room, ERROR, one + j, H, state + j, new + j, atol, rtol)
+        enlarge(room, WORST, other + j, H, state + j, new + j, atol, rtol)
     for k in range(LANES):
-        e = d = 0.0
-        for j in range(2 * n):
-            size = max(abs(room[(state + j) * LANES + k]), abs(room[(new + j) * LANES + k]))
-            share = room[H * LANES + k] / (control[ATOL + j % n] + rtol * size)
-            e = max(e, abs(room[(one + j) * LANES + k] * share))
-            d = max(d, abs(room[(other + j) * LANES + k] * share))
+        e, d = room[ERROR * LANES + k], room[WORST * LANES + k]
         room[ERROR * LANES + k] = e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
 
@@ -112,9 +101,9 @@ def attempt_dop853(code, settings, control, options, room, status, n_steps):
     slopes = memory + N_BEFORE_SLOPES * n
     begin_control(options, control, room, n, state, a, memory)
     choose_steps(room, control, status, n_steps)
-    _copy(room, state, memory + n, 2 * n)
-    _copy(room, state + n, slopes, n)
-    _copy(room, memory, slopes + n, n)
+    copy_vectors(room, state, memory + n, 2 * n)
+    copy_vectors(room, state + n, slopes, n)
+    copy_vectors(room, memory, slopes + n, n)
     fill_field(room, FINE, 1.0)
     _stages(code, settings, control, options, room)
     _estimate(control, options, room, n, state, new, memory)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
-from twoloop.kernels.lanes.lane_algebra import copy_vectors, solve_lanes, table, vectors
+from twoloop.kernels.lanes.lane_algebra import copy_vectors, enlarge, solve_lanes, sum_rows, table, vectors
 from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps
 from twoloop.kernels.lanes.lane_newton import (
     BEGIN_Q,
@@ -51,12 +51,12 @@ from twoloop.kernels.lanes.lane_room import (
     N,
     T,
     X,
+    fill_field,
     places_of,
 )
 from twoloop.kernels.steps.lasting import TURNS
 from twoloop.kernels.steps.newton_memory import GAMMA0, N_EIGEN_SCALARS, VELOCITIES, count_eigenvalues, eigen_place
 from twoloop.kernels.steps.stages import tableau_of
-from twoloop.kernels.steps.weighted_sums import weighted_sum
 
 
 @merged
@@ -81,10 +81,10 @@ def _embedded(settings, options, room, memory):
     for i in range(n * LANES):
         room[e_q * LANES + i] = (gamma0 + total) * room[begin * LANES + i]
     for j in range(s):  # velocities of the stages
-        weighted_sum(A[j], known, vectors(room, sums, n))
+        sum_rows(A[j], known, vectors(room, sums, n))
         for i in range(n * LANES):
             room[e_q * LANES + i] += e[j] * room[H * LANES + i % LANES] * room[sums * LANES + i]
-    weighted_sum(e, known, vectors(room, sums, n))
+    sum_rows(e, known, vectors(room, sums, n))
     for i in range(n * LANES):
         h = room[H * LANES + i % LANES]
         room[e_q * LANES + i] *= h
@@ -148,16 +148,14 @@ def _estimate(settings, control, options, room):
     _embedded(settings, options, room, memory)
     copy_vectors(room, e_v, vector_at(memory, n, RAW), n)
     _filter(settings, options, room, memory)
-    for k in range(LANES):
-        error = 0.0
-        for j in range(n):
-            scale = _allowed(control, room, state, new, j, j, k)
-            error = max(error, abs(room[(e_q + j) * LANES + k]) / scale)
-            if own[place + VELOCITIES] == 1.0:
-                scale = _allowed(control, room, state, new, j, n + j, k)
-                error = max(error, abs(room[(e_v + j) * LANES + k]) / scale)
-        room[ERROR * LANES + k] = error
-    if own[place + VELOCITIES] == 1.0:
+    tests_velocities = own[place + VELOCITIES] == 1.0
+    fill_field(room, ERROR, 0.0)
+    for j in range(n):
+        atol, rtol = control[ATOL + j], control[RTOL]
+        enlarge(room, ERROR, e_q + j, RUNNING, state + j, new + j, atol, rtol)
+        if tests_velocities:
+            enlarge(room, ERROR, e_v + j, RUNNING, state + n + j, new + n + j, atol, rtol)
+    if tests_velocities:
         return
     copy_vectors(room, e_v, vector_at(memory, n, ONCE), n)
     _filter(settings, options, room, memory)

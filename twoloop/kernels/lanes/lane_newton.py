@@ -11,7 +11,7 @@ end of the step alone is put on them. Derivatives are differences, made for all 
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.lanes.lane_algebra import add_product, copy_vectors, factor_lanes, solve_lanes, table, vectors
+from twoloop.kernels.lanes.lane_algebra import add_product, copy_vectors, factor_lanes, solve_lanes, sum_rows, table, vectors
 from twoloop.kernels.lanes.lane_control import LEAST, N_HEAD
 from twoloop.kernels.lanes.lane_room import (
     AHEAD,
@@ -30,7 +30,7 @@ from twoloop.kernels.steps.newton_memory import N_EIGEN_SCALARS, N_REAL, count_e
 from twoloop.kernels.steps.newton_step import MAX_ITERATIONS, STAGNATION, middle_node
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE
 from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, tableau_of
-from twoloop.kernels.steps.weighted_sums import weighted_sum
+
 
 # of the method's memory, in vectors: one number for each lane, ...
 (
@@ -203,13 +203,13 @@ def _residuals(code, settings, control, options, room):
     fill_field(room, memory + SCALE_Q, 1.0)
     fill_field(room, memory + SCALE_V, 1.0)
     for j in range(s):
-        weighted_sum(A2[j], known, total)
+        sum_rows(A2[j], known, total)
         for m in range(n):
             for k in range(LANES):
                 x, at = room[X * LANES + k], (begin + m) * LANES + k
                 way = x * c[j] * room[at + n * LANES] + x * x * room[(sums + m) * LANES + k]
                 room[(new + m) * LANES + k] = room[at] + way
-        weighted_sum(A[j], known, total)
+        sum_rows(A[j], known, total)
         for m in range(n):
             for k in range(LANES):
                 v = room[(begin + n + m) * LANES + k] + room[X * LANES + k] * room[(sums + m) * LANES + k]
@@ -242,8 +242,8 @@ def _correct(settings, options, room):
     for system in range(n_systems):
         row, column = place + 2, place + 2 + 2 * s
         place += 2 + 4 * s
-        weighted_sum(own[row : row + s], left, vectors(room, one, n))
-        weighted_sum(own[row + s : row + 2 * s], left, vectors(room, one + n, n))
+        sum_rows(own[row : row + s], left, vectors(room, one, n))
+        sum_rows(own[row + s : row + 2 * s], left, vectors(room, one + n, n))
         matrix, pivots = matrix_at(memory, n, s, SYSTEMS + 2 * system), pivots_at(memory, n, s, n_systems, system)
         imaginary = 0 if system < n_real else n * n
         solve_lanes(room, matrix, pivots, n, imaginary, one)
@@ -277,9 +277,9 @@ def _sizes(settings, options, room):
     fill_field(room, memory + LARGEST_Q, 0.0)
     fill_field(room, memory + LARGEST_V, 0.0)
     for j in range(s):
-        weighted_sum(A2[j], known, vectors(room, sums, n))
+        sum_rows(A2[j], known, vectors(room, sums, n))
         _enlarge(room, memory + LARGEST_Q, sums, n)
-        weighted_sum(A[j], known, vectors(room, sums, n))
+        sum_rows(A[j], known, vectors(room, sums, n))
         _enlarge(room, memory + LARGEST_V, sums, n)
 
 
@@ -344,11 +344,11 @@ def end_of_stages(settings, options, room):
     s, _, _, b, bA, _ = tableau_of(options[N_HEAD:])
     begin, sums = vector_at(memory, n, BEGIN_Q), vector_at(memory, n, SUMS)
     known, total = table(room, block_at(memory, n, s, STAGES), s, n), vectors(room, sums, n)
-    weighted_sum(bA, known, total)
+    sum_rows(bA, known, total)
     for i in range(n * LANES):
         x, at = room[X * LANES + i % LANES], begin * LANES + i
         room[new * LANES + i] = room[at] + (x * room[at + n * LANES] + x * x * room[sums * LANES + i])
-    weighted_sum(b, known, total)
+    sum_rows(b, known, total)
     for i in range(n * LANES):
         x, at = room[X * LANES + i % LANES], (begin + n) * LANES + i
         room[(new + n) * LANES + i] = room[at] + x * room[sums * LANES + i]

@@ -30,12 +30,12 @@ from twoloop.kernels.data.common import (
     merged,
 )
 from twoloop.kernels.evaluation.calls import EVALUATE_THERE, evaluate, evaluate_state, evaluate_there, project
-from twoloop.kernels.steps.weighted_sums import BLOCK, weighted_sum
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
 # vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
+BLOCK = 8
 
 
 def options_array(
@@ -92,9 +92,34 @@ def _slopes(memory, s, n):
 
 
 @compiled
+def _weighted(weights, slopes, total):
+    """The sum of weights[k] slopes[k], block by block, each in registers."""
+    for m in range(0, total.size, BLOCK):
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
+        for k in range(weights.size):
+            weight = weights[k]
+            s0 += weight * slopes[k, m]
+            s1 += weight * slopes[k, m + 1]
+            s2 += weight * slopes[k, m + 2]
+            s3 += weight * slopes[k, m + 3]
+            s4 += weight * slopes[k, m + 4]
+            s5 += weight * slopes[k, m + 5]
+            s6 += weight * slopes[k, m + 6]
+            s7 += weight * slopes[k, m + 7]
+        total[m] = s0
+        total[m + 1] = s1
+        total[m + 2] = s2
+        total[m + 3] = s3
+        total[m + 4] = s4
+        total[m + 5] = s5
+        total[m + 6] = s6
+        total[m + 7] = s7
+
+
+@compiled
 def _move(y, h, weights, slopes, total, y1):
     """y1 = y + h times the weighted sum: added at last, so that not every stage rounds y."""
-    weighted_sum(weights, slopes, total)
+    _weighted(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
 
@@ -122,8 +147,8 @@ def largest_error(tolerances, y, y1, one, other):
 @compiled
 def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other):
     """The error of a step that is finished; `one` and `other` are room for the two estimates."""
-    weighted_sum(fine, slopes, one)
-    weighted_sum(coarse, slopes, other)
+    _weighted(fine, slopes, one)
+    _weighted(coarse, slopes, other)
     for m in range(y.size):
         one[m] *= h
         other[m] *= h
