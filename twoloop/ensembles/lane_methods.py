@@ -36,7 +36,7 @@ class LaneMethod:
     options : ndarray
         What its step reads.
     step, memory : callable
-        Its LaneStep, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
+        Its kernel, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
     """
 
     name: str
@@ -69,9 +69,9 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> li
 
 def _taylor(rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.lane_taylor import TAYLOR_IN_LANES
+        from twoloop.kernels.lanes.lane_taylor import step_by_series
 
-        return TAYLOR_IN_LANES
+        return step_by_series
 
     order = order_in_lanes(rtol, atol) + 1
     return LaneMethod("Taylor", True, order, np.zeros(0), step, lambda code: code.series_size(order))
@@ -79,9 +79,9 @@ def _taylor(rtol: float, atol: float) -> LaneMethod:
 
 def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.lane_dop853 import DOP853_IN_LANES
+        from twoloop.kernels.lanes.lane_dop853 import step_by_dop853
 
-        return DOP853_IN_LANES
+        return step_by_dop853
 
     def memory(code: LaneCode) -> int:
         from twoloop.kernels.lanes.lane_dop853 import memory_size
@@ -93,9 +93,9 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
 
 def _newton(method: RungeKutta, n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.lane_implicit import NEWTON_IN_LANES
+        from twoloop.kernels.lanes.lane_implicit import step_by_newton
 
-        return NEWTON_IN_LANES
+        return step_by_newton
 
     def memory(code: LaneCode) -> int:
         from twoloop.kernels.lanes.lane_newton import memory_size

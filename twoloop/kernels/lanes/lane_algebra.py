@@ -28,17 +28,21 @@ def copy_vectors(room, source, target, count):
 
 @compiled
 def sum_rows(weights, rows, total):
-    """The sum of weights[k] rows[k]: row by row, which LLVM makes vectors of, past weights that are zero."""
+    """The sum of weights[k] rows[k], four rows at once, which LLVM makes vectors of."""
+    first = weights.size % 4
     for m in range(total.size):
         total[m] = 0.0
-    for k in range(weights.size):
+    for k in range(first):
         weight, row = weights[k], rows[k]
-        if weight != 0.0:
-            for m in range(total.size):
-                total[m] += weight * row[m]
+        for m in range(total.size):
+            total[m] += weight * row[m]
+    for k in range(first, weights.size, 4):
+        a, b, c, d = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
+        for m in range(total.size):
+            total[m] += (a * rows[k, m] + b * rows[k + 1, m]) + (c * rows[k + 2, m] + d * rows[k + 3, m])
 
 
-@merged
+@compiled
 def add_product(room, target, x, y, sign):
     """target += sign x y, in each lane; all is read before it is written, as LLVM knows of no places apart."""
     t, p, q = target * LANES, x * LANES, y * LANES
@@ -56,7 +60,7 @@ def _larger(room, most, error, factor, one, other, atol, rtol):
     return max(room[most], abs(room[error]) * room[factor] / scale)
 
 
-@merged
+@compiled
 def enlarge(room, most, error, factor, one, other, atol, rtol):
     """`most` is at least |error| factor / (atol + rtol max(|one|, |other|)), in each lane."""
     m, e, f, x, y = most * LANES, error * LANES, factor * LANES, one * LANES, other * LANES

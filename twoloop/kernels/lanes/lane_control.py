@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, N_PAST, N_RULE, SAFETY, factor_of, remember
+from twoloop.kernels.control.controller import N_PAST, N_RULE, factor_of, remember
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.lanes.lane_algebra import enlarge
 from twoloop.kernels.lanes.lane_projection import project_lanes
@@ -92,7 +92,7 @@ def begin_control(options, control, room, n, state, a, start):
 
 @compiled
 def choose_steps(room, control, status, n_steps):
-    """H and X of each lane, no longer than the gap, and AHEAD; 0 where none runs."""
+    """H and X of each lane, no longer than the gap, 0 where none runs; FINE are those that run."""
     t1 = control[T1]
     for k in range(LANES):
         room[H * LANES + k], t = 0.0, room[T * LANES + k]
@@ -107,9 +107,16 @@ def choose_steps(room, control, status, n_steps):
                 room[H * LANES + k], room[WANTED * LANES + k] = h, wanted
             else:
                 leave(room, status, k)
-        h = room[H * LANES + k]
-        room[X * LANES + k] = h
-        room[AHEAD * LANES + k] = t1 if h == t1 - t else t + h
+        room[X * LANES + k] = room[H * LANES + k]
+        room[FINE * LANES + k] = room[RUNNING * LANES + k]
+
+
+@compiled
+def set_end(room, control):
+    """AHEAD, X after the beginning of the step."""
+    for k in range(LANES):
+        t, x = room[T * LANES + k], room[X * LANES + k]
+        room[AHEAD * LANES + k] = control[T1] if x == control[T1] - t else t + x
 
 
 @compiled

@@ -4,24 +4,19 @@ import numpy as np
 
 from twoloop.kernels.data.common import compiled, inlined, kernel
 from twoloop.kernels.lanes.lane_algebra import copy_vectors, enlarge, sum_rows, table, vectors
-from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps
+from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.lane_room import (
     AHEAD,
     ATOL,
-    ATTEMPT_LANES,
     ERROR,
-    FINE,
     LANES,
     N_NUMBERS,
     N_ROWS,
     ORDER,
-    REACH,
     RTOL,
-    RUNNING,
-    T1,
+    STEP,
     WORST,
     H,
-    LaneStep,
     N,
     T,
     X,
@@ -93,34 +88,21 @@ def _estimate(control, options, room, n, state, new, memory):
         room[ERROR * LANES + k] = e * e / np.hypot(e, d) if e > 0.0 else 0.0
 
 
-@kernel(ATTEMPT_LANES, vectorized=True)
-def attempt_dop853(code, settings, control, options, room, status, n_steps):
-    """A step, no longer than the gap within which the equations are looked at."""
+@kernel(STEP, vectorized=True)
+def step_by_dop853(code, settings, control, options, room, status, n_steps, within):
+    """A step, no longer than the gap within which the equations are looked at, or states within one, by shorter ones."""
     n = settings[N]
     state, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     slopes = memory + N_BEFORE_SLOPES * n
-    begin_control(options, control, room, n, state, a, memory)
-    choose_steps(room, control, status, n_steps)
-    copy_vectors(room, state, memory + n, 2 * n)
-    copy_vectors(room, state + n, slopes, n)
-    copy_vectors(room, memory, slopes + n, n)
-    fill_field(room, FINE, 1.0)
+    if not within:
+        begin_control(options, control, room, n, state, a, memory)
+        choose_steps(room, control, status, n_steps)
+        copy_vectors(room, state, memory + n, 2 * n)
+        copy_vectors(room, state + n, slopes, n)
+        copy_vectors(room, memory, slopes + n, n)
     _stages(code, settings, control, options, room)
-    _estimate(control, options, room, n, state, new, memory)
-    for k in range(LANES):
-        t, h = room[T * LANES + k], room[H * LANES + k]
-        room[AHEAD * LANES + k] = control[T1] if h == control[T1] - t else t + h
-        room[FINE * LANES + k] *= room[RUNNING * LANES + k]
-    end_steps(code, settings, control, room, memory + 3 * n)
-    judge_steps(options, room, n, a, memory, status)
-
-
-@kernel(REACH, vectorized=True)
-def reach_by_stages(code, settings, control, options, room):
-    """States within a step, each by a shorter step from its beginning."""
-    _stages(code, settings, control, options, room)
-    for k in range(LANES):
-        room[AHEAD * LANES + k] = room[T * LANES + k] + room[X * LANES + k]
-
-
-DOP853_IN_LANES = LaneStep(attempt_dop853, reach_by_stages)
+    set_end(room, control)
+    if not within:
+        _estimate(control, options, room, n, state, new, memory)
+        end_steps(code, settings, control, room, memory + 3 * n)
+        judge_steps(options, room, n, a, memory, status)

@@ -4,7 +4,7 @@ import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
 from twoloop.kernels.lanes.lane_algebra import copy_vectors, enlarge, solve_lanes, sum_rows, table, vectors
-from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps
+from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.lane_newton import (
     BEGIN_Q,
     BEGIN_V,
@@ -33,24 +33,17 @@ from twoloop.kernels.lanes.lane_newton import (
 )
 from twoloop.kernels.lanes.lane_room import (
     ACCEPTED,
-    AHEAD,
     ATOL,
-    ATTEMPT_LANES,
     ERROR,
-    FINE,
     FRESH,
     LANES,
     N_NUMBERS,
     N_ROWS,
-    REACH,
     RTOL,
     RUNNING,
-    T1,
+    STEP,
     H,
-    LaneStep,
     N,
-    T,
-    X,
     fill_field,
     places_of,
 )
@@ -165,32 +158,9 @@ def _estimate(settings, control, options, room):
         room[ERROR * LANES + k] = max(room[ERROR * LANES + k], error)
 
 
-@kernel(ATTEMPT_LANES, vectorized=True)
-def attempt_newton(code, settings, control, options, room, status, n_steps):
-    """A step, no longer than the gap within which the equations are looked at."""
-    n = settings[N]
-    state, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    s, _, _, _, _, _ = tableau_of(options[N_HEAD:])
-    start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
-    begin_control(options, control, room, n, state, a, start)
-    for k in range(LANES):
-        if room[FRESH * LANES + k] == 1.0:
-            room[(memory + H_PREVIOUS) * LANES + k] = room[(memory + LASTING) * LANES + k] = 0.0
-    choose_steps(room, control, status, n_steps)
-    copy_vectors(room, state, begin, 2 * n)
-    copy_vectors(room, start, begin + 2 * n, n)
-    copy_vectors(room, RUNNING, FINE, 1)
-    find_derivatives(code, settings, control, options, room)
-    factor_systems_of_lanes(settings, options, room)
-    predict_stages(settings, options, room, 1.0)
-    solve_stages(code, settings, control, options, room)
-    end_of_stages(settings, options, room)
-    _estimate(settings, control, options, room)
-    for k in range(LANES):
-        t, h = room[T * LANES + k], room[H * LANES + k]
-        room[AHEAD * LANES + k] = control[T1] if h == control[T1] - t else t + h
-    end_steps(code, settings, control, room, vector_at(memory, n, SUMS))
-    judge_steps(options, room, n, a, start, status)
+@compiled
+def _keep(room, memory, n, s):
+    """The stages of accepted steps are what the next ones, and states within these, are predicted from."""
     stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if room[ACCEPTED * LANES + k] == 1.0:
@@ -199,15 +169,29 @@ def attempt_newton(code, settings, control, options, room, status, n_steps):
                 room[(previous + i) * LANES + k] = room[(stages + i) * LANES + k]
 
 
-@kernel(REACH, vectorized=True)
-def reach_by_newton(code, settings, control, options, room):
-    """States within a step, each by a shorter step from its beginning."""
+@kernel(STEP, vectorized=True)
+def step_by_newton(code, settings, control, options, room, status, n_steps, within):
+    """A step, no longer than the gap within which the equations are looked at, or states within one, by shorter ones."""
+    n = settings[N]
+    state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    s, _, _, _, _, _ = tableau_of(options[N_HEAD:])
+    start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
+    if not within:
+        begin_control(options, control, room, n, state, a, start)
+        for k in range(LANES):
+            if room[FRESH * LANES + k] == 1.0:
+                room[(memory + H_PREVIOUS) * LANES + k] = room[(memory + LASTING) * LANES + k] = 0.0
+        choose_steps(room, control, status, n_steps)
+        copy_vectors(room, state, begin, 2 * n)
+        copy_vectors(room, start, begin + 2 * n, n)
+        find_derivatives(code, settings, control, options, room)
     factor_systems_of_lanes(settings, options, room)
-    predict_stages(settings, options, room, 0.0)
+    predict_stages(settings, options, room, 0.0 if within else 1.0)
     solve_stages(code, settings, control, options, room)
     end_of_stages(settings, options, room)
-    for k in range(LANES):
-        room[AHEAD * LANES + k] = room[T * LANES + k] + room[X * LANES + k]
-
-
-NEWTON_IN_LANES = LaneStep(attempt_newton, reach_by_newton)
+    set_end(room, control)
+    if not within:
+        _estimate(settings, control, options, room)
+        end_steps(code, settings, control, room, vector_at(memory, n, SUMS))
+        judge_steps(options, room, n, a, start, status)
+        _keep(room, memory, n, s)

@@ -11,7 +11,15 @@ end of the step alone is put on them. Derivatives are differences, made for all 
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.lanes.lane_algebra import add_product, copy_vectors, factor_lanes, solve_lanes, sum_rows, table, vectors
+from twoloop.kernels.lanes.lane_algebra import (
+    add_product,
+    copy_vectors,
+    factor_lanes,
+    solve_lanes,
+    sum_rows,
+    table,
+    vectors,
+)
 from twoloop.kernels.lanes.lane_control import LEAST, N_HEAD
 from twoloop.kernels.lanes.lane_room import (
     AHEAD,
@@ -20,7 +28,7 @@ from twoloop.kernels.lanes.lane_room import (
     N_NUMBERS,
     N_ROWS,
     ORDER,
-        N,
+    N,
     T,
     X,
     fill_field,
@@ -30,7 +38,6 @@ from twoloop.kernels.steps.newton_memory import N_EIGEN_SCALARS, N_REAL, count_e
 from twoloop.kernels.steps.newton_step import MAX_ITERATIONS, STAGNATION, middle_node
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE
 from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, tableau_of
-
 
 # of the method's memory, in vectors: one number for each lane, ...
 (
@@ -48,7 +55,9 @@ from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, tableau_of
 ) = range(11)
 # ... then n for each of these: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the
 # middle of the step, and its accelerations; the estimate of the error, and that of the velocities filtered
-START, BEGIN_Q, BEGIN_V, BEGIN_A, SUMS, MIDDLE_Q, MIDDLE_V, MIDDLE_A, E_Q, E_V, RAW, ONCE, ONE, ONE_IMAGINARY = range(14)
+START, BEGIN_Q, BEGIN_V, BEGIN_A, SUMS, MIDDLE_Q, MIDDLE_V, MIDDLE_A, E_Q, E_V, RAW, ONCE, ONE, ONE_IMAGINARY = range(
+    14
+)
 N_VECTORS = 14
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # (s, n) each; then weights (s, s)
 BY_Q, BY_V, SYSTEMS = range(3)  # (n, n) each; of a system the real and the imaginary parts, then all pivots

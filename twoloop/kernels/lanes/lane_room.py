@@ -1,8 +1,7 @@
 """What lanes have in memory, and what kernels call: functions made for a mechanism, and the step of a method."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from numba import types
 from numba.extending import typeof_impl
 
@@ -63,14 +62,11 @@ TASKS_OF_SERIES = (
 )
 CODE = Reference("LaneKit", {})
 CODE.add_own_functions(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), types.none(types.int64, VECTOR, VECTOR)))
-# of a method, (code, settings, control, options, room, status, n_steps): a step H of each lane that runs, and whether it
-# is ACCEPTED, with its end in NEW, A and LAM
-ATTEMPT_LANES = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2)
-# of a method, (code, settings, control, options, room): NEW, X seconds after the beginning of the step that was just
-# accepted, of the lanes that FINE names, off the constraints as yet
-REACH = types.void(CODE, INTEGERS, *[VECTOR] * 3)
-CODE.add_function("attempt", ATTEMPT_LANES)
-CODE.add_function("reach", REACH)
+# of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
+# whether it is ACCEPTED, with its end in NEW, A and LAM; or `within` the step that was just accepted NEW, X seconds after
+# its beginning, of the lanes that FINE names, off the constraints as yet
+STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
+CODE.add_function("step", STEP)
 
 LEFT, ENDED = 0, 1  # what becomes of a run: left to a run of its own, or made
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS = range(5)  # in `settings`
@@ -80,20 +76,13 @@ MOST_REFUSED = 10
 SHORTEST = 1e-13  # step, of the time
 
 
-class LaneStep(NamedTuple):
-    """The step of a method in lanes, and states within it."""
-
-    attempt: Any
-    reach: Any
-
-
 class LaneKit:
     """The functions made for a mechanism and the step of a method, as kernels get them."""
 
-    def __init__(self, own: OwnFunctions, method: LaneStep):
+    def __init__(self, own: OwnFunctions, step: Any):
         self.__dict__.update(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), 0))
         self.__dict__.update(own.addresses)
-        self.own, self.attempt, self.reach = own, method.attempt, method.reach
+        self.own, self.step = own, step
         self.table = CODE.table(self)
         self.address = self.table.ctypes.data
 

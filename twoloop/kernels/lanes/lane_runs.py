@@ -19,18 +19,18 @@ from twoloop.kernels.lanes.lane_room import (
     FINE,
     FRESH,
     LANES,
+    N_ROWS,
     ORDER,
     REACHED,
     REFUSED,
     RUNNING,
     T0,
     T1,
+    UNIT,
     WHICH,
     H,
     N,
-    N_ROWS,
     T,
-    UNIT,
     X,
     fill_field,
     leave,
@@ -74,7 +74,7 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
 
 
 @compiled
-def _between(code, settings, control, options, room, n, new, times, out_q, out_v):
+def _between(code, settings, control, options, room, n, new, times, out_q, out_v, status, n_steps):
     """States that are wanted within the accepted steps."""
     while True:
         n_wanted = 0
@@ -90,7 +90,7 @@ def _between(code, settings, control, options, room, n, new, times, out_q, out_v
             room[ASKED * LANES + k] = room[FINE * LANES + k]
         if n_wanted == 0:
             return
-        code.reach(code, settings, control, options, room)
+        code.step(code, settings, control, options, room, status, n_steps, True)
         project_lanes(code, settings[ORDER], control, room, n, new)
         for k in range(LANES):
             if room[ASKED * LANES + k] == 1.0:
@@ -127,9 +127,7 @@ def _go_on(room, control, n_steps):
             room[REFUSED * LANES + k] = 0.0
 
 
-_ADVANCE = types.void(
-    CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 2, VECTOR
-)
+_ADVANCE = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 2, VECTOR)
 
 
 @kernel(_ADVANCE)
@@ -151,9 +149,9 @@ def advance_lanes(code, settings, control, options, times, numbers, q0, v0, out_
             if next_run == numbers.shape[0]:
                 return
             continue
-        code.attempt(code, settings, control, options, room, status, n_steps)
+        code.step(code, settings, control, options, room, status, n_steps, False)
         code.take(order, control, room)
         _write_ends(room, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:
-            _between(code, settings, control, options, room, n, new, times, out_q, out_v)
+            _between(code, settings, control, options, room, n, new, times, out_q, out_v, status, n_steps)
         _go_on(room, control, n_steps)

@@ -7,7 +7,6 @@ from twoloop.kernels.lanes.lane_projection import project_lanes
 from twoloop.kernels.lanes.lane_room import (
     ACCEPTED,
     AHEAD,
-    ATTEMPT_LANES,
     CHECKS_REDUNDANT,
     DEFECT,
     FINE,
@@ -17,22 +16,21 @@ from twoloop.kernels.lanes.lane_room import (
     LENGTH,
     LONGEST,
     MOST_REFUSED,
-    N,
     N_NUMBERS,
     N_ROWS,
     OFF,
     ORDER,
-    REACH,
     REFUSED,
     RUNNING,
     SHORTEST,
+    STEP,
     T0,
     T1,
     UNIT,
     WHICH,
     WORST,
     H,
-    LaneStep,
+    N,
     T,
     X,
     fill_field,
@@ -141,10 +139,15 @@ def _make_steps(code, order, control, room, n, n_rows, n_numbers, checks_redunda
             room[LONGEST * LANES + k] = GROWTH * h
 
 
-@kernel(ATTEMPT_LANES)
-def attempt_taylor(code, settings, control, options, room, status, n_steps):
-    """A step by the series about its beginning."""
+@kernel(STEP)
+def step_by_series(code, settings, control, options, room, status, n_steps, within):
+    """A step by the series about its beginning, or states within one."""
     n, n_rows, order, n_numbers = settings[N], settings[N_ROWS], settings[ORDER], settings[N_NUMBERS]
+    if within:
+        for k in range(LANES):
+            room[X * LANES + k] = room[X * LANES + k] / room[UNIT * LANES + k]
+        code.evaluate(order, control, room)
+        return
     _begin(room, control)
     fill_field(room, FINE, 1.0)
     code.series(order, control, room)
@@ -153,14 +156,3 @@ def attempt_taylor(code, settings, control, options, room, status, n_steps):
     if n_places > 0:
         _look_within(code, order, control, room, n_places, n_steps)
     _make_steps(code, order, control, room, n, n_rows, n_numbers, settings[CHECKS_REDUNDANT], status)
-
-
-@kernel(REACH)
-def reach_by_series(code, settings, control, options, room):
-    """States within a step, by its series."""
-    for k in range(LANES):
-        room[X * LANES + k] = room[X * LANES + k] / room[UNIT * LANES + k]
-    code.evaluate(settings[ORDER], control, room)
-
-
-TAYLOR_IN_LANES = LaneStep(attempt_taylor, reach_by_series)
