@@ -90,7 +90,7 @@ def _estimate(control, options, room, n, state, new, memory):
 
 @kernel(STEP, vectorized=True)
 def step_by_dop853(code, settings, control, options, room, status, n_steps, within):
-    """A step, no longer than the gap within which the equations are looked at, or states within one, by shorter ones."""
+    """A step, no longer than the gap within which the equations are looked at, or states within one, by others."""
     n = settings[N]
     state, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     slopes = memory + N_BEFORE_SLOPES * n

@@ -171,7 +171,7 @@ def _keep(room, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, room, status, n_steps, within):
-    """A step, no longer than the gap within which the equations are looked at, or states within one, by shorter ones."""
+    """A step, no longer than the gap within which the equations are looked at, or states within one, by others."""
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s, _, _, _, _, _ = tableau_of(options[N_HEAD:])
