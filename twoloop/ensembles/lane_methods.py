@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from twoloop.run.run import FIRST_STEP
 
 Array = NDArray[np.float64]
 
-IN_LANES = ("auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9", "RadauIIA13")  # presets that go in lanes
+STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # of the implicit methods
+IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that go in lanes
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,12 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> li
     if name == "Taylor":
         return [_taylor(rtol, atol)]
     if name != "auto":
-        return [_newton(PRESETS[name], n, rtol, atol)]
+        return [_newton(name, "all", n, rtol, atol)]
     if not stiff:
         return [_taylor(rtol, atol), _dop853(n, rtol, atol)]
-    tolerance, auto = least_tolerance(rtol, atol), PRESETS["auto"]
-    if tolerance >= LOOSE:
-        return [_newton(RungeKutta(radau_iia(3), outer="newton", tested="positions"), n, rtol, atol)]
-    return [_newton(auto.tight if tolerance >= TIGHTEST else auto.tightest, n, rtol, atol)]
+    tolerance = least_tolerance(rtol, atol)
+    radau = "RadauIIA5" if tolerance >= LOOSE else "RadauIIA9" if tolerance >= TIGHTEST else "RadauIIA13"
+    return [_newton(radau, "positions", n, rtol, atol)]
 
 
 def _taylor(rtol: float, atol: float) -> LaneMethod:
@@ -91,7 +91,7 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory)
 
 
-def _newton(method: RungeKutta, n: int, rtol: float, atol: float) -> LaneMethod:
+def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
         from twoloop.kernels.lanes.lane_implicit import step_by_newton
 
@@ -100,10 +100,11 @@ def _newton(method: RungeKutta, n: int, rtol: float, atol: float) -> LaneMethod:
     def memory(code: LaneCode) -> int:
         from twoloop.kernels.lanes.lane_newton import memory_size
 
-        return memory_size(method.tableau.stages, n)
+        return memory_size(tableau.stages, n)
 
-    order = method.tableau.order
-    return LaneMethod(f"RadauIIA{order}", False, order, _options(method, n, rtol, atol), step, memory)
+    tableau = radau_iia(STAGES[name])
+    method = RungeKutta(tableau, outer="newton", tested=tested)
+    return LaneMethod(name, False, tableau.order, _options(method, n, rtol, atol), step, memory)
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:

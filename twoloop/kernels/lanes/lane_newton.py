@@ -54,11 +54,25 @@ from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, tableau_of
     N_OF_LANES,
 ) = range(11)
 # ... then n for each of these: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the
-# middle of the step, and its accelerations; the estimate of the error, and that of the velocities filtered
-START, BEGIN_Q, BEGIN_V, BEGIN_A, SUMS, MIDDLE_Q, MIDDLE_V, MIDDLE_A, E_Q, E_V, RAW, ONCE, ONE, ONE_IMAGINARY = range(
-    14
-)
-N_VECTORS = 14
+# middle of the step, and its accelerations; the estimate of the error, and that of velocities as it was and filtered
+# once; and a vector whose imaginary part follows
+(
+    START,
+    BEGIN_Q,
+    BEGIN_V,
+    BEGIN_A,
+    SUMS,
+    MIDDLE_Q,
+    MIDDLE_V,
+    MIDDLE_A,
+    E_Q,
+    E_V,
+    RAW,
+    ONCE,
+    ONE,
+    _IMAGINARY,
+    N_VECTORS,
+) = range(15)
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # (s, n) each; then weights (s, s)
 BY_Q, BY_V, SYSTEMS = range(3)  # (n, n) each; of a system the real and the imaginary parts, then all pivots
 
@@ -102,7 +116,7 @@ def pivots_at(memory, n, s, n_systems, k):
 def _middle(settings, control, options, room, code, new, a, memory):
     """The state in the middle of the step, near the constraints, and its accelerations."""
     n, order = settings[N], settings[ORDER]
-    s, _, _, _, _, c = tableau_of(options[N_HEAD:])
+    _, _, _, _, _, c = tableau_of(options[N_HEAD:])
     share, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
     for k in range(LANES):
         x = share * room[X * LANES + k]
@@ -171,7 +185,7 @@ def factor_systems_of_lanes(settings, options, room):
 
 @compiled
 def predict_stages(settings, options, room, begins):
-    """Accelerations of the stages by the polynomial of the step before, or constant; `begins` 0: by that of this one."""
+    """Stages by the polynomial of the step before, or constant; `begins` 0: by that of the step itself."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s, _, _, _, _, c = tableau_of(options[N_HEAD:])

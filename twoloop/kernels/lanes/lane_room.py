@@ -63,8 +63,8 @@ TASKS_OF_SERIES = (
 CODE = Reference("LaneKit", {})
 CODE.add_own_functions(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), types.none(types.int64, VECTOR, VECTOR)))
 # of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
-# whether it is ACCEPTED, with its end in NEW, A and LAM; or `within` the step that was just accepted NEW, X seconds after
-# its beginning, of the lanes that FINE names, off the constraints as yet
+# whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
+# after its beginning, of the lanes that FINE names, off the constraints as yet
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
