@@ -41,12 +41,12 @@ def ensemble(
 ) -> Runs:
     """Integrate many runs of one system, each with parameters and a start of its own.
 
-    Runs go through machine code made for the system, one in each lane of the processor's vectors, by Taylor series with
-    steps of their own, which are checked as those of a single run; a lane whose run has ended takes the next one. All
-    parameters go through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run:
-    a run that comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other
-    methods. The first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of
-    each other run is compared with what was found there.
+    Runs go through machine code made for the system, one in each lane of the processor's vectors, with steps of their
+    own, which are checked as those of a single run; a lane whose run has ended takes the next one. All parameters go
+    through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run: a run that
+    comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other methods. The
+    first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of each other
+    run is compared with what was found there.
 
     Parameters
     ----------
@@ -60,7 +60,10 @@ def ensemble(
     rtol, atol, t_eval, events
         As for `solve_dae`; t_eval None: states are stored at the start and the end.
     method : str or method object
-        "auto" and "Taylor" go in lanes.
+        "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
+        there, and DOP853 for runs that these cannot do and for systems that have none. If the first run came to
+        Newton's method, it takes the Radau method for the tolerance, for all runs: of order 5 from 3e-5 on, 13 below
+        1e-9, else 9, with errors of velocities tested as `Auto` does.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
 
@@ -73,6 +76,13 @@ def ensemble(
     ------
     TypeError, ValueError
         If an argument is wrong, naming it, or a start is not consistent, naming the run.
+
+    Notes
+    -----
+    In lanes as singly, no step of DOP853 or of a Radau method is longer than a hundredth of the run. Stages are off the
+    constraints by the error of the formula, those of Radau methods, too, whose unknowns are here the accelerations of
+    all coordinates; the end of each step is put on the constraints. States at `t_eval` within a step are the ends of
+    shorter steps from its beginning. A run that would take more than 100,000 of these steps is made singly.
     """
     check_system(system)
     t0, t1 = check_span(t_span)
