@@ -60,10 +60,9 @@ def _allowed(control, room, state, new, j, place, k):
 
 
 @compiled
-def _embedded(settings, options, room, memory):
+def _embedded(settings, own, A, room, memory):
     """The embedded estimate of the error, not filtered, into E_Q and E_V."""
-    n, own = settings[N], options[N_HEAD:]
-    s, A, _, _, _, _ = tableau_of(own)
+    n, s = settings[N], A.shape[0]
     place = eigen_place(own, s)
     gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
     known, begin = table(room, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
@@ -85,10 +84,9 @@ def _embedded(settings, options, room, memory):
 
 
 @compiled
-def _filter(settings, options, room, memory):
+def _filter(settings, own, s, room, memory):
     """(I - z J)^-1 (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
-    n, own = settings[N], options[N_HEAD:]
-    s, _, _, _, _, _ = tableau_of(own)
+    n = settings[N]
     gamma0 = own[eigen_place(own, s) + GAMMA0]
     e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, ONE)
     by_q = matrix_at(memory, n, s, BY_Q)
@@ -131,16 +129,15 @@ def _lasting_error(control, room, n, memory, z, state, new, k):
 
 
 @compiled
-def _estimate(settings, control, options, room):
+def _estimate(settings, control, own, A, room):
     """ERROR of the steps: the embedded estimate, filtered for stiff components, over the tolerances."""
-    n, own = settings[N], options[N_HEAD:]
+    n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    s, _, _, _, _, _ = tableau_of(own)
     place = eigen_place(own, s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
-    _embedded(settings, options, room, memory)
+    _embedded(settings, own, A, room, memory)
     copy_vectors(room, e_v, vector_at(memory, n, RAW), n)
-    _filter(settings, options, room, memory)
+    _filter(settings, own, s, room, memory)
     tests_velocities = own[place + VELOCITIES] == 1.0
     fill_field(room, ERROR, 0.0)
     for j in range(n):
@@ -151,7 +148,7 @@ def _estimate(settings, control, options, room):
     if tests_velocities:
         return
     copy_vectors(room, e_v, vector_at(memory, n, ONCE), n)
-    _filter(settings, options, room, memory)
+    _filter(settings, own, s, room, memory)
     for k in range(LANES):
         z = own[place + GAMMA0] * room[H * LANES + k]
         error = _lasting_error(control, room, n, memory, z, state, new, k)
@@ -174,7 +171,8 @@ def step_by_newton(code, settings, control, options, room, status, n_steps, with
     """A step, no longer than the gap within which the equations are looked at, or states within one, by others."""
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    s, _, _, _, _, _ = tableau_of(options[N_HEAD:])
+    own = options[N_HEAD:]
+    s, A, A2, b, bA, c = tableau_of(own)
     start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
     if not within:
         begin_control(options, control, room, n, state, a, start)
@@ -184,14 +182,14 @@ def step_by_newton(code, settings, control, options, room, status, n_steps, with
         choose_steps(room, control, status, n_steps)
         copy_vectors(room, state, begin, 2 * n)
         copy_vectors(room, start, begin + 2 * n, n)
-        find_derivatives(code, settings, control, options, room)
-    factor_systems_of_lanes(settings, options, room)
-    predict_stages(settings, options, room, 0.0 if within else 1.0)
-    solve_stages(code, settings, control, options, room)
-    end_of_stages(settings, options, room)
+        find_derivatives(code, settings, control, c, room)
+    factor_systems_of_lanes(settings, own, s, room)
+    predict_stages(settings, c, room, 0.0 if within else 1.0)
+    solve_stages(code, settings, control, options, own, A, A2, c, room)
+    end_of_stages(settings, b, bA, room)
     set_end(room, control)
     if not within:
-        _estimate(settings, control, options, room)
+        _estimate(settings, control, own, A, room)
         end_steps(code, settings, control, room, vector_at(memory, n, SUMS))
         judge_steps(options, room, n, a, start, status)
         _keep(room, memory, n, s)

@@ -37,7 +37,7 @@ from twoloop.kernels.lanes.lane_room import (
 from twoloop.kernels.steps.newton_memory import N_EIGEN_SCALARS, N_REAL, count_eigenvalues, eigen_place
 from twoloop.kernels.steps.newton_step import MAX_ITERATIONS, STAGNATION, middle_node
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE
-from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, tableau_of
+from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL
 
 # of the method's memory, in vectors: one number for each lane, ...
 (
@@ -113,10 +113,9 @@ def pivots_at(memory, n, s, n_systems, k):
 
 
 @compiled
-def _middle(settings, control, options, room, code, new, a, memory):
+def _middle(code, settings, control, c, room, new, a, memory):
     """The state in the middle of the step, near the constraints, and its accelerations."""
     n, order = settings[N], settings[ORDER]
-    _, _, _, _, _, c = tableau_of(options[N_HEAD:])
     share, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
     for k in range(LANES):
         x = share * room[X * LANES + k]
@@ -133,15 +132,15 @@ def _middle(settings, control, options, room, code, new, a, memory):
 
 
 @compiled
-def find_derivatives(code, settings, control, options, room):
+def find_derivatives(code, settings, control, c, room):
     """Derivatives of the accelerations by positions and velocities, in the middle of the step, of lanes that are FINE.
 
     At the time of a stage, so that they see nothing of a force that the stages do not see.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    s, _, _, _, _, _ = tableau_of(options[N_HEAD:])
-    _middle(settings, control, options, room, code, new, a, memory)
+    s = c.size
+    _middle(code, settings, control, c, room, new, a, memory)
     middle, middle_a = vector_at(memory, n, MIDDLE_Q), vector_at(memory, n, MIDDLE_A)
     for column in range(2 * n):
         copy_vectors(room, middle, new, 2 * n)
@@ -158,12 +157,10 @@ def find_derivatives(code, settings, control, options, room):
 
 
 @compiled
-def factor_systems_of_lanes(settings, options, room):
+def factor_systems_of_lanes(settings, own, s, room):
     """Factors of I - (X l)^2 J_q - X l J_v for each eigenvalue l."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    own = options[N_HEAD:]
-    s, _, _, _, _, _ = tableau_of(own)
     n_systems, place = count_eigenvalues(own, s), eigen_place(own, s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
@@ -184,11 +181,11 @@ def factor_systems_of_lanes(settings, options, room):
 
 
 @compiled
-def predict_stages(settings, options, room, begins):
+def predict_stages(settings, c, room, begins):
     """Stages by the polynomial of the step before, or constant; `begins` 0: by that of the step itself."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    s, _, _, _, _, c = tableau_of(options[N_HEAD:])
+    s = c.size
     weights, stages = _weights_at(memory, n, s), block_at(memory, n, s, STAGES)
     previous, a = block_at(memory, n, s, PREVIOUS), vector_at(memory, n, BEGIN_A)
     for k in range(LANES):
@@ -215,11 +212,11 @@ def predict_stages(settings, options, room, begins):
 
 
 @compiled
-def _residuals(code, settings, control, options, room):
+def _residuals(code, settings, control, A, A2, c, room):
     """What the equations leave at the stages; FINE where there are values, and the largest entries."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    s, A, A2, _, _, c = tableau_of(options[N_HEAD:])
+    s = c.size
     stages, sums = block_at(memory, n, s, STAGES), vector_at(memory, n, SUMS)
     begin, residual = vector_at(memory, n, BEGIN_Q), block_at(memory, n, s, RESIDUAL)
     known, total = table(room, stages, s, n), vectors(room, sums, n)
@@ -248,12 +245,10 @@ def _residuals(code, settings, control, options, room):
 
 
 @compiled
-def _correct(settings, options, room):
+def _correct(settings, own, s, room):
     """The corrections of the stages, into CHANGES, and to the stages of lanes in which the iteration goes on."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    own = options[N_HEAD:]
-    s, _, _, _, _, _ = tableau_of(own)
     n_systems, place = count_eigenvalues(own, s), eigen_place(own, s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
@@ -291,11 +286,11 @@ def _enlarge(room, most, sums, n):
 
 
 @compiled
-def _sizes(settings, options, room):
+def _sizes(settings, A, A2, room):
     """The largest corrections of the positions and velocities of the stages, for a step of 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    s, A, A2, _, _, _ = tableau_of(options[N_HEAD:])
+    s = A.shape[0]
     sums, known = vector_at(memory, n, SUMS), table(room, block_at(memory, n, s, CHANGES), s, n)
     fill_field(room, memory + LARGEST_Q, 0.0)
     fill_field(room, memory + LARGEST_V, 0.0)
@@ -334,7 +329,7 @@ def _ended(options, room, memory, iteration, k):
 
 
 @compiled
-def solve_stages(code, settings, control, options, room):
+def solve_stages(code, settings, control, options, own, A, A2, c, room):
     """The stages of a step X, predicted, of lanes that are FINE; FINE where they were found."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
@@ -349,9 +344,9 @@ def solve_stages(code, settings, control, options, room):
             left += room[to_go * LANES + k]
         if left == 0.0:
             break
-        _residuals(code, settings, control, options, room)
-        _correct(settings, options, room)
-        _sizes(settings, options, room)
+        _residuals(code, settings, control, A, A2, c, room)
+        _correct(settings, own, c.size, room)
+        _sizes(settings, A, A2, room)
         for k in range(LANES):
             if room[to_go * LANES + k] == 1.0 and _ended(options, room, memory, iteration, k):
                 room[to_go * LANES + k] = 0.0
@@ -360,11 +355,11 @@ def solve_stages(code, settings, control, options, room):
 
 
 @compiled
-def end_of_stages(settings, options, room):
+def end_of_stages(settings, b, bA, room):
     """NEW, X after the beginning of the step, by its stages."""
     n = settings[N]
     _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    s, _, _, b, bA, _ = tableau_of(options[N_HEAD:])
+    s = b.size
     begin, sums = vector_at(memory, n, BEGIN_Q), vector_at(memory, n, SUMS)
     known, total = table(room, block_at(memory, n, s, STAGES), s, n), vectors(room, sums, n)
     sum_rows(bA, known, total)
