@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.lane_code import LaneCode
 from twoloop.methods.auto import LOOSE, TIGHTEST
 from twoloop.methods.dop853_tableau import B
 from twoloop.methods.plan import Method, least_tolerance
@@ -16,6 +15,9 @@ from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.methods.taylor import order_in_lanes
 from twoloop.run.run import FIRST_STEP
+
+if TYPE_CHECKING:  # it loads kernels
+    from twoloop.generate.lane_code import LaneCode
 
 Array = NDArray[np.float64]
 
@@ -45,7 +47,7 @@ class LaneMethod:
     order: int
     options: Array
     step: Callable[[], Any]
-    memory: Callable[[LaneCode], int]
+    memory: Callable[["LaneCode"], int]
 
 
 def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> list[LaneMethod]:
@@ -83,7 +85,7 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
 
         return step_by_dop853
 
-    def memory(code: LaneCode) -> int:
+    def memory(code: "LaneCode") -> int:
         from twoloop.kernels.lanes.lane_dop853 import memory_size
 
         return memory_size(len(B), n)
@@ -97,7 +99,7 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 
         return step_by_newton
 
-    def memory(code: LaneCode) -> int:
+    def memory(code: "LaneCode") -> int:
         from twoloop.kernels.lanes.lane_newton import memory_size
 
         return memory_size(tableau.stages, n)
