@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
+from twoloop.generate.choices import Choice
 from twoloop.generate.on_arrays import OnArrays
-from twoloop.generate.straight_line import Choice
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
