@@ -192,19 +192,37 @@ def test_stiff_motion_takes_the_implicit_method_that_auto_takes_singly():
     assert list(names.values()) == ["RadauIIA5", "RadauIIA9", "RadauIIA13"]
 
 
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-8])
+def test_an_iteration_that_has_ended_in_one_lane_goes_on_in_others_alone():
+    system, q, p = springs(17)
+    order = np.random.default_rng(5).permutation(17)
+    options = {"method": "RadauIIA9", "rtol": 1e-4, "atol": 1e-4, "t_eval": np.linspace(0.0, 3.0, 7)}
+    runs = ensemble(system, (0.0, 3.0), q, 0 * q, parameters=p, **options)
+    other = ensemble(system, (0.0, 3.0), q[order], 0 * q, parameters=p[order], **options)
+    lanes = ~runs.singly[order] & ~other.singly
+    assert lanes.sum() >= 15 and (other.q[lanes] == runs.q[order][lanes]).all()
+
+
+@pytest.mark.parametrize("tolerance", [1e-7, 1e-8])
 def test_vibrations_that_do_not_matter_are_passed_over_as_singly_and_no_others(tolerance):
     """By the methods of the default, which look at what errors of velocities make of the positions."""
-    system, q, p = springs(9)
-    starts = Starts(0.0, q, np.zeros_like(q), p)
-    lanes = LaneRuns(system, starts, lane_methods("auto", True, 4, tolerance, tolerance)[0])
-    out, atol = np.empty((2, 9, 4, 1)), np.full(4, tolerance)
+    p = np.column_stack([np.geomspace(1e2, 1e8, 9), np.full(9, 2.0)])
+    system = ConstrainedSystem.from_python(
+        n_q=1,
+        n_c=0,
+        mass=np.eye(1),
+        force=lambda t, q, v, p: np.array([-p[0] * (q[0] - np.sin(40.0 * t)) - p[1] * v[0]]),
+        parameters=p[0],
+        name="carried along by a spring",
+    )
+    q, v, atol = np.zeros((9, 1)), np.full((9, 1), 40.0), np.full(1, tolerance)
+    lanes = LaneRuns(system, Starts(0.0, q, v, p), lane_methods("auto", True, 1, tolerance, tolerance)[0])
+    out = np.empty((2, 9, 1, 1))
     made, n_steps, _ = lanes.make(np.arange(9), 4.0, np.array([4.0]), tolerance, atol, 1, *out)
     options = {"method": PRESETS["auto"].tight, "rtol": tolerance, "atol": tolerance}
-    for run in (1, 6):
-        alone = solve_dae(system.with_parameters(p[run]), (0.0, 4.0), q[run], 0 * q[run], **options)
+    for run in (1, 5, 8):
+        alone = solve_dae(system.with_parameters(p[run]), (0.0, 4.0), q[run], v[run], **options)
         assert made[run] == 1 and 130 < 0.9 * alone.stats.n_accepted <= n_steps[run] <= 1.3 * alone.stats.n_accepted
-        assert np.abs(out[0, run, :, 0] - alone.q[:, -1]).max() < 30.0 * tolerance
+        assert np.abs(out[0, run, :, 0] - alone.q[:, -1]).max() < 100.0 * tolerance
 
 
 @pytest.mark.parametrize("name", STAGES)

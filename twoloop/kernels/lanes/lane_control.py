@@ -19,7 +19,6 @@ from twoloop.kernels.lanes.lane_room import (
     H_NEXT,
     LANES,
     LIMIT_AGE,
-    MOST_REFUSED,
     N_NUMBERS,
     N_ROWS,
     OFF,
@@ -49,6 +48,7 @@ ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN, SHORTENED, WHOLE = 10.0, 0.95, 1e-10  # as in advance.py
 LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as of a Plan
+MOST_REFUSED = 30  # one after another, by estimates that may say little of how much shorter a stiff step has to be
 MOST_STEPS = 100_000  # of a run in lanes, which nothing interrupts
 
 

@@ -72,7 +72,6 @@ LEFT, ENDED = 0, 1  # what becomes of a run: left to a run of its own, or made
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS = range(5)  # in `settings`
 T0, T1, GAP, RTOL, ATOL = range(5)  # in `control`; from ATOL on a tolerance for each coordinate
 
-MOST_REFUSED = 10
 SHORTEST = 1e-13  # step, of the time
 
 

@@ -15,7 +15,6 @@ from twoloop.kernels.lanes.lane_room import (
     LANES,
     LENGTH,
     LONGEST,
-    MOST_REFUSED,
     N_NUMBERS,
     N_ROWS,
     OFF,
@@ -40,6 +39,7 @@ from twoloop.kernels.lanes.lane_room import (
 
 ALLOWED = 0.3  # as in taylor_step.py
 MOST_SHORTENED, GROWTH = 0.1, 5.0
+MOST_REFUSED = 10  # one after another
 FIRST_UNIT = 0.01  # of the span
 MOST_PLACES = 1000  # within a step
 GOLDEN = 0.6180339887498949
