@@ -1,0 +1,6 @@
+"""Mechanisms from bodies and joints: masses, joints and forces in, a `Problem` with its equations out."""
+
+from twoloop.bodies.planar_model import PlanarModel
+from twoloop.bodies.spatial_model import SpatialModel
+
+__all__ = ["PlanarModel", "SpatialModel"]

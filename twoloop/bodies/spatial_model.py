@@ -1,0 +1,418 @@
+"""Models in space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.bodies.functions import Function
+from twoloop.bodies.model import Model
+from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PERPENDICULAR, PLANE, POINT, SLIDE, TORSION, TURN
+from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.checks.arguments import check_real, check_vector, shown
+from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
+
+Array = NDArray[np.float64]
+
+PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
+SYMMETRIC = 1e-9  # relative: entries of an inertia
+
+
+class SpatialModel(Model):
+    """A mechanism in space, from bodies, joints and forces.
+
+    Coordinates are x, y, z of each body's centre of mass and the four Euler parameters of its axes. Points and axes are
+    given in space, in the position in which the bodies are given, or on a body by `body.point(...)` and
+    `body.direction(...)`.
+
+    Parameters
+    ----------
+    gravity : array_like (3,)
+        m/s^2.
+    name : str
+
+    Attributes
+    ----------
+    ground : Body
+    bodies, joints, forces : list
+        What was added so far.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong.
+    """
+
+    dimension = 3
+    coordinate_names = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
+
+    def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
+        super().__init__(gravity, name)
+
+    def body(
+        self,
+        name: str,
+        *,
+        mass: float,
+        inertia: ArrayLike,
+        position: ArrayLike,
+        rotation: ArrayLike | None = None,
+        velocity: ArrayLike | None = None,
+        angular_velocity: ArrayLike | None = None,
+    ) -> Body:
+        """Add a body.
+
+        Parameters
+        ----------
+        name : str
+        mass : float
+            kg.
+        inertia : array_like (3,) or (3, 3)
+            About the centre of mass along the axes of the body, kg m^2: three moments, or the whole tensor.
+        position : array_like (3,)
+            Of the centre of mass, m.
+        rotation : array_like (3, 3), optional
+            Its columns are the axes of the body. None: those of space.
+        velocity : array_like (3,), optional
+            Of the centre of mass at the start, m/s. None: it follows from the other velocities.
+        angular_velocity : array_like (3,), optional
+            Along the axes of space, rad/s, likewise.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or something of the model has this name.
+        """
+        name, place, weight, speed = self._new_body(name, mass, position, velocity)
+        moments = _moments(f"inertia of {name!r}", inertia)
+        R = _rotation(f"rotation of {name!r}", np.eye(3) if rotation is None else rotation)
+        spin = None
+        if angular_velocity is not None:
+            spin = check_vector(f"angular_velocity of {name!r}", angular_velocity, 3)
+        return self._add_body(Body(name, len(self.bodies), place, R, np.append(weight, moments), speed, spin))
+
+    def spherical(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
+        """A ball joint: both bodies share a point.
+
+        Parameters
+        ----------
+        a, b : Body or str
+            The bodies, or their names.
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            Where, in space in the position given, m; or a point of a and one of b, which are put together.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, *points = self._pair("spherical", a, b, name, at)
+        rows = (JointRow(POINT, 3, first, second, *points),)
+        return self._add_joint(ModelJoint(name, "spherical", first, second, rows, *points))
+
+    def revolute(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A hinge: b turns on a about an axis.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            Its direction, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, *points = self._pair("revolute", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        rows = JointRow(POINT, 3, first, second, *points), *_parallel(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "revolute", first, second, rows, *points, (one, other)))
+
+    def universal(self, a: Body | str, b: Body | str, *, at: Any, axes: Any, name: str | None = None) -> ModelJoint:
+        """A cross: one of its axes is fixed in a, the other, perpendicular, in b.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            Its centre, m.
+        axes : (array_like (3,), array_like (3,)) or (BodyDirection, BodyDirection)
+            The axis in a and the axis in b.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or the axes are not perpendicular.
+        """
+        if not isinstance(axes, (tuple, list, np.ndarray)) or len(axes) != 2:
+            raise ValueError(f"axes must be two directions, the axis in a and the axis in b; given {shown(axes)}")
+        first, second, name, *points = self._pair("universal", a, b, name, at)
+        one, other = self._direction("axes[0]", axes[0], first), self._direction("axes[1]", axes[1], second)
+        cosine = float((first.rotation @ one) @ (second.rotation @ other))
+        if not any(hasattr(each, "body") for each in axes) and abs(cosine) > PERPENDICULAR_TO:
+            raise ValueError(
+                f"axes of {name!r} must be perpendicular; given {shown(axes)}, at {np.degrees(np.arccos(cosine)):.6g} deg"
+            )
+        rows = JointRow(POINT, 3, first, second, *points), _across(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "universal", first, second, rows, *points))
+
+    def cylindrical(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A sleeve: b slides along an axis of a, and turns about it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            Its direction, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, *points = self._pair("cylindrical", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        rows = *_on_line(first, one, second, *points), *_parallel(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "cylindrical", first, second, rows, *points))
+
+    def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A slide: b moves along an axis of a, and does not turn on it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            Its direction, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, *points = self._pair("prismatic", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        across, third = _perpendiculars(one)
+        held = _across(first, across, second, _relative(first, one, second, other).T @ third)
+        rows = *_on_line(first, one, second, *points), *_parallel(first, one, second, other), held
+        return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points, (one, other)))
+
+    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
+        """Both bodies move as one.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint), optional
+            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, *points = self._pair("fixed", a, b, name, at)
+        there = second.rotation.T @ first.rotation
+        pairs = ((0, 1), (0, 2), (1, 2))
+        rows = (
+            JointRow(POINT, 3, first, second, *points),
+            *(_across(first, np.eye(3)[i], second, there[:, j]) for i, j in pairs),
+        )
+        return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
+
+    def distance(
+        self, a: Body | str, at_a: Any, b: Body | str, at_b: Any, *, length: float | None = None, name: str | None = None
+    ) -> ModelJoint:
+        """A massless rod between a point of a and a point of b.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at_a, at_b : array_like (3,) or BodyPoint
+            The points, in space in the position given, m.
+        length : float, optional
+            m. None: their distance in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        return self._distance(LENGTH, a, at_a, b, at_b, length, name)
+
+    def _no_rotation(self) -> Array:
+        return np.eye(3)
+
+    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        one, other = joint.axes
+        if joint.kind == "prismatic":
+            along = Numbers(tuple(one))
+            return JointRow(PLANE, 1, joint.a, joint.b, along, joint.point_b, joint.point_a, motion)
+        first, second = _perpendiculars(one)
+        zero = _relative(joint.a, one, joint.b, other).T @ first
+        return JointRow(TURN, 1, joint.a, joint.b, Numbers((*first, *second)), Numbers(tuple(zero)), None, motion)
+
+    def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
+        one, other = joint.axes
+        zero = euler_parameters(_relative(joint.a, one, joint.b, other))
+        here, there = (euler_parameters(body.rotation) for body in (joint.a, joint.b))
+        w = here[0] * there[0] + here[1:] @ there[1:]
+        x = here[0] * there[1:] - there[0] * here[1:] - np.cross(here[1:], there[1:])
+        zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # of both signs the one that the bodies start with
+        axis, start = Numbers(tuple(one)), Numbers(tuple(zero))
+        conserves = numbers.values[1] == 0.0
+        return Force(name, TORSION, joint.a, joint.b, axis, start, numbers, conserves=conserves)
+
+    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
+        function, more = self._function(name, f, 1, unit)
+        axis = Numbers(tuple(joint.axes[0]))
+        if joint.kind == "revolute":
+            return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function)
+        return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function)
+
+    def _check_moments(self, name: str, moments: Array) -> None:
+        _moments(f"inertia of {name}", moments[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3))
+
+    def _first_row(self) -> int:
+        return len(self.bodies)
+
+    def _start(self) -> Array:
+        return np.concatenate([[*body.position, *euler_parameters(body.rotation)] for body in self.bodies])
+
+    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        given = np.full((len(self.bodies), 7), np.nan)
+        for row, body, state in zip(given, self.bodies, q.reshape(-1, 7), strict=True):
+            if body.velocity is not None:
+                row[:3] = body.velocity
+            if body.angular_velocity is not None:
+                row[3:] = euler_rates(state[3:], body.angular_velocity)
+        known = np.isfinite(given.ravel())
+        return np.where(known, given.ravel(), 0.0), known
+
+    def _check_branches(self, t: float, q: Array) -> None:
+        for joint in self.joints:
+            row = joint.rows[0]
+            if row.kind != TURN or row.motion is None:
+                continue
+            assert row.on_first is not None and row.on_second is not None
+            one, other = (
+                np.eye(3) if body is self.ground else rotation_matrix(q[7 * body.number + 3 : 7 * body.number + 7])
+                for body in (joint.a, joint.b)
+            )
+            there = one.T @ (other @ np.array(row.on_second.values))
+            angle = float(row.motion.at(t, q, q)[0])
+            first, second = np.array(row.on_first.values).reshape(2, 3)
+            if np.cos(angle) * (first @ there) + np.sin(angle) * (second @ there) < 0.0:
+                raise ValueError(
+                    f"{joint.name!r} is to begin at {angle:.6g} rad from the position given, which is so far away that "
+                    "the bodies end half a turn from it: give their poses nearer to where the motion begins"
+                )
+
+
+def _perpendiculars(axis: Array) -> tuple[Array, Array]:
+    """Two unit directions, perpendicular to an axis and to each other: right-handed with it."""
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
+def _across(a: Body, one: Array, b: Body, other: Array) -> JointRow:
+    """A direction of a and one of b stay perpendicular."""
+    return JointRow(PERPENDICULAR, 1, a, b, Numbers(tuple(one)), Numbers(tuple(other)))
+
+
+def _parallel(a: Body, one: Array, b: Body, other: Array) -> tuple[JointRow, ...]:
+    """A direction of a and one of b stay parallel."""
+    return tuple(_across(a, across, b, other) for across in _perpendiculars(one))
+
+
+def _on_line(a: Body, one: Array, b: Body, on_a: Numbers, on_b: Numbers) -> tuple[JointRow, ...]:
+    """A point of b stays on a line of a."""
+    return tuple(JointRow(PLANE, 1, a, b, Numbers(tuple(across)), on_b, on_a) for across in _perpendiculars(one))
+
+
+def _relative(a: Body, one: Array, b: Body, other: Array) -> Array:
+    """The rotation of b against a nearest to the one given in which the axis of b is that of a."""
+    given: Array = a.rotation.T @ b.rotation
+    there = given @ other
+    turn, c = np.cross(there, one), float(there @ one)
+    if c < 0.0 and np.linalg.norm(turn) < 1e-6:  # opposite: half a turn about any direction across
+        across = _perpendiculars(one)[0]
+        return np.asarray((2.0 * np.outer(across, across) - np.eye(3)) @ given)
+    cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+    return np.asarray((np.eye(3) + cross + cross @ cross / (1.0 + c)) @ given)
+
+
+def _rotation(name: str, given: ArrayLike) -> Array:
+    """A rotation matrix, orthonormal to rounding."""
+    R = check_real(name, given)
+    try:
+        return rotation_matrix(euler_parameters(R))
+    except ValueError:
+        raise ValueError(
+            f"{name} must be a rotation matrix (3, 3), orthonormal to 1e-9 and right-handed; given {shown(given)}"
+        ) from None
+
+
+def _moments(name: str, given: ArrayLike) -> Array:
+    """J_xx, J_yy, J_zz, J_xy, J_xz, J_yz of three moments or of a tensor."""
+    J = check_real(name, given)
+    if J.shape not in ((3,), (3, 3)) or not np.isfinite(J).all():
+        raise ValueError(
+            f"{name} must be three moments, shape (3,), or a tensor, shape (3, 3), of finite numbers; given {shown(given)}"
+        )
+    J = np.diag(J) if J.ndim == 1 else J
+    if np.abs(J - J.T).max() > SYMMETRIC * np.abs(J).max() or np.linalg.eigvalsh(J).min() <= 0.0:
+        raise ValueError(
+            f"{name} must be symmetric and positive: without a moment about some axis a body that turns about it has no "
+            f"inertia (give a thin rod a small one); given {shown(given)}"
+        )
+    J = 0.5 * (J + J.T)
+    return np.array([J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]])
