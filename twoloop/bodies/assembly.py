@@ -146,7 +146,7 @@ def velocities(
         raise ValueError(
             f"the joints of {system.name!r} do not allow the velocities given: the rate of {name} was to be "
             f"{given[j]:.6g}, and the nearest that they allow is {v[j] * scales.columns[j]:.6g}"
-            f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or less joints"
+            f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or fewer joints"
         )
     return consistent_state(system, t, q, v * scales.columns)[1]
 

@@ -121,9 +121,8 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
             return replace(function, traced=np.array(numbers_of(program_for([function], 0, True))))
         except Untraceable as error:
             raise ValueError(
-                f"{name} needs its derivatives, which follow from it only where it runs on symbols: {error}. Write it "
-                "with numpy's functions and without branches, or give rate= and acceleration=, its first and second "
-                "derivative as functions of t"
+                f"{error}; so its derivatives do not follow from it. Write it with numpy's functions and without "
+                "branches, or give rate= and acceleration=, its first and second derivative as functions of t"
             ) from None
     return function
 

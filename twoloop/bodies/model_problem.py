@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from twoloop.bodies.assembly import Freedom
 from twoloop.checks.arguments import check_finite
 from twoloop.problem.description import name_and_unit
@@ -76,9 +74,7 @@ class ModelProblem(Problem):
                 return known, place
         words = str(name).split()
         near = [known for known in self.parameters if words and words[-1] in known.split()]
-        raise ValueError(
-            f"{self.name!r} has no parameter {name!r}; it has {_listed(near or list(self.parameters))}"
-        )
+        raise ValueError(f"{self.name!r} has no parameter {name!r}; it has {_listed(near or list(self.parameters))}")
 
 
 def _listed(names: Sequence[str]) -> str:

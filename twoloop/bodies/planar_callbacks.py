@@ -1,4 +1,4 @@
-"""The callbacks of all planar models: bodies by x, y of the centre of mass and an angle; see `parameter_layout` for p."""
+"""The callbacks of all planar models: bodies by x, y of the centre of mass and an angle; p: see `parameter_layout`."""
 
 import math
 
@@ -36,7 +36,6 @@ from twoloop.bodies.parameter_layout import (
     SECOND,
     SECOND_AT,
     SLIDE,
-    SPRING,
     TORQUE,
     TORSION,
 )
@@ -103,6 +102,7 @@ def turn(row, body, factor):
 
 @helper
 def fill_constraint(q, p, made, C):
+    """C."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
@@ -124,6 +124,7 @@ def fill_constraint(q, p, made, C):
 
 @helper
 def fill_jacobian(q, p, made, Cq):
+    """C_q; `made`: results of the program of motions."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
@@ -150,6 +151,7 @@ def fill_jacobian(q, p, made, Cq):
 
 @helper
 def fill_rate(q, p, made, Ct):
+    """C_t, of drives alone."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         if int(p[k + MOTION]) >= 0:
@@ -158,6 +160,7 @@ def fill_rate(q, p, made, Ct):
 
 @helper
 def fill_gamma(q, v, p, made, Qd):
+    """The right-hand side of C_q a = gamma."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
@@ -182,6 +185,7 @@ def fill_gamma(q, v, p, made, Qd):
 
 @helper
 def fill_force(q, v, p, made, Q):
+    """Q; `made`: results of the program of forces."""
     for body in range(int(p[p.size - HEAD + BODIES])):
         mass = p[WEIGHT + PLANAR_BODY * body]
         Q[3 * body] += mass * p[0]
@@ -190,7 +194,7 @@ def fill_force(q, v, p, made, Q):
     for k in range(first, first + FORCE_WIDTH * n, FORCE_WIDTH):
         kind, i, j, more = int(p[k + F_KIND]), int(p[k + F_FIRST]), int(p[k + F_SECOND]), int(p[k + F_MORE])
         given = int(p[k + F_RESULT])
-        if kind == TORQUE or kind == TORSION:
+        if kind in (TORQUE, TORSION):
             if kind == TORSION:
                 torque = -p[more] * (angle_of(q, j) - angle_of(q, i) - p[more + 2])
                 torque -= p[more + 1] * (angle_of(v, j) - angle_of(v, i))

@@ -109,7 +109,7 @@ class PlanarModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("revolute", a, b, name, at)
+        first, second, name, points = self._pair("revolute", a, b, name, at)
         return self._add_joint(ModelJoint(name, "revolute", first, second, (_pin(first, second, *points),), *points))
 
     def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
@@ -133,7 +133,7 @@ class PlanarModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("prismatic", a, b, name, at)
+        first, second, name, points = self._pair("prismatic", a, b, name, at)
         one, other = self._directions(axis, first, second)
         turned = float(np.arctan2(one[1], one[0]))
         pair = isinstance(axis, (tuple, list)) and not isinstance(axis[0], (int, float, np.number))
@@ -164,13 +164,20 @@ class PlanarModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("fixed", a, b, name, at)
+        first, second, name, points = self._pair("fixed", a, b, name, at)
         turned = _turn(name, first, second, second.rotation - first.rotation)
         rows = _pin(first, second, *points), JointRow(ANGLE, 1, first, second, more=turned)
         return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
 
     def distance(
-        self, a: Body | str, at_a: Any, b: Body | str, at_b: Any, *, length: float | None = None, name: str | None = None
+        self,
+        a: Body | str,
+        at_a: Any,
+        b: Body | str,
+        at_b: Any,
+        *,
+        length: float | None = None,
+        name: str | None = None,
     ) -> ModelJoint:
         """A massless rod between a point of a and a point of b.
 

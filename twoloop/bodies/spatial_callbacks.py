@@ -1,4 +1,4 @@
-"""The callbacks of all spatial models: bodies by their centre of mass and Euler parameters; see `parameter_layout` for p.
+"""The callbacks of all spatial models: bodies by centre of mass and Euler parameters; p: see `parameter_layout`.
 
 The first rows are e.e = 1 of each body, then those of the joints. The mass matrix has the rank 6 of 7 for each body,
 4 G^T J G being of rank 3.
@@ -7,6 +7,7 @@ The first rows are e.e = 1 of each body, then those of the joints. The mass matr
 import math
 
 from twoloop.bodies.parameter_layout import (
+    AXIAL,
     BODIES,
     F_FIRST,
     F_FIRST_AT,
@@ -40,10 +41,8 @@ from twoloop.bodies.parameter_layout import (
     SECOND_AT,
     SLIDE,
     SPATIAL_BODY,
-    SPRING,
     TORQUE,
     TORSION,
-    AXIAL,
     TURN,
 )
 from twoloop.bodies.program_results import result, results
@@ -94,6 +93,7 @@ def followed(p, at, made, moved):
 
 @helper
 def fill_constraint(q, p, made, C):
+    """C."""
     for body in range(int(p[p.size - HEAD + BODIES])):
         k = 7 * body + 3
         C[body] = 0.5 * (q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3] - 1.0)
@@ -101,7 +101,7 @@ def fill_constraint(q, p, made, C):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
-        if kind == PERPENDICULAR or kind == TURN:
+        if kind in (PERPENDICULAR, TURN):
             if kind == TURN:
                 (x, y, z), _, _ = followed(p, at, made, moved)
             else:
@@ -126,6 +126,7 @@ def fill_constraint(q, p, made, C):
 
 @helper
 def fill_jacobian(q, p, made, Cq):
+    """C_q; `made`: results of the program of motions."""
     n = int(p[p.size - HEAD + BODIES])
     for body in range(n):
         for k in range(7 * body + 3, 7 * body + 7):
@@ -164,6 +165,7 @@ def fill_jacobian(q, p, made, Cq):
 
 @helper
 def fill_rate(q, p, made, Ct):
+    """C_t, of drives alone."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         moved = int(p[k + MOTION])
@@ -180,6 +182,7 @@ def fill_rate(q, p, made, Ct):
 
 @helper
 def fill_gamma(q, v, p, made, Qd):
+    """The right-hand side of C_q a = gamma."""
     for body in range(int(p[p.size - HEAD + BODIES])):
         k = 7 * body + 3
         Qd[body] = -(v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2] + v[k + 3] * v[k + 3])
@@ -187,7 +190,7 @@ def fill_gamma(q, v, p, made, Qd):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
-        if kind == PERPENDICULAR or kind == TURN:
+        if kind in (PERPENDICULAR, TURN):
             bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
             bux, buy, buz, bax, bay, baz = vector_rate(q, v, j, p[there], p[there + 1], p[there + 2])
             x, y, z = p[at], p[at + 1], p[at + 2]
@@ -230,6 +233,7 @@ def fill_gamma(q, v, p, made, Qd):
 
 @helper
 def fill_force(q, v, p, made, Q):
+    """Q; `made`: results of the program of forces."""
     for body in range(int(p[p.size - HEAD + BODIES])):
         m, k = WEIGHT + SPATIAL_BODY * body, 7 * body + 3
         move_row(Q, body, p[m] * p[0], p[m] * p[1], p[m] * p[2])
@@ -257,7 +261,7 @@ def fill_force(q, v, p, made, Q):
             else:
                 push_row(q, Q, j, p, there, p[more], p[more + 1], p[more + 2])
             continue
-        if kind == AXIAL or kind == TORSION or kind == SLIDE:  # along an axis of body i
+        if kind in (AXIAL, TORSION, SLIDE):  # along an axis of body i
             x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
             if kind == TORSION:
                 ux, uy, uz = spin(q, v, i)

@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.bodies.functions import Function
 from twoloop.bodies.model import Model
-from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PERPENDICULAR, PLANE, POINT, SLIDE, TORSION, TURN
+from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.spatial_rows import across, on_line, parallel, perpendiculars, relative
 from twoloop.checks.arguments import check_real, check_vector, shown
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
 
@@ -117,7 +118,7 @@ class SpatialModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("spherical", a, b, name, at)
+        first, second, name, points = self._pair("spherical", a, b, name, at)
         rows = (JointRow(POINT, 3, first, second, *points),)
         return self._add_joint(ModelJoint(name, "spherical", first, second, rows, *points))
 
@@ -142,9 +143,9 @@ class SpatialModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("revolute", a, b, name, at)
+        first, second, name, points = self._pair("revolute", a, b, name, at)
         one, other = self._directions(axis, first, second)
-        rows = JointRow(POINT, 3, first, second, *points), *_parallel(first, one, second, other)
+        rows = JointRow(POINT, 3, first, second, *points), *parallel(first, one, second, other)
         return self._add_joint(ModelJoint(name, "revolute", first, second, rows, *points, (one, other)))
 
     def universal(self, a: Body | str, b: Body | str, *, at: Any, axes: Any, name: str | None = None) -> ModelJoint:
@@ -170,14 +171,14 @@ class SpatialModel(Model):
         """
         if not isinstance(axes, (tuple, list, np.ndarray)) or len(axes) != 2:
             raise ValueError(f"axes must be two directions, the axis in a and the axis in b; given {shown(axes)}")
-        first, second, name, *points = self._pair("universal", a, b, name, at)
+        first, second, name, points = self._pair("universal", a, b, name, at)
         one, other = self._direction("axes[0]", axes[0], first), self._direction("axes[1]", axes[1], second)
         cosine = float((first.rotation @ one) @ (second.rotation @ other))
         if not any(hasattr(each, "body") for each in axes) and abs(cosine) > PERPENDICULAR_TO:
             raise ValueError(
-                f"axes of {name!r} must be perpendicular; given {shown(axes)}, at {np.degrees(np.arccos(cosine)):.6g} deg"
+                f"axes of {name!r} must be perpendicular; given {shown(axes)}, whose cosine is {cosine:.6g}"
             )
-        rows = JointRow(POINT, 3, first, second, *points), _across(first, one, second, other)
+        rows = JointRow(POINT, 3, first, second, *points), across(first, one, second, other)
         return self._add_joint(ModelJoint(name, "universal", first, second, rows, *points))
 
     def cylindrical(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
@@ -201,9 +202,9 @@ class SpatialModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("cylindrical", a, b, name, at)
+        first, second, name, points = self._pair("cylindrical", a, b, name, at)
         one, other = self._directions(axis, first, second)
-        rows = *_on_line(first, one, second, *points), *_parallel(first, one, second, other)
+        rows = *on_line(first, one, second, *points), *parallel(first, one, second, other)
         return self._add_joint(ModelJoint(name, "cylindrical", first, second, rows, *points))
 
     def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
@@ -227,11 +228,11 @@ class SpatialModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("prismatic", a, b, name, at)
+        first, second, name, points = self._pair("prismatic", a, b, name, at)
         one, other = self._directions(axis, first, second)
-        across, third = _perpendiculars(one)
-        held = _across(first, across, second, _relative(first, one, second, other).T @ third)
-        rows = *_on_line(first, one, second, *points), *_parallel(first, one, second, other), held
+        first_across, third = perpendiculars(one)
+        held = across(first, first_across, second, relative(first, one, second, other).T @ third)
+        rows = *on_line(first, one, second, *points), *parallel(first, one, second, other), held
         return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points, (one, other)))
 
     def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
@@ -253,17 +254,24 @@ class SpatialModel(Model):
         TypeError, ValueError
             If an argument is wrong.
         """
-        first, second, name, *points = self._pair("fixed", a, b, name, at)
+        first, second, name, points = self._pair("fixed", a, b, name, at)
         there = second.rotation.T @ first.rotation
         pairs = ((0, 1), (0, 2), (1, 2))
         rows = (
             JointRow(POINT, 3, first, second, *points),
-            *(_across(first, np.eye(3)[i], second, there[:, j]) for i, j in pairs),
+            *(across(first, np.eye(3)[i], second, there[:, j]) for i, j in pairs),
         )
         return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
 
     def distance(
-        self, a: Body | str, at_a: Any, b: Body | str, at_b: Any, *, length: float | None = None, name: str | None = None
+        self,
+        a: Body | str,
+        at_a: Any,
+        b: Body | str,
+        at_b: Any,
+        *,
+        length: float | None = None,
+        name: str | None = None,
     ) -> ModelJoint:
         """A massless rod between a point of a and a point of b.
 
@@ -295,13 +303,13 @@ class SpatialModel(Model):
         if joint.kind == "prismatic":
             along = Numbers(tuple(one))
             return JointRow(PLANE, 1, joint.a, joint.b, along, joint.point_b, joint.point_a, motion)
-        first, second = _perpendiculars(one)
-        zero = _relative(joint.a, one, joint.b, other).T @ first
+        first, second = perpendiculars(one)
+        zero = relative(joint.a, one, joint.b, other).T @ first
         return JointRow(TURN, 1, joint.a, joint.b, Numbers((*first, *second)), Numbers(tuple(zero)), None, motion)
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
         one, other = joint.axes
-        zero = euler_parameters(_relative(joint.a, one, joint.b, other))
+        zero = euler_parameters(relative(joint.a, one, joint.b, other))
         here, there = (euler_parameters(body.rotation) for body in (joint.a, joint.b))
         w = here[0] * there[0] + here[1:] @ there[1:]
         x = here[0] * there[1:] - there[0] * here[1:] - np.cross(here[1:], there[1:])
@@ -356,40 +364,6 @@ class SpatialModel(Model):
                 )
 
 
-def _perpendiculars(axis: Array) -> tuple[Array, Array]:
-    """Two unit directions, perpendicular to an axis and to each other: right-handed with it."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    first /= np.linalg.norm(first)
-    return first, np.cross(axis, first)
-
-
-def _across(a: Body, one: Array, b: Body, other: Array) -> JointRow:
-    """A direction of a and one of b stay perpendicular."""
-    return JointRow(PERPENDICULAR, 1, a, b, Numbers(tuple(one)), Numbers(tuple(other)))
-
-
-def _parallel(a: Body, one: Array, b: Body, other: Array) -> tuple[JointRow, ...]:
-    """A direction of a and one of b stay parallel."""
-    return tuple(_across(a, across, b, other) for across in _perpendiculars(one))
-
-
-def _on_line(a: Body, one: Array, b: Body, on_a: Numbers, on_b: Numbers) -> tuple[JointRow, ...]:
-    """A point of b stays on a line of a."""
-    return tuple(JointRow(PLANE, 1, a, b, Numbers(tuple(across)), on_b, on_a) for across in _perpendiculars(one))
-
-
-def _relative(a: Body, one: Array, b: Body, other: Array) -> Array:
-    """The rotation of b against a nearest to the one given in which the axis of b is that of a."""
-    given: Array = a.rotation.T @ b.rotation
-    there = given @ other
-    turn, c = np.cross(there, one), float(there @ one)
-    if c < 0.0 and np.linalg.norm(turn) < 1e-6:  # opposite: half a turn about any direction across
-        across = _perpendiculars(one)[0]
-        return np.asarray((2.0 * np.outer(across, across) - np.eye(3)) @ given)
-    cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
-    return np.asarray((np.eye(3) + cross + cross @ cross / (1.0 + c)) @ given)
-
-
 def _rotation(name: str, given: ArrayLike) -> Array:
     """A rotation matrix, orthonormal to rounding."""
     R = check_real(name, given)
@@ -406,13 +380,13 @@ def _moments(name: str, given: ArrayLike) -> Array:
     J = check_real(name, given)
     if J.shape not in ((3,), (3, 3)) or not np.isfinite(J).all():
         raise ValueError(
-            f"{name} must be three moments, shape (3,), or a tensor, shape (3, 3), of finite numbers; given {shown(given)}"
+            f"{name} must be three finite moments, shape (3,), or a tensor, shape (3, 3); given {shown(given)}"
         )
     J = np.diag(J) if J.ndim == 1 else J
     if np.abs(J - J.T).max() > SYMMETRIC * np.abs(J).max() or np.linalg.eigvalsh(J).min() <= 0.0:
         raise ValueError(
-            f"{name} must be symmetric and positive: without a moment about some axis a body that turns about it has no "
-            f"inertia (give a thin rod a small one); given {shown(given)}"
+            f"{name} must be symmetric and positive definite, as a body that turns about an axis without a moment has "
+            f"no inertia (give a thin rod a small one); given {shown(given)}"
         )
     J = 0.5 * (J + J.T)
     return np.array([J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]])

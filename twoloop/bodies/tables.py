@@ -1,4 +1,4 @@
-"""The parameters of a model: its numbers with their names, and the tables of its joints and forces; see `parameter_layout`."""
+"""The parameters of a model: numbers with names, tables of joints and forces, programs; see `parameter_layout`."""
 
 from __future__ import annotations
 
@@ -64,9 +64,10 @@ class Tables:
             names = ("mass (kg)", *(f"{moment} (kg m^2)" for moment in MOMENTS[dimension]))
             self._place(Numbers(tuple(body.inertia), tuple(_of(name, body.name) for name in names)))
         rows = [row for joint in joints for row in joint.rows]
-        self._numbers = [numbers for row in (*rows, *forces) for numbers in (row.on_first, row.on_second, row.more)]
-        for numbers in self._numbers:
-            self._place(numbers)
+        for row in rows:
+            self._place_all(row.on_first, row.on_second, row.more)
+        for force in forces:
+            self._place_all(force.on_first, force.on_second, force.more)
         self._n_named = len(self._values)
         self.motions = [row.motion for row in rows if row.motion is not None]
         self.functions = [force.function for force in forces if force.function is not None]
@@ -88,9 +89,12 @@ class Tables:
         for name, value in values.items():
             self.p[self.places[name]] = value
 
-    def _place(self, numbers: Numbers | None) -> None:
-        if numbers is None or id(numbers) in self._known:
-            return
+    def _place_all(self, *parts: Numbers | None) -> None:
+        for numbers in parts:
+            if numbers is not None and id(numbers) not in self._known:
+                self._place(numbers)
+
+    def _place(self, numbers: Numbers) -> None:
         self._keep.append(numbers)
         if not numbers.names:
             self._known[id(numbers)] = NONE - 1 - len(self._constants)  # counted back from NONE until all are known
@@ -112,7 +116,7 @@ class Tables:
         table: list[float] = []
         row, motion, result = first_row, 0, 0
         for joint in self.joints:
-            numbered = []
+            numbered: list[int] = []
             for part in joint.rows:
                 table += self._joint_row(part, row, NONE if part.motion is None else 3 * motion)
                 motion += part.motion is not None
@@ -123,8 +127,8 @@ class Tables:
         forces = n_before + len(table)
         for force in self.forces:
             first, second, function = force.first.number, force.second.number, force.function
-            places = first, self._at(force.on_first), second, self._at(force.on_second), self._at(force.more)
-            table += (force.kind, *places, NONE if function is None else result)
+            table += (force.kind, first, self._at(force.on_first), second, self._at(force.on_second))
+            table += (self._at(force.more), NONE if function is None else result)
             result += 0 if function is None else function.size
         self.n_rows, self.untraced = row, ""
         programs: list[list[float]] = []
@@ -150,6 +154,6 @@ class Tables:
 
 
 def _of(quantity: str, name: str) -> str:
-    """ "mass (kg)" of "crank": "mass of crank (kg)"."""
+    """Of "mass (kg)" and "crank" make "mass of crank (kg)"."""
     head, unit = quantity.split(" (")
     return f"{head} of {name} ({unit}"
