@@ -102,9 +102,11 @@ class Laws:
         a = np.linalg.lstsq(K, right, rcond=1e-11)[0][: 6 * n].reshape(n, 6)
         return a[:, :3], a[:, 3:]
 
-    def applied(self, t, bodies, v, w):
-        """(body, point, force, torque) of all loads on bodies that move."""
+    def applied(self, t, bodies, v, w, springs=True):
+        """(body, point, force, torque) of all loads on bodies that move; or of those without a potential."""
         for load in self.loads:
+            if not springs and getattr(load, "has_potential", False):
+                continue
             for body, point, force, torque in load(t, bodies, v, w):
                 if body is not None:
                     yield body, point, force, torque

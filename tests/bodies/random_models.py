@@ -163,9 +163,10 @@ class Both:
 
         self.laws.rows.append(row)
 
-    def spring(self, i, j):
+    def spring(self, i, j, damped=True, stiff=True):
         one, other, random = self.point(), self.point(), self.random
         stiffness, damping, length = random.uniform(5.0, 50.0), random.uniform(0.0, 3.0), random.uniform(0.2, 2.0)
+        stiffness, damping = stiffness * stiff, damping * damped
         self.model.spring(
             self.handle(i),
             self.cut(one),
@@ -184,11 +185,13 @@ class Both:
             pull = (stiffness * (now - length) + damping * (rate @ gap) / now) * gap / now
             return [(i, here, pull, NONE), (j, there, -pull, NONE)]
 
+        load.has_potential = not damped
         self.laws.loads.append(load)
 
-    def torsion(self, i, j, joint, axis):
-        stiffness, damping, rest = self.random.uniform(0.5, 5.0, 3)
-        self.model.torsion_spring(joint, stiffness=stiffness, damping=damping, angle=rest)
+    def torsion(self, i, j, joint, axis, damped=True):
+        stiffness, damping, rest = self.random.uniform(0.5, 5.0, 3) * (1.0, damped, 1.0)
+        self.model.torsion_spring(joint, stiffness=stiffness, damping=damping, angle=rest - 2.0)
+        rest -= 2.0
         one = np.linalg.svd(axis[None])[2][1]
         a, n, b = self.along(i, one), self.along(i, axis), self.along(j, one)
 
@@ -199,6 +202,7 @@ class Both:
             torque = -stiffness * (angle - rest) - damping * (other_w - one_w) @ along
             return [(j, NONE, NONE, torque * along), (i, NONE, NONE, -torque * along)]
 
+        load.has_potential = not damped
         self.laws.loads.append(load)
 
     def motor(self, i, j, joint, axis, point, f):

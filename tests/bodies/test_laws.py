@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.bodies.newton_euler import Bodies
 from tests.bodies.random_models import Both
 from twoloop import consistent_state
 from twoloop.mechanisms.rotation import G, rotation_matrix
@@ -31,16 +32,22 @@ def states(both, q, v, a):
     return q[:, :3], R, v[:, :3], spins[0], a[:, :3], spins[1]
 
 
+def in_motion(both, t=0.4):
+    """The problem, and a consistent state of it far from the start."""
+    problem = both.model.problem(t_span=(t, t + 1.0))
+    system, random = problem.system, both.random
+    away = problem.q0 + random.uniform(-0.2, 0.2, system.n_q)
+    v = problem.v0 + random.uniform(-2.0, 2.0, system.n_q)
+    return problem, *consistent_state(system, t, away, v, check_assembly=False)
+
+
 def assert_follows_the_laws(both, t=0.4):
     if both.planar:
         for k in range(both.n):
             both.plane_bound(k)
-    problem = both.model.problem(t_span=(t, t + 1.0))
-    system, random = problem.system, both.random
+    problem, q, v = in_motion(both, t)
+    system = problem.system
     assert system.python_functions == {}
-    away = problem.q0 + random.uniform(-0.2, 0.2, system.n_q)
-    v = problem.v0 + random.uniform(-2.0, 2.0, system.n_q)
-    q, v = consistent_state(system, t, away, v, check_assembly=False)
     x, R, u, w, a, alpha = states(both, q, v, accelerations(system, t, q, v))
     assert np.abs(both.laws.constraint(t, x, R)).max(initial=0.0) < 1e-9  # the position, asked of those
     known = both.laws.matrix(t, x, R) @ np.column_stack([u, w]).ravel() + both.laws.rate(t, x, R)
@@ -92,3 +99,35 @@ def test_a_loop_closed_by_every_joint():
     problem = assert_follows_the_laws(both)
     assert problem.freedom.degrees == 1
     assert problem.freedom.redundant == (tuple(joint.name for joint in both.model.joints),)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("planar", [True, False])
+def test_energy_changes_by_the_power_of_what_has_no_potential(planar, seed):
+    both, t = Both(100 + seed, planar, n=4), 0.4
+    joints = []
+    for k, kind in enumerate(("revolute", "prismatic", "revolute", "fixed" if planar else "universal")):
+        parent = None if k == 0 else k - 1
+        joints.append(getattr(both, kind)(parent, k))
+    both.torsion(None, 0, *joints[0][:2], damped=False)
+    both.spring(None, 3, damped=False)
+    both.spring(0, 2, damped=False)
+    assert both.model.problem().conserved
+    if seed > 1:
+        both.motor(0, 1, *joints[1], lambda t: 3.0 * np.cos(t))
+        both.motor(1, 2, *joints[2], lambda t: 2.0)
+        both.force(3, lambda t: np.array([1.0, np.sin(t), 0.5 * (not planar)]))
+        both.torque(1, 2.0)
+        both.spring(1, 3, stiff=False)
+    problem, q, v = in_motion(both, t)
+    assert problem.conserved == (seed <= 1)
+    a = accelerations(problem.system, t, q, v)
+    h = 1e-4 * np.array([-2.0, -1.0, 1.0, 2.0])
+    energies = problem.energy(t, q[:, None] + np.outer(v, h) + np.outer(a, 0.5 * h**2), v[:, None] + np.outer(a, h))
+    rate = (energies @ np.array([1.0, -8.0, 8.0, -1.0])) / 12e-4
+    x, R, u, w, _, _ = states(both, q, v, a)
+    loads = both.laws.applied(t, Bodies(x, R), u, w, springs=False)
+    power = 0.0
+    for body, at, force, torque in loads:
+        power += force @ (u[body] + np.cross(w[body], at - x[body])) + torque @ w[body]
+    assert rate == pytest.approx(power, abs=1e-6 * (1.0 + np.abs(energies).max()))

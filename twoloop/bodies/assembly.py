@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
+from scipy.linalg import lapack, null_space
 from scipy.optimize import least_squares
 
 from twoloop.checks.scales import scales_of
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 SINGULAR = 1e-9  # singular values of scaled rows that count as zero, over the largest
 NEARBY = 0.02  # of the largest coordinate, at least of 1: how far away the joints are looked at once more
 ROUGH = 0.1  # of the largest velocity given: by how much joints may change it
+ROUNDING = 8.0 * np.finfo(np.float64).eps  # of the terms of a constraint
+CLEAR = 1e-12  # reciprocal condition of C_q C_q^T from which the rank is full without a doubt
 STAYS = 1e-7  # of the size of the model: what a joint that cannot close leaves open at least
 
 
@@ -43,15 +45,37 @@ class Freedom:
 
 
 def positions(
-    system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[int], rows: Mapping[str, tuple[int, ...]]
+    system: ConstrainedSystem,
+    t: float,
+    guess: Array,
+    turning: NDArray[np.bool_],
+    keep: Sequence[int],
+    rows: Mapping[str, tuple[int, ...]],
 ) -> Array:
     """Bodies moved by the least change so that all joints close.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        In which drives have no rate.
+    guess : ndarray (n_q,)
+    turning : ndarray of bool (n_q,)
+        Which coordinates are rotations.
+    keep : sequence of int
+        Which stay as they are.
+    rows : mapping
+        Of each joint, by its name.
 
     Raises
     ------
     ValueError
         Naming the joint that does not close.
     """
+    if system.n_c == 0:
+        return guess
+    terms = np.abs(system.jacobian(t, guess)) @ np.where(turning, np.maximum(np.abs(guess), 1.0), np.abs(guess))
+    if (np.abs(system.constraint(t, guess)) <= ROUNDING * terms).all():
+        return guess
     still = np.zeros(system.n_q)
     try:
         return consistent_state(system, t, guess, still, keep=list(keep) or None)[0]
@@ -113,7 +137,7 @@ def velocities(
     ValueError
         If the joints do not allow the velocities given, or a drive asks for what they do not allow.
     """
-    if system.n_c == 0:
+    if system.n_c == 0 or not (known.any() or system.rates(t, q).any()):
         return np.where(known, given, 0.0)
     rows = system.rows(t, q)
     scales = scales_of(system, t, q, rows)
@@ -148,16 +172,20 @@ def velocities(
             f"{given[j]:.6g}, and the nearest that they allow is {v[j] * scales.columns[j]:.6g}"
             f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or fewer joints"
         )
-    return consistent_state(system, t, q, v * scales.columns)[1]
+    v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
+    return np.asarray(v * scales.columns)
 
 
 def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]) -> Freedom:
     """Degrees of freedom at a start and beside it, and which joints have rows that follow from others."""
     if system.n_c == 0:
         return Freedom(system.n_q, 0, ())
+    scaled = _scaled(system, t, q)
+    if _full_rank(scaled):
+        return Freedom(system.n_q - system.n_c, 0, ())
     at_start = _rank(system, t, q)
     beside = at_start
-    free = null_space(_scaled(system, t, q), rcond=SINGULAR)
+    free = null_space(scaled, rcond=SINGULAR)
     if free.shape[1]:
         direction = free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1])
         away = q + NEARBY * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max()
@@ -174,6 +202,15 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
 def _scaled(system: ConstrainedSystem, t: float, q: Array) -> Array:
     rows = system.rows(t, q)
     return scales_of(system, t, q, rows).scaled(rows)
+
+
+def _full_rank(scaled: Array) -> bool:
+    """Whether all rows are independent without a doubt: far cheaper to say than the rank."""
+    if len(scaled) > scaled.shape[1]:
+        return False
+    square = scaled @ scaled.T
+    factor, info = lapack.dpotrf(square)
+    return bool(info == 0 and lapack.dpocon(factor, np.abs(square).sum(axis=0).max())[0] > CLEAR)
 
 
 def _rank(system: ConstrainedSystem, t: float, q: Array) -> int:

@@ -293,7 +293,7 @@ class Model(Collection):
         about = t_span[0], start, np.zeros_like(start)
         system = system_of(self.dimension, tables, joints, name, about)
         still = system_of(self.dimension, tables, joints, name, about, moves=False) if tables.motions else system
-        q = assembly.positions(still, t_span[0], start, keep, tables.rows)
+        q = assembly.positions(still, t_span[0], start, self._turning(), keep, tables.rows)
         self._check_branches(t_span[0], q)
         given, known = self._velocities(q)
         coordinates = tuple(f"{each} of {body.name}" for body in self.bodies for each in self.coordinate_names)
@@ -317,6 +317,10 @@ class Model(Collection):
             keep=keep,
             freedom=freedom,
         )
+
+    def _turning(self) -> NDArray[np.bool_]:
+        """Which coordinates are rotations."""
+        return np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
 
     def _first_row(self) -> int:
         """How many rows stand before those of the joints."""
