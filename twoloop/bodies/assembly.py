@@ -168,11 +168,12 @@ def velocities(
         j = int(off.argmax())
         name, unit = name_and_unit(coordinates[j])
         raise ValueError(
-            f"the joints of {system.name!r} do not allow the velocities given: the rate of {name} was to be "
+            f"the joints and drives of {system.name!r} do not allow the velocities given: the rate of {name} was to be "
             f"{given[j]:.6g}, and the nearest that they allow is {v[j] * scales.columns[j]:.6g}"
             f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
+    v[~known & (np.abs(v) < ROUNDING * np.abs(v).max())] = 0.0  # what rounding leaves of bodies at rest
     return np.asarray(v * scales.columns)
 
 

@@ -50,6 +50,8 @@ def system_of(
     if tables.motions and moves:
         kinds.append("constraint_rate")
     options: Any = {"n_q": n_q, "n_c": tables.n_rows, "joints": joints, "name": name, "parameters": tables.p}
+    for each in (*tables.motions, *tables.functions):
+        each.at(*start)  # says what is wrong with what it returns
     if not tables.untraced:
         tables.untraced = _disagreement(tables, *start)
     if tables.untraced:
