@@ -29,7 +29,7 @@ def spatial():
 
 def body(**changed):
     given = {"name": "arm", "mass": 1.0, "inertia": 0.1, "position": (0.0, 0.0), **changed}
-    return lambda: planar().body(given.pop("name"), **given)
+    return lambda: planar().body(**given)
 
 
 def solid(**changed):

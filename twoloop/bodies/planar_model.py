@@ -11,7 +11,7 @@ from twoloop.bodies.functions import Function
 from twoloop.bodies.model import Model
 from twoloop.bodies.parameter_layout import ACROSS, ALONG, ANGLE, DISTANCE, PIN, SLIDE, TORQUE, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
-from twoloop.checks.arguments import check_finite, check_positive
+from twoloop.checks.arguments import check_finite, check_positive, check_vector
 
 Array = NDArray[np.float64]
 
@@ -88,6 +88,93 @@ class PlanarModel(Model):
         turned = check_finite(f"angle of {name!r}", angle)
         spin = None if rate is None else np.array([rate])
         return self._add_body(Body(name, len(self.bodies), place, turned, np.array([weight, inertia]), speed, spin))
+
+    def rod(self, name: str, start: ArrayLike, end: ArrayLike, *, mass: float, **motion: Any) -> Body:
+        """Add a uniform thin rod between two points of space; its angle is that from `start` to `end`.
+
+        Parameters
+        ----------
+        name : str
+        start, end : array_like (2,)
+            m.
+        mass : float
+            kg.
+        **motion
+            `velocity` and `angular_velocity`, as for `body`.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        one, other = check_vector(f"start of {name!r}", start, 2), check_vector(f"end of {name!r}", end, 2)
+        length = float(np.hypot(*(other - one)))
+        check_positive(f"mass of {name!r}", mass)
+        check_positive(f"the length of {name!r}, from start to end,", length)
+        position, angle = 0.5 * (one + other), float(np.arctan2(*(other - one)[::-1]))
+        return self.body(name, mass=mass, inertia=mass * length**2 / 12.0, position=position, angle=angle, **motion)
+
+    def box(self, name: str, size: ArrayLike, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
+        """Add a uniform rectangle.
+
+        Parameters
+        ----------
+        name : str
+        size : array_like (2,)
+            Its edges along the axes of the body, m.
+        mass : float
+            kg.
+        position : array_like (2,)
+            Of the centre, m.
+        **pose
+            `angle`, `velocity` and `angular_velocity`, as for `body`.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        edges = check_vector(f"size of {name!r}", size, 2)
+        check_positive(f"mass of {name!r}", mass)
+        for edge in edges:
+            check_positive(f"each edge of {name!r}", float(edge))
+        return self.body(name, mass=mass, inertia=mass * float(edges @ edges) / 12.0, position=position, **pose)
+
+    def disc(self, name: str, radius: float, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
+        """Add a uniform disc.
+
+        Parameters
+        ----------
+        name : str
+        radius : float
+            m.
+        mass : float
+            kg.
+        position : array_like (2,)
+            Of the centre, m.
+        **pose
+            `angle`, `velocity` and `angular_velocity`, as for `body`.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        check_positive(f"radius of {name!r}", radius)
+        check_positive(f"mass of {name!r}", mass)
+        return self.body(name, mass=mass, inertia=0.5 * mass * radius**2, position=position, **pose)
 
     def revolute(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
         """A pin: b turns on a.

@@ -8,20 +8,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.bodies.functions import Function
-from twoloop.bodies.model import Model
 from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.bodies.spatial_rows import across, on_line, parallel, perpendiculars, relative
-from twoloop.checks.arguments import check_real, check_vector, shown
+from twoloop.bodies.spatial_shapes import SpatialShapes
+from twoloop.checks.arguments import shown
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
 
 Array = NDArray[np.float64]
 
 PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
-SYMMETRIC = 1e-9  # relative: entries of an inertia
 
 
-class SpatialModel(Model):
+class SpatialModel(SpatialShapes):
     """A mechanism in space, from bodies, joints and forces.
 
     Coordinates are x, y, z of each body's centre of mass and the four Euler parameters of its axes. Points and axes are
@@ -46,57 +45,10 @@ class SpatialModel(Model):
         If an argument is wrong.
     """
 
-    dimension = 3
     coordinate_names = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
 
     def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
         super().__init__(gravity, name)
-
-    def body(
-        self,
-        name: str,
-        *,
-        mass: float,
-        inertia: ArrayLike,
-        position: ArrayLike,
-        rotation: ArrayLike | None = None,
-        velocity: ArrayLike | None = None,
-        angular_velocity: ArrayLike | None = None,
-    ) -> Body:
-        """Add a body.
-
-        Parameters
-        ----------
-        name : str
-        mass : float
-            kg.
-        inertia : array_like (3,) or (3, 3)
-            About the centre of mass along the axes of the body, kg m^2: three moments, or the whole tensor.
-        position : array_like (3,)
-            Of the centre of mass, m.
-        rotation : array_like (3, 3), optional
-            Its columns are the axes of the body. None: those of space.
-        velocity : array_like (3,), optional
-            Of the centre of mass at the start, m/s. None: it follows from the other velocities.
-        angular_velocity : array_like (3,), optional
-            Along the axes of space, rad/s, likewise.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong, or something of the model has this name.
-        """
-        name, place, weight, speed = self._new_body(name, mass, position, velocity)
-        moments = _moments(f"inertia of {name!r}", inertia)
-        R = _rotation(f"rotation of {name!r}", np.eye(3) if rotation is None else rotation)
-        spin = None
-        if angular_velocity is not None:
-            spin = check_vector(f"angular_velocity of {name!r}", angular_velocity, 3)
-        return self._add_body(Body(name, len(self.bodies), place, R, np.append(weight, moments), speed, spin))
 
     def spherical(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
         """A ball joint: both bodies share a point.
@@ -325,9 +277,6 @@ class SpatialModel(Model):
             return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function)
         return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function)
 
-    def _check_moments(self, name: str, moments: Array) -> None:
-        _moments(f"inertia of {name}", moments[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3))
-
     def _first_row(self) -> int:
         return len(self.bodies)
 
@@ -362,31 +311,3 @@ class SpatialModel(Model):
                     f"{joint.name!r} is to begin at {angle:.6g} rad from the position given, which is so far away that "
                     "the bodies end half a turn from it: give their poses nearer to where the motion begins"
                 )
-
-
-def _rotation(name: str, given: ArrayLike) -> Array:
-    """A rotation matrix, orthonormal to rounding."""
-    R = check_real(name, given)
-    try:
-        return rotation_matrix(euler_parameters(R))
-    except ValueError:
-        raise ValueError(
-            f"{name} must be a rotation matrix (3, 3), orthonormal to 1e-9 and right-handed; given {shown(given)}"
-        ) from None
-
-
-def _moments(name: str, given: ArrayLike) -> Array:
-    """J_xx, J_yy, J_zz, J_xy, J_xz, J_yz of three moments or of a tensor."""
-    J = check_real(name, given)
-    if J.shape not in ((3,), (3, 3)) or not np.isfinite(J).all():
-        raise ValueError(
-            f"{name} must be three finite moments, shape (3,), or a tensor, shape (3, 3); given {shown(given)}"
-        )
-    J = np.diag(J) if J.ndim == 1 else J
-    if np.abs(J - J.T).max() > SYMMETRIC * np.abs(J).max() or np.linalg.eigvalsh(J).min() <= 0.0:
-        raise ValueError(
-            f"{name} must be symmetric and positive definite, as a body that turns about an axis without a moment has "
-            f"no inertia (give a thin rod a small one); given {shown(given)}"
-        )
-    J = 0.5 * (J + J.T)
-    return np.array([J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]])
