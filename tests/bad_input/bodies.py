@@ -189,10 +189,16 @@ BODIES: list[Case] = [
         "give its name",
     ),
     of_planar(
-        "a motor in a distance",
-        lambda: planar().motor(planar().distance("bar", (0, 0), "block", (1, 0)), 1.0),
-        "joint must be one of this model",
+        "a joint of another model",
+        lambda: planar().motor(planar().joints[0], 1.0),
+        "'pin' belongs to another",
         "give a joint of the same model",
+    ),
+    of_planar(
+        "a motor in a distance",
+        lambda: (m := planar()).motor(m.distance("bar", (0, 0), "block", (1, 0)), 1.0),
+        "motor needs a revolute or prismatic joint; given 'distance bar-block', which is distance",
+        "let a force or a spring act between the points",
     ),
     of_planar("a number for a motion", drive(1.0), "must be a function of t", "give lambda t: ...", TypeError),
     of_planar(

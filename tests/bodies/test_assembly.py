@@ -211,6 +211,44 @@ def test_names_units_tags_and_reactions():
     assert model.bodies[1].coordinates == (3, 4, 5)
 
 
+def test_a_damper_that_is_added_by_a_parameter_is_told():
+    model = four_bar()
+    model.spring("crank", (0.0, 1.0), "ground", (3.0, 0.0), stiffness=2.0)
+    problem = model.problem()
+    model.body("later", mass=1.0, inertia=1.0, position=(0.0, 0.0))  # does not belong to the problem
+    assert problem.conserved and not problem.with_parameters({"damping of spring crank-ground": 0.1}).conserved
+    assert problem.with_parameters({"stiffness of spring crank-ground": 0.1}).system.n_q == 9
+
+
+def test_names_with_brackets():
+    model = SpatialModel()
+    model.body("arm (left)", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 0.0, 0.0))
+    problem = model.problem()
+    assert problem.names[3:5] == ("e0 of arm (left)", "e1 of arm (left)") and problem.units[2:4] == ("m", "")
+    assert problem.place("mass of arm (left)") == 3
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+def test_sizes_do_not_matter(scale):
+    """Lengths in other units, at the same angles: times go with the root of the length under gravity."""
+    ends = []
+    for unit in (1.0, scale):
+        model = PlanarModel()
+        points = unit * np.array([[0.0, 0.0], [0.0, 1.0], [2.0, 1.5], [2.5, 0.0]])
+        for k in range(3):
+            model.rod(f"bar {k}", points[k], points[k + 1], mass=1.0)
+        for k in range(4):
+            a, b = ("ground", *(body.name for body in model.bodies), "ground")[k : k + 2]
+            model.revolute(a, b, at=points[k])
+        problem = model.problem((0.0, np.sqrt(unit)))
+        assert problem.freedom.degrees == 1 and problem.freedom.singular == 0
+        atol = np.tile([unit, unit, 1.0], 3) * 1e-10
+        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-10, atol=atol)
+        assert result.success
+        ends.append(result.q[:, -1] / np.tile([unit, unit, 1.0], 3))
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-7)
+
+
 def test_a_problem_travels_to_another_process():
     model = four_bar()
     model.spring("crank", (0.0, 1.0), "ground", (3.0, 0.0), stiffness=2.0)
@@ -219,6 +257,12 @@ def test_a_problem_travels_to_another_process():
     one, other = (solve_dae(each.system, each.t_span, each.q0, each.v0) for each in (problem, again))
     np.testing.assert_array_equal(one.q, other.q)
     assert again.energy(0.0, again.q0, again.v0) == problem.energy(0.0, problem.q0, problem.v0)
+    assert again.with_parameters({"mass of rod": 3.0}).parameters["mass of rod (kg)"] == 3.0
+    model.motor("revolute crank-ground", lambda t: 1.0 + t)
+    without = pickle.loads(pickle.dumps(model.problem()))  # the system travels, a lambda does not
+    assert without.system.force(0.0, without.q0, without.v0)[2] == pytest.approx(1.0, abs=2.0)
+    with pytest.raises(ValueError, match="without its model"):
+        without.with_parameters({})
 
 
 def test_a_spring_without_length_has_force_where_its_ends_meet():

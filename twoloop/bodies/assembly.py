@@ -88,11 +88,14 @@ def positions(
     found = _nearest(system, t, guess, keep)
     left = np.abs(system.constraint(t, found))
     if rows and left.max() > STAYS:
-        worst = max(rows, key=lambda name: float(left[list(rows[name])].max()))
+        misfit = {name: float(left[list(of)].max()) for name, of in rows.items()}
+        worst = max(misfit, key=lambda name: misfit[name])
+        others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
+        also = f" (nor do {', '.join(map(repr, others))})" if others else ""
         raise ValueError(
-            f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close; with the least "
-            f"misfit of all joints {float(left[list(rows[worst])].max()):.3g} remain in it. Look at its points, at "
-            "lengths, and at what else holds its bodies"
+            f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close{also}; with the "
+            f"least misfit of all joints {misfit[worst]:.3g} remain in it. Look at lengths, at the points of these "
+            "joints, and at what else holds their bodies"
         )
     raise ValueError(f"the bodies of {system.name!r} cannot be put together from the poses given: {reason}")
 

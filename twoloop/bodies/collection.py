@@ -102,9 +102,10 @@ class Collection:
                 raise TypeError(
                     f"joint must be what revolute(...) and its kin returned, or its name; given {shown(given)}"
                 )
-            name = given if isinstance(given, str) else given.name
+            if isinstance(given, ModelJoint):
+                raise ValueError(f"joint must be one of this model; {given.name!r} belongs to another")
             known = ", ".join(repr(joint.name) for joint in self.joints) or "none so far"
-            raise ValueError(f"joint must be one of this model, {known}; given {name!r}")
+            raise ValueError(f"joint must be one of this model, {known}; given {given!r}")
         if found.kind not in kinds:
             raise ValueError(f"{what} needs a {' or '.join(kinds)} joint; given {found.name!r}, which is {found.kind}")
         return found

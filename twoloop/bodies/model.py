@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from twoloop.bodies import assembly
 from twoloop.bodies.collection import Collection
-from twoloop.bodies.functions import Function, is_constant, motion_function
+from twoloop.bodies.functions import Function, motion_function
 from twoloop.bodies.model_energy import ModelEnergy
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.model_system import joints_of, system_of
@@ -90,7 +91,7 @@ class Model(Collection):
         else:
             names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
             more, kind = Numbers((stiffness, damping, length), names), SPRING
-        return self._add_force(Force(name, kind, first, second, *points, more, conserves=damping == 0.0))
+        return self._add_force(Force(name, kind, first, second, *points, more))
 
     def torsion_spring(
         self,
@@ -299,7 +300,6 @@ class Model(Collection):
         coordinates = tuple(f"{each} of {body.name}" for body in self.bodies for each in self.coordinate_names)
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
-        moves = any(not is_constant(motion) for motion in tables.motions)
         return ModelProblem(
             name=name,
             system=system,
@@ -309,14 +309,20 @@ class Model(Collection):
             energy=ModelEnergy(tables.p.copy(), self.dimension),
             parameters=tables.values,
             note=_note(freedom, tables.untraced),
-            conserved=not moves and all(force.conserves for force in self.forces),
+            conserved=tables.conserve,
             tags=self._tags(freedom),
             coordinates=coordinates,
             drawing=drawing_of(tables),
-            model=self,
+            model=self._as_it_is(),
             keep=keep,
             freedom=freedom,
         )
+
+    def _as_it_is(self) -> Model:
+        """A copy to which nothing is added."""
+        other = copy.copy(self)
+        other.bodies, other.joints, other.forces = list(self.bodies), list(self.joints), list(self.forces)
+        return other
 
     def _turning(self) -> NDArray[np.bool_]:
         """Which coordinates are rotations."""

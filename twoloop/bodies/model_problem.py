@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from twoloop.bodies.assembly import Freedom
 from twoloop.checks.arguments import check_finite
-from twoloop.problem.description import name_and_unit
 from twoloop.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -65,12 +65,24 @@ class ModelProblem(Problem):
         values = dict(self.parameters)
         for name, value in parameters.items():
             values[self._known(name)[0]] = check_finite(f"parameters[{name!r}]", value)
-        assert self.model is not None
+        if self.model is None:
+            raise ValueError(
+                f"{self.name!r} came from another process without its model, whose functions cannot travel: make it "
+                "again, or give them names at the top level of a module"
+            )
         return self.model.put_together(self.t_span, self.name, self.keep, values, self.q0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        try:
+            pickle.dumps(self.model)
+        except Exception:  # a function without a name of its own
+            state["model"] = None
+        return state
 
     def _known(self, name: Any) -> tuple[str, int]:
         for place, known in enumerate(self.parameters):
-            if name == known or name == name_and_unit(known)[0]:
+            if name in (known, known.rpartition(" (")[0]):
                 return known, place
         words = str(name).split()
         near = [known for known in self.parameters if words and words[-1] in known.split()]

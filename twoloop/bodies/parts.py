@@ -141,8 +141,6 @@ class Force:
     Attributes
     ----------
     name : str
-    conserves : bool
-        Whether it has a potential that the energy counts.
     """
 
     name: str
@@ -153,4 +151,3 @@ class Force:
     on_second: Numbers | None = field(default=None, repr=False)
     more: Numbers | None = field(default=None, repr=False)
     function: Function | None = field(default=None, repr=False)
-    conserves: bool = False

@@ -45,7 +45,7 @@ class SpatialModel(SpatialShapes):
         If an argument is wrong.
     """
 
-    coordinate_names = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
+    coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
 
     def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
         super().__init__(gravity, name)
@@ -267,8 +267,7 @@ class SpatialModel(SpatialShapes):
         x = here[0] * there[1:] - there[0] * here[1:] - np.cross(here[1:], there[1:])
         zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # of both signs the one that the bodies start with
         axis, start = Numbers(tuple(one)), Numbers(tuple(zero))
-        conserves = numbers.values[1] == 0.0
-        return Force(name, TORSION, joint.a, joint.b, axis, start, numbers, conserves=conserves)
+        return Force(name, TORSION, joint.a, joint.b, axis, start, numbers)
 
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
         function, more = self._function(name, f, 1, unit)

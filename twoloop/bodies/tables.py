@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.functions import numbers_of, program_for
-from twoloop.bodies.parameter_layout import NONE
+from twoloop.bodies.functions import is_constant, numbers_of, program_for
+from twoloop.bodies.parameter_layout import NONE, PULL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.generate.tracing import Untraceable
 
@@ -84,6 +84,17 @@ class Tables:
         place = self._at(numbers)
         return self.p[place : place + len(numbers.values)]
 
+    @property
+    def conserve(self) -> bool:
+        """Whether nothing in the model changes its energy: no damper, force, torque or motor, no drive that moves."""
+        for force in self.forces:
+            numbers = np.zeros(0) if force.more is None else self.of(force.more)
+            if force.function is not None:
+                return False
+            if (numbers[1:2] if force.kind in (SPRING, TORSION) else numbers[force.kind == PULL :]).any():
+                return False
+        return all(is_constant(motion) for motion in self.motions)
+
     def replaced(self, values: dict[str, float]) -> None:
         """Put other values in the place of some."""
         for name, value in values.items():
@@ -102,6 +113,8 @@ class Tables:
             return
         self._known[id(numbers)] = len(self._values)
         for name, value in zip(numbers.names, numbers.values, strict=True):
+            while name in self.places:  # names of bodies and joints can add up to the same
+                name = f"other {name}"
             self.places[name] = len(self._values)
             self._values.append(value)
 
