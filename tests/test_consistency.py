@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tests.derivative_cases import UNITS, lever, linkage, slider_crank
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, consistent_state, solve_dae
 from twoloop.checks.consistency import check_start
-from twoloop.mechanisms import four_bar
+from twoloop.mechanisms import four_bar, redundant_slider_crank
 
 REST = np.zeros(2)
 STRETCHED = math.acos(0.25)  # theta_3 at which bars 1 and 2 of this linkage are in line
@@ -103,6 +104,16 @@ def test_redundant_rows_name_what_they_depend_on():
         solve_dae(system, (0.0, 1.0), np.zeros(3), np.zeros(3))
     equations = ("row 2 = 2 row 0 - 0.5 row 1", "row 1 = 4 row 0 - 2 row 2", "row 0 = 0.25 row 1 + 0.5 row 2")
     assert any(equation in str(caught[0].message) for equation in equations)
+
+
+def test_a_row_that_depends_on_many_is_named_without_coefficients(recwarn):
+    problem = redundant_slider_crank()
+    result = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0)
+    for k in (0, -1):
+        solve_dae(problem.system, (0.0, 0.1), result.q[:, k], result.v[:, k])
+    said = [str(each.message) for each in recwarn if each.category is ConstraintWarning]
+    assert said  # a loop over starts would print one for each, did they differ in coefficients
+    assert all(re.search(r"\(row \d on rows \d, \d, \d, \d\)", each) for each in said)
 
 
 def test_a_start_without_rank_names_its_row():

@@ -143,6 +143,7 @@ PARAMETERS = [
 def test_a_run_is_what_it_is_without_code(parameters, method):
     made, expected = (run(pendulum(parameters), compiled, method) for compiled in ("auto", False))
     assert made.success and expected.success
+    assert made.compiled and expected.compiled is False
     assert np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
 
 

@@ -10,10 +10,11 @@ import pytest
 
 from tests.problems import pendulum
 from twoloop import ConstraintWarning, mechanisms, solve_dae
+from twoloop.generate.choices import Choice
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.families import family_of
 from twoloop.generate.straight_code import SharedCode
-from twoloop.generate.straight_line import Choice, StraightLine
+from twoloop.generate.straight_line import StraightLine
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.layout import _free
 from twoloop.methods.plans_for import MOST, plans_for

@@ -194,6 +194,7 @@ def solve_dae(
         run = run_from(system, t0, q0, v0, asked)
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
+        with_code = bool(run.plan.own)
         with _progress_bar(progress, chosen.name, t0, t1) as report:
             lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
@@ -203,7 +204,8 @@ def solve_dae(
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
-        own = {"system": system, "method": chosen.name, "rtol": float(rtol), "atol": atol, "untested": untested}
+        given = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
+        own = {"system": system, "untested": untested, **given}
         return Result(**vars(record) | own)
     return Result(**vars(not_begun(system, t0, event_functions, chosen.name)))
 

@@ -92,7 +92,7 @@ class Claim:
             Verdict.HOLDS: Verdict.CIRCULAR
             if self.circular
             else Verdict.CONSISTENT
-            if self.stand_in
+            if self.stand_in or self.inputs
             else Verdict.HOLDS,
             Verdict.FAILS: Verdict.ASSUMED if self.inputs else Verdict.FAILS,
         }

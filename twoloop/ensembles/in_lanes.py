@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
+from twoloop.generate.choices import Choice
 from twoloop.generate.on_arrays import OnArrays
-from twoloop.generate.straight_line import Choice
 from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
 

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import AT_ONCE, LaneSeries
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import conditions_hold, results_of
-from twoloop.generate.straight_line import Choice, Outputs, Solution, StraightLine
+from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels import lanes
 from twoloop.kernels.control.defect import ROUNDING

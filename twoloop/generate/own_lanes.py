@@ -18,11 +18,11 @@ from twoloop.generate import (
     straight_code,
     straight_line,
 )
+from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
-from twoloop.generate.straight_line import Choice
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.caches import Newest, digest_of
 from twoloop.kernels.compile.own_functions import are_kept, own_functions

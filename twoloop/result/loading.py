@@ -65,6 +65,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         rank=known.rank,
         system=system,
         method=known.method,
+        compiled=known.compiled,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 

@@ -70,6 +70,8 @@ class Result(Record):
         the system's functions (such as lambdas) cannot be pickled.
     method : str
         Name of the method with its options; "" of a foreign solver. `twoloop.citation` says what to cite for it.
+    compiled : bool or None
+        Whether the run had machine code made for the mechanism, see `solve_dae`. None of a foreign solver.
     rtol : float or None
     atol : ndarray (n_q,) or None
         Tolerances of a step; those of `Newmark(error_tol=...)` are its own. None where a foreign solver ran.

@@ -36,6 +36,7 @@ def save(result: Record, path: str | os.PathLike[str]) -> None:
         arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
     words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
     words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
+    words |= {"compiled": result.compiled}
     words |= {name: getattr(result, name) for name in NUMBERS}
     if result.sol is not None:
         interpolator, table = result.sol.interpolator, result.sol.table

@@ -125,6 +125,7 @@ class Record:
     widest_gap: float | None = None
     system: ConstrainedSystem | None = None
     method: str = ""
+    compiled: bool | None = None
     rtol: float | None = None
     atol: Array | None = None
     untested: NDArray[np.bool_] | None = None

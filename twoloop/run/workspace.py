@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import least_inertia
+from twoloop.checks.consistency import has_definite_mass, least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays
@@ -18,7 +18,6 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
-SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
 MOST_KITS = 16  # that are kept with a system
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
@@ -36,10 +35,9 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     flags: Array = system.functions.flags.copy()
-    place = None if system.constant_mass else (t0, q0.tobytes())
-    diagonal, definite = system.remembered_at("mass", place, lambda: _kind_of(system.mass(t0, q0)))
     if system.constant_mass:
-        flags[common.DIAGONAL_MASS] = diagonal
+        flags[common.DIAGONAL_MASS] = system.remembered("diagonal mass", lambda: _is_diagonal(system.mass(t0, q0)))
+    definite = has_definite_mass(system, t0, q0)
     reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
     flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
@@ -52,10 +50,8 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return flags
 
 
-def _kind_of(mass: Array) -> tuple[bool, bool]:
-    """Whether a mass matrix is diagonal, and definite."""
-    diagonal = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
-    return diagonal, bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+def _is_diagonal(mass: Array) -> bool:
+    return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:
