@@ -114,6 +114,14 @@ class Both:
         joint = make(self.handle(i), self.handle(j), at=self.cut(point), axis=self.cut(0.7 * axis))
         return joint, axis, point
 
+    def table(self, i, j):
+        point, axis = self.point(), self.axis()
+        a, b, c = self.here(i, point), self.here(j, point), self.along(i, axis)
+        self.laws.rows.append(lambda t, bodies: bodies.direction(i, c) @ (bodies.point(j, b) - bodies.point(i, a)))
+        for across in np.linalg.svd(axis[None])[2][1:]:
+            self._dot(i, across, j, axis, 0.0)
+        return self.model.planar(self.handle(i), self.handle(j), at=point, axis=1.3 * axis)
+
     def prismatic(self, i, j):
         joint, axis, point = self.cylindrical(i, j, slide=True)
         if self.planar:
@@ -203,6 +211,35 @@ class Both:
             return [(j, NONE, NONE, torque * along), (i, NONE, NONE, -torque * along)]
 
         load.has_potential = not damped
+        self.laws.loads.append(load)
+
+    def rail(self, i, j, joint, axis, point, damped=True):
+        """A spring along a slide, damped by a dashpot and by friction; without, it has a potential."""
+        stiffness, damping, rest, rub, speed = self.random.uniform(0.5, 5.0, 5) * (1.0, damped, 1.0, damped, 1.0)
+        self.model.axial_spring(joint, stiffness=stiffness, damping=damping, length=rest)
+        self.model.friction(joint, rub, speed=speed)
+        a, n, b = self.here(i, point), self.along(i, axis), self.here(j, point)
+
+        def load(t, bodies, v, w):
+            along, here, there = bodies.direction(i, n), bodies.point(i, a), bodies.point(j, b)
+            rate = along @ (velocity(bodies, v, w, j, there) - velocity(bodies, v, w, i, there))
+            push = -stiffness * (along @ (there - here) - rest) - damping * rate - rub * np.tanh(rate / speed)
+            return [(j, there, push * along, NONE), (i, there, -push * along, NONE)]
+
+        load.has_potential = not damped
+        self.laws.loads.append(load)
+
+    def brake(self, i, j, joint, axis):
+        most, speed = self.random.uniform(0.5, 5.0, 2)
+        self.model.friction(joint, most, speed=speed)
+        n = self.along(i, axis)
+
+        def load(t, bodies, v, w):
+            along = bodies.direction(i, n)
+            one_w, other_w = (NONE if each is None else w[each] for each in (i, j))
+            torque = -most * np.tanh((other_w - one_w) @ along / speed) * along
+            return [(j, NONE, NONE, torque), (i, NONE, NONE, -torque)]
+
         self.laws.loads.append(load)
 
     def motor(self, i, j, joint, axis, point, f):

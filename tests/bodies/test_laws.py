@@ -60,7 +60,7 @@ def assert_follows_the_laws(both, t=0.4):
 
 
 PLANAR = ("revolute", "prismatic", "fixed", "distance")
-SPATIAL = (*PLANAR, "spherical", "universal", "cylindrical")
+SPATIAL = (*PLANAR, "spherical", "universal", "cylindrical", "table")
 
 
 @pytest.mark.parametrize("seed", range(14))
@@ -80,6 +80,8 @@ def test_chains_with_everything(planar, seed):
                 both.motor(i, j, joint, axis, point, lambda t: 2.0 * np.sin(3.0 * t) + 0.5)
             if kind == "revolute" and random.random() < 0.8:
                 both.torsion(i, j, joint, axis)
+            if random.random() < 0.5:
+                (both.brake if kind == "revolute" else both.rail)(i, j, *made[: 2 if kind == "revolute" else 3])
             if random.random() < 0.3:
                 both.drive(i, j, joint, axis, point, lambda t: 0.3 * np.sin(2.0 * t) + 0.2 * t**2)
     both.spring(None, 3)
@@ -110,6 +112,7 @@ def test_energy_changes_by_the_power_of_what_has_no_potential(planar, seed):
         parent = None if k == 0 else k - 1
         joints.append(getattr(both, kind)(parent, k))
     both.torsion(None, 0, *joints[0][:2], damped=False)
+    both.rail(0, 1, *joints[1], damped=False)
     both.spring(None, 3, damped=False)
     both.spring(0, 2, damped=False)
     assert both.model.problem().conserved

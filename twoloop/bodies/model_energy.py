@@ -14,6 +14,7 @@ from twoloop.bodies.parameter_layout import (
     F_FIRST_AT,
     F_KIND,
     F_MORE,
+    F_ON_FIRST,
     F_SECOND,
     F_SECOND_AT,
     FORCE_WIDTH,
@@ -22,6 +23,7 @@ from twoloop.bodies.parameter_layout import (
     N_FORCES,
     PLANAR_BODY,
     PULL,
+    RAIL,
     SPATIAL_BODY,
     SPRING,
     TORSION,
@@ -59,13 +61,17 @@ class ModelEnergy:
             J = bodies[:, [1, 4, 5, 4, 2, 6, 5, 6, 3]].reshape(-1, 3, 3)
             spins = _spins(q[:, 3:], v[:, 3:])
             total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
-        for kind, i, at, j, there, more in self._forces:
+        for kind, i, at, j, there, more, on_first in self._forces:
             if kind in (SPRING, PULL):
                 gap = self._place(q, j, there) - self._place(q, i, at)
                 length = np.sqrt((gap**2).sum(axis=0))
                 total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == SPRING else 0.0)) ** 2
             elif kind == TORSION:
                 total += 0.5 * self.p[more] * (self._turned(q, i, j, at, there) - self.p[more + 2]) ** 2
+            elif kind == RAIL:
+                gap = self._place(q, j, there) - self._place(q, i, on_first)
+                slid = (self._axis(q, i, at) * gap).sum(axis=0)
+                total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
         return total
 
     @property
@@ -77,7 +83,7 @@ class ModelEnergy:
         head = self.p[self.p.size - HEAD :].astype(int)
         first, n = head[FORCES], head[N_FORCES]
         table = self.p[first : first + FORCE_WIDTH * n].reshape(-1, FORCE_WIDTH).astype(int)
-        return table[:, [F_KIND, F_FIRST, F_FIRST_AT, F_SECOND, F_SECOND_AT, F_MORE]].tolist()
+        return table[:, [F_KIND, F_FIRST, F_FIRST_AT, F_SECOND, F_SECOND_AT, F_MORE, F_ON_FIRST]].tolist()
 
     def _place(self, q: Array, body: int, at: int) -> Array:
         """The point of a body in space, (2 or 3,) or (2 or 3, n_t)."""
@@ -90,6 +96,18 @@ class ModelEnergy:
         from twoloop.mechanisms.rotation import rotated  # whose import compiles
 
         return q[body, :3] + np.array(rotated.py_func(*q[body, 3:], *point))
+
+    def _axis(self, q: Array, body: int, at: int) -> Array:
+        """An axis of a body in space, (2 or 3,) or (2 or 3, n_t)."""
+        if self.dimension == 2:
+            angle = self.p[at] + (q[body, 2] if body >= 0 else np.zeros(q.shape[2:]))
+            return np.array([np.cos(angle), np.sin(angle)])
+        axis = self.p[at : at + 3]
+        if body < 0:
+            return axis.reshape(-1, *(1,) * (q.ndim - 2))
+        from twoloop.mechanisms.rotation import rotated  # whose import compiles
+
+        return np.array(rotated.py_func(*q[body, 3:], *axis))
 
     def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
         if self.dimension == 2:

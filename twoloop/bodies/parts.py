@@ -151,3 +151,4 @@ class Force:
     on_second: Numbers | None = field(default=None, repr=False)
     more: Numbers | None = field(default=None, repr=False)
     function: Function | None = field(default=None, repr=False)
+    point_on_first: Numbers | None = field(default=None, repr=False)

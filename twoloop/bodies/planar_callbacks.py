@@ -6,11 +6,13 @@ from twoloop.bodies.parameter_layout import (
     ACROSS,
     ANGLE,
     BODIES,
+    BRAKE,
     DISTANCE,
     F_FIRST,
     F_FIRST_AT,
     F_KIND,
     F_MORE,
+    F_ON_FIRST,
     F_RESULT,
     F_SECOND,
     F_SECOND_AT,
@@ -32,7 +34,9 @@ from twoloop.bodies.parameter_layout import (
     PIN,
     PLANAR_BODY,
     PULL,
+    RAIL,
     ROW,
+    RUB,
     SECOND,
     SECOND_AT,
     SLIDE,
@@ -194,10 +198,12 @@ def fill_force(q, v, p, made, Q):
     for k in range(first, first + FORCE_WIDTH * n, FORCE_WIDTH):
         kind, i, j, more = int(p[k + F_KIND]), int(p[k + F_FIRST]), int(p[k + F_SECOND]), int(p[k + F_MORE])
         given = int(p[k + F_RESULT])
-        if kind in (TORQUE, TORSION):
+        if kind in (TORQUE, TORSION, BRAKE):
+            rate = angle_of(v, j) - angle_of(v, i)
             if kind == TORSION:
-                torque = -p[more] * (angle_of(q, j) - angle_of(q, i) - p[more + 2])
-                torque -= p[more + 1] * (angle_of(v, j) - angle_of(v, i))
+                torque = -p[more] * (angle_of(q, j) - angle_of(q, i) - p[more + 2]) - p[more + 1] * rate
+            elif kind == BRAKE:
+                torque = -p[more] * math.tanh(rate / p[more + 1])
             elif given >= 0:
                 torque = made[given]
             else:
@@ -213,9 +219,21 @@ def fill_force(q, v, p, made, Q):
                 add(Q, j, p[more], p[more + 1], bdx, bdy)
             continue
         at = int(p[k + F_FIRST_AT])
-        if kind == SLIDE:  # at the point of j, also on i
+        if kind in (SLIDE, RAIL, RUB):  # at the point of j, also on i
             fx, fy = direction(q, i, p[at], False)
-            push = made[given] if given >= 0 else p[more]
+            u, w, _, _ = motion(v, j, bdx, bdy)
+            if i >= 0:
+                rate = v[3 * i + 2]
+                u, w = u - v[3 * i] + rate * (by - q[3 * i + 1]), w - v[3 * i + 1] - rate * (bx - q[3 * i])
+            if kind == RAIL:
+                ax, ay, _, _ = place(q, i, p, int(p[k + F_ON_FIRST]))
+                push = -p[more] * (fx * (bx - ax) + fy * (by - ay) - p[more + 2]) - p[more + 1] * (fx * u + fy * w)
+            elif kind == RUB:
+                push = -p[more] * math.tanh((fx * u + fy * w) / p[more + 1])
+            elif given >= 0:
+                push = made[given]
+            else:
+                push = p[more]
             add(Q, j, push * fx, push * fy, bdx, bdy)
             if i >= 0:
                 add(Q, i, -push * fx, -push * fy, q[3 * i + 1] - by, bx - q[3 * i])

@@ -311,6 +311,10 @@ class PlanarModel(Model):
             return Force(name, TORQUE, joint.a, joint.b, None, None, more, function)
         return Force(name, SLIDE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function)
 
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+        axis = joint.rows[0].more  # None of a revolute one
+        return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
+
     def _check_moments(self, name: str, moments: Array) -> None:
         check_positive(f"moment of inertia of {name}", float(moments[0]))
 

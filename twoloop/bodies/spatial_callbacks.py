@@ -9,10 +9,12 @@ import math
 from twoloop.bodies.parameter_layout import (
     AXIAL,
     BODIES,
+    BRAKE,
     F_FIRST,
     F_FIRST_AT,
     F_KIND,
     F_MORE,
+    F_ON_FIRST,
     F_RESULT,
     F_SECOND,
     F_SECOND_AT,
@@ -36,7 +38,9 @@ from twoloop.bodies.parameter_layout import (
     PLANE,
     POINT,
     PULL,
+    RAIL,
     ROW,
+    RUB,
     SECOND,
     SECOND_AT,
     SLIDE,
@@ -261,28 +265,46 @@ def fill_force(q, v, p, made, Q):
             else:
                 push_row(q, Q, j, p, there, p[more], p[more + 1], p[more + 2])
             continue
-        if kind in (AXIAL, TORSION, SLIDE):  # along an axis of body i
+        if kind in (AXIAL, TORSION, BRAKE):  # about an axis of body i
             x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
+            ux, uy, uz = spin(q, v, i)
+            wx, wy, wz = spin(q, v, j)
+            rate = x * (wx - ux) + y * (wy - uy) + z * (wz - uz)
             if kind == TORSION:
-                ux, uy, uz = spin(q, v, i)
-                wx, wy, wz = spin(q, v, j)
-                push = -p[more] * (turned(q, i, j, p, at, there) - p[more + 2])
-                push -= p[more + 1] * (x * (wx - ux) + y * (wy - uy) + z * (wz - uz))
+                push = -p[more] * (turned(q, i, j, p, at, there) - p[more + 2]) - p[more + 1] * rate
+            elif kind == BRAKE:
+                push = -p[more] * math.tanh(rate / p[more + 1])
             elif given >= 0:
                 push = made[given]
             else:
                 push = p[more]
             x, y, z = push * x, push * y, push * z
-            if kind == SLIDE:  # at the point of j, also on i
-                push_row(q, Q, j, p, there, x, y, z)
-                bx, by, bz = place(q, j, p, there)
-                cx, cy, cz = centre(q, i)
-                bx, by, bz = bx - cx, by - cy, bz - cz
-                move_row(Q, i, -x, -y, -z)
-                twist_row(q, Q, i, -(by * z - bz * y), -(bz * x - bx * z), -(bx * y - by * x))
+            twist_row(q, Q, j, x, y, z)
+            twist_row(q, Q, i, -x, -y, -z)
+            continue
+        if kind in (SLIDE, RAIL, RUB):  # along an axis of body i, at the point of j, also on i
+            x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
+            bx, by, bz = place(q, j, p, there)
+            cx, cy, cz = centre(q, i)
+            cx, cy, cz = bx - cx, by - cy, bz - cz
+            wx, wy, wz, _, _, _ = motion(q, v, j, p, there)
+            ux, uy, uz = centre(v, i)
+            ox, oy, oz = spin(q, v, i)
+            wx, wy, wz = wx - ux - oy * cz + oz * cy, wy - uy - oz * cx + ox * cz, wz - uz - ox * cy + oy * cx
+            rate = x * wx + y * wy + z * wz
+            if kind == RAIL:
+                ax, ay, az = place(q, i, p, int(p[k + F_ON_FIRST]))
+                push = -p[more] * (x * (bx - ax) + y * (by - ay) + z * (bz - az) - p[more + 2]) - p[more + 1] * rate
+            elif kind == RUB:
+                push = -p[more] * math.tanh(rate / p[more + 1])
+            elif given >= 0:
+                push = made[given]
             else:
-                twist_row(q, Q, j, x, y, z)
-                twist_row(q, Q, i, -x, -y, -z)
+                push = p[more]
+            x, y, z = push * x, push * y, push * z
+            push_row(q, Q, j, p, there, x, y, z)
+            move_row(Q, i, -x, -y, -z)
+            twist_row(q, Q, i, cz * y - cy * z, cx * z - cz * x, cy * x - cx * y)
             continue
         ax, ay, az = place(q, i, p, at)
         bx, by, bz = place(q, j, p, there)

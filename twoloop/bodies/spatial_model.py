@@ -187,6 +187,33 @@ class SpatialModel(SpatialShapes):
         rows = *on_line(first, one, second, *points), *parallel(first, one, second, other), held
         return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points, (one, other)))
 
+    def planar(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A table: b slides in a plane of a, and turns about the axis across it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point in the plane, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            The direction across the plane, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("planar", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        plane = JointRow(PLANE, 1, first, second, Numbers(tuple(one)), points[1], points[0])
+        rows = plane, *parallel(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "planar", first, second, rows, *points))
+
     def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
         """Both bodies move as one.
 
@@ -275,6 +302,10 @@ class SpatialModel(SpatialShapes):
         if joint.kind == "revolute":
             return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function)
         return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function)
+
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+        axis = Numbers(tuple(joint.axes[0]))
+        return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
 
     def _first_row(self) -> int:
         return len(self.bodies)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies.functions import is_constant, numbers_of, program_for
-from twoloop.bodies.parameter_layout import NONE, PULL, SPRING, TORSION
+from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RUB, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.generate.tracing import Untraceable
 
@@ -89,9 +89,11 @@ class Tables:
         """Whether nothing in the model changes its energy: no damper, force, torque or motor, no drive that moves."""
         for force in self.forces:
             numbers = np.zeros(0) if force.more is None else self.of(force.more)
-            if force.function is not None:
-                return False
-            if (numbers[1:2] if force.kind in (SPRING, TORSION) else numbers[force.kind == PULL :]).any():
+            if force.kind in (SPRING, TORSION, RAIL):
+                numbers = numbers[1:2]  # the damping
+            elif force.kind in (BRAKE, RUB):
+                numbers = numbers[:1]
+            if force.function is not None or (force.kind != PULL and numbers.any()):
                 return False
         return all(is_constant(motion) for motion in self.motions)
 
@@ -141,7 +143,7 @@ class Tables:
         for force in self.forces:
             first, second, function = force.first.number, force.second.number, force.function
             table += (force.kind, first, self._at(force.on_first), second, self._at(force.on_second))
-            table += (self._at(force.more), NONE if function is None else result)
+            table += (self._at(force.more), NONE if function is None else result, self._at(force.point_on_first))
             result += 0 if function is None else function.size
         self.n_rows, self.untraced = row, ""
         programs: list[list[float]] = []
