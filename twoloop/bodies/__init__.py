@@ -1,6 +1,7 @@
 """Mechanisms from bodies and joints: masses, joints and forces in, a `Problem` with its equations out."""
 
+from twoloop.bodies.mjcf_reader import IgnoredWarning, from_mjcf
 from twoloop.bodies.planar_model import PlanarModel
 from twoloop.bodies.spatial_model import SpatialModel
 
-__all__ = ["PlanarModel", "SpatialModel"]
+__all__ = ["IgnoredWarning", "PlanarModel", "SpatialModel", "from_mjcf"]

@@ -152,3 +152,4 @@ class Force:
     more: Numbers | None = field(default=None, repr=False)
     function: Function | None = field(default=None, repr=False)
     point_on_first: Numbers | None = field(default=None, repr=False)
+    joint: ModelJoint | None = field(default=None, repr=False)  # in which it is

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,8 @@ class SpatialModel(SpatialShapes):
     ground : Body
     bodies, joints, forces : list
         What was added so far.
+    ignored : tuple of str
+        What was not read of a file, see `from_mjcf`.
 
     Raises
     ------
@@ -45,6 +48,7 @@ class SpatialModel(SpatialShapes):
         If an argument is wrong.
     """
 
+    ignored: tuple[str, ...] = ()  # what of a file has no counterpart, see `from_mjcf`
     coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
 
     def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
@@ -131,7 +135,7 @@ class SpatialModel(SpatialShapes):
                 f"axes of {name!r} must be perpendicular; given {shown(axes)}, whose cosine is {cosine:.6g}"
             )
         rows = JointRow(POINT, 3, first, second, *points), across(first, one, second, other)
-        return self._add_joint(ModelJoint(name, "universal", first, second, rows, *points))
+        return self._add_joint(ModelJoint(name, "universal", first, second, rows, *points, (one, other)))
 
     def cylindrical(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
         """A sleeve: b slides along an axis of a, and turns about it.
@@ -157,7 +161,7 @@ class SpatialModel(SpatialShapes):
         first, second, name, points = self._pair("cylindrical", a, b, name, at)
         one, other = self._directions(axis, first, second)
         rows = *on_line(first, one, second, *points), *parallel(first, one, second, other)
-        return self._add_joint(ModelJoint(name, "cylindrical", first, second, rows, *points))
+        return self._add_joint(ModelJoint(name, "cylindrical", first, second, rows, *points, (one, other)))
 
     def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
         """A slide: b moves along an axis of a, and does not turn on it.
@@ -212,7 +216,7 @@ class SpatialModel(SpatialShapes):
         one, other = self._directions(axis, first, second)
         plane = JointRow(PLANE, 1, first, second, Numbers(tuple(one)), points[1], points[0])
         rows = plane, *parallel(first, one, second, other)
-        return self._add_joint(ModelJoint(name, "planar", first, second, rows, *points))
+        return self._add_joint(ModelJoint(name, "planar", first, second, rows, *points, (one, other)))
 
     def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
         """Both bodies move as one.
@@ -274,6 +278,30 @@ class SpatialModel(SpatialShapes):
         """
         return self._distance(LENGTH, a, at_a, b, at_b, length, name)
 
+    def to_mjcf(self, path: str | os.PathLike[str]) -> None:
+        """Write the model to a file that MuJoCo reads, see `twoloop.bodies.from_mjcf`.
+
+        Joints become hinges, slides and balls of a tree of bodies; those that close loops, connect and weld. Springs
+        become stiffness and damping of joints, and tendons.
+
+        Parameters
+        ----------
+        path : path-like
+
+        Warns
+        -----
+        IgnoredWarning
+            If there are velocities, forces, motors, drives or friction: these have no place in such a file.
+
+        Raises
+        ------
+        ValueError
+            If MJCF has no counterpart of a joint, or none that closes a loop.
+        """
+        from twoloop.bodies.mjcf_writer import write
+
+        write(self, path)
+
     def _no_rotation(self) -> Array:
         return np.eye(3)
 
@@ -294,7 +322,7 @@ class SpatialModel(SpatialShapes):
         x = here[0] * there[1:] - there[0] * here[1:] - np.cross(here[1:], there[1:])
         zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # of both signs the one that the bodies start with
         axis, start = Numbers(tuple(one)), Numbers(tuple(zero))
-        return Force(name, TORSION, joint.a, joint.b, axis, start, numbers)
+        return Force(name, TORSION, joint.a, joint.b, axis, start, numbers, joint=joint)
 
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
         function, more = self._function(name, f, 1, unit)
@@ -305,7 +333,8 @@ class SpatialModel(SpatialShapes):
 
     def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
         axis = Numbers(tuple(joint.axes[0]))
-        return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
+        places = axis, joint.point_b, numbers
+        return Force(name, kind, joint.a, joint.b, *places, point_on_first=joint.point_a, joint=joint)
 
     def _first_row(self) -> int:
         return len(self.bodies)
