@@ -1,4 +1,4 @@
-"""Poses and inertias as MJCF writes them.
+"""What reading and writing of MJCF share: poses, inertias, and the warning of what is left out.
 
 See MuJoCo's XML reference, mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
@@ -16,6 +16,10 @@ from twoloop.mechanisms.rotation import rotation_matrix
 Array = NDArray[np.float64]
 
 DENSITY = 1000.0  # kg/m^3, of geoms that give neither mass nor density
+
+
+class IgnoredWarning(UserWarning):
+    """What of a file has no counterpart in a model, or of a model in a file."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.mjcf_geometry import Lump, Pose, geom_lump, numbers, pose_of, together
+from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, geom_lump, numbers, pose_of, together
 from twoloop.bodies.mjcf_joints import Freed, add_joints
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
@@ -23,10 +23,6 @@ SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
 SOFT = ("armature", "frictionloss")
 AGREES = 1e-6  # of the pose that a weld asks for
-
-
-class IgnoredWarning(UserWarning):
-    """What of a file has no counterpart in a model; it is in `ignored` of the model, too."""
 
 
 @dataclass

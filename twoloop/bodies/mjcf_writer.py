@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.mjcf_reader import IgnoredWarning
+from twoloop.bodies.mjcf_geometry import IgnoredWarning
 from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.mechanisms.rotation import euler_parameters
