@@ -16,7 +16,7 @@ from twoloop.bodies.model_system import joints_of, system_of
 from twoloop.bodies.parts import Body
 from twoloop.bodies.sketches import drawing_of
 from twoloop.bodies.tables import Tables
-from twoloop.checks.arguments import check_positive, check_span, check_text
+from twoloop.checks.arguments import check_positive, check_span, check_text, shown
 
 Array = NDArray[np.float64]
 
@@ -57,6 +57,8 @@ class Model(Loads):
         name = self.name if name is None else check_text("name", name)
         if isinstance(keep, (str, Body)):
             keep = (keep,)
+        if not isinstance(keep, (tuple, list)):
+            raise TypeError(f"keep must be a list of bodies, or of their names; given {shown(keep)}")
         kept = tuple(j for each in keep for j in self._moving_body("keep", each).coordinates)
         return self.put_together(span, name, kept, None, None)
 
