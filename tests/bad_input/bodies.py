@@ -44,8 +44,8 @@ def drive(motion, **more):
 def rough(distance):
     """Two bars of 1 m that are to reach a point of the ground."""
     model = PlanarModel(name="arms")
-    one = model.body("one", mass=1.0, inertia=0.1, position=(0.5, 0.1))
-    two = model.body("two", mass=1.0, inertia=0.1, position=(1.4, 0.1))
+    one = model.body("one", mass=1.0, inertia=0.1, position=(0.45, 0.2), angle=0.3)
+    two = model.body("two", mass=1.0, inertia=0.1, position=(1.4, 0.2), angle=-0.3)
     ground = model.ground
     model.revolute(ground, one, at=(ground.point(0.0, 0.0), one.point(-0.5, 0.0)))
     model.revolute(one, two, at=(one.point(0.5, 0.0), two.point(-0.5, 0.0)))

@@ -53,6 +53,20 @@ def test_rough_poses_are_put_together(rough):
     assert solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0).success
 
 
+def test_poses_from_which_two_assemblies_can_be_meant_are_refused():
+    model = PlanarModel(name="arms")
+    ground = model.ground
+    for name, x in (("one", 0.5), ("two", 1.4)):
+        model.body(name, mass=1.0, inertia=0.1, position=(x, 0.0))  # straight: the elbow may go up or down
+    one, two = model.bodies
+    model.revolute(ground, one, at=(ground.point(0.0, 0.0), one.point(-0.5, 0.0)))
+    model.revolute(one, two, at=(one.point(0.5, 0.0), two.point(-0.5, 0.0)))
+    model.revolute(two, ground, at=(two.point(0.5, 0.0), ground.point(1.7, 0.0)))
+    with pytest.raises(ValueError, match="cannot be put together") as caught:
+        model.problem()
+    assert "coordinate " not in str(caught.value)
+
+
 def test_bodies_that_are_kept_stay():
     model = four_bar(0.1, keep=("crank",))
     problem = model.problem(keep=["crank"])
@@ -93,6 +107,20 @@ def test_a_drive_moves_the_bodies_to_where_it_begins():
     spatial.drive(hinge, lambda t: 1.2 + 0.0 * t)
     place = spatial.problem().q0[:3]  # the ground turns on the wheel
     np.testing.assert_allclose(place, [0.3 * np.cos(1.2), 0.0, 0.3 * np.sin(1.2)], atol=1e-12)
+
+
+def test_a_drive_that_begins_far_away_leaves_no_assembly():
+    model = four_bar()
+    model.drive("revolute crank-ground", lambda t: 2.2 + t)
+    problem = model.problem()
+    assert problem.q0[2] - 0.5 * np.pi == pytest.approx(2.2, abs=1e-12) and violation(problem) < 1e-12
+    result = solve_dae(problem.system, (0.0, 2.0 * np.pi - 2.2), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    known = four_bar().problem(keep="crank")  # a turn from where it was given it is there again
+    np.testing.assert_allclose(result.q[[0, 1, 3, 4, 6, 7], -1], known.q0[[0, 1, 3, 4, 6, 7]], atol=1e-8)
+    rocker = four_bar()
+    rocker.drive("revolute rocker-ground", lambda t: 3.0 + t)  # which rocks, and does not turn
+    with pytest.raises(ValueError, match="to which the joints do not let the bodies come"):
+        rocker.problem()
 
 
 def test_a_drive_that_holds_still_conserves_the_energy_and_one_that_moves_does_not():
@@ -263,6 +291,12 @@ def test_a_problem_travels_to_another_process():
     assert without.system.force(0.0, without.q0, without.v0)[2] == pytest.approx(1.0, abs=2.0)
     with pytest.raises(ValueError, match="without its model"):
         without.with_parameters({})
+
+
+def test_a_spring_is_without_force_where_it_is_given():
+    model = four_bar()
+    model.spring("crank", (0.0, 1.0), "ground", (3.0, 0.0), stiffness=2.0)
+    assert model.problem().parameters["length of spring crank-ground (m)"] == pytest.approx(np.sqrt(10.0))
 
 
 def test_a_spring_without_length_has_force_where_its_ends_meet():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,8 @@ NEARBY = 0.02  # of the largest coordinate, at least of 1: how far away the join
 ROUGH = 0.1  # of the largest velocity given: by how much joints may change it
 ROUNDING = 8.0 * np.finfo(np.float64).eps  # of the terms of a constraint
 CLEAR = 1e-12  # reciprocal condition of C_q C_q^T from which the rank is full without a doubt
+SMALL = 0.05  # rad or m, of a step to where a drive begins ...
+CORRECTIONS = 5  # ... and of Newton's in each
 STAYS = 1e-7  # of the size of the model: what a joint that cannot close leaves open at least
 
 
@@ -51,13 +54,14 @@ def positions(
     turning: NDArray[np.bool_],
     keep: Sequence[int],
     rows: Mapping[str, tuple[int, ...]],
+    coordinates: Sequence[str],
 ) -> Array:
     """Bodies moved by the least change so that all joints close.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        In which drives have no rate.
+        Without drives.
     guess : ndarray (n_q,)
     turning : ndarray of bool (n_q,)
         Which coordinates are rotations.
@@ -65,39 +69,69 @@ def positions(
         Which stay as they are.
     rows : mapping
         Of each joint, by its name.
+    coordinates : sequence of str (n_q,)
 
     Raises
     ------
     ValueError
-        Naming the joint that does not close.
+        Naming the joint that does not close; or if the poses are so far off that they may be put together in two ways.
     """
     if system.n_c == 0:
         return guess
     terms = np.abs(system.jacobian(t, guess)) @ np.where(turning, np.maximum(np.abs(guess), 1.0), np.abs(guess))
     if (np.abs(system.constraint(t, guess)) <= ROUNDING * terms).all():
         return guess
-    still = np.zeros(system.n_q)
     try:
-        return consistent_state(system, t, guess, still, keep=list(keep) or None)[0]
+        found = consistent_state(system, t, guess, np.zeros(system.n_q))[0]
+        reason = ""
     except ValueError as error:
-        reason = str(error)
-    try:
-        return consistent_state(system, t, _nearest(system, t, guess, keep), still, keep=list(keep) or None)[0]
-    except ValueError:
-        pass
-    found = _nearest(system, t, guess, keep)
-    left = np.abs(system.constraint(t, found))
-    if rows and left.max() > STAYS:
-        misfit = {name: float(left[list(of)].max()) for name, of in rows.items()}
-        worst = max(misfit, key=lambda name: misfit[name])
-        others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
-        also = f" (nor do {', '.join(map(repr, others))})" if others else ""
-        raise ValueError(
-            f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close{also}; with the "
-            f"least misfit of all joints {misfit[worst]:.3g} remain in it. Look at lengths, at the points of these "
-            "joints, and at what else holds their bodies"
-        )
-    raise ValueError(f"the bodies of {system.name!r} cannot be put together from the poses given: {reason}")
+        reason = re.sub(r"coordinate (\d+)", lambda of: name_and_unit(coordinates[int(of[1])])[0], str(error))
+    if len(keep) or reason:
+        found = _nearest(system, t, guess, keep)
+        left = np.abs(system.constraint(t, found))
+        if (left > STAYS * np.maximum(terms, terms.max())).any():
+            raise ValueError(_open(system, left, rows))
+    if reason:
+        raise ValueError(f"the bodies of {system.name!r} cannot be put together from the poses given: {reason}")
+    return found
+
+
+def driven_there(system: ConstrainedSystem, t: float, start: Array, keep: Sequence[int]) -> Array:
+    """Where drives move bodies whose other joints are closed: in small steps, so that no assembly is left.
+
+    Raises
+    ------
+    ValueError
+        If the joints, or the bodies that are kept, do not let them.
+    """
+    free = np.setdiff1d(np.arange(system.n_q), keep)
+    q, values = start.copy(), system.constraint(t, start)
+    n = int(np.ceil(np.abs(values).max() / SMALL))
+    for k in range(1, n + 1):
+        for _ in range(CORRECTIONS):
+            off = system.constraint(t, q) - (1.0 - k / n) * values
+            q[free] -= np.linalg.lstsq(system.jacobian(t, q)[:, free], off, rcond=SINGULAR)[0]
+        left = np.abs(system.constraint(t, q) - (1.0 - k / n) * values).max()
+        if not left <= STAYS * max(1.0, float(np.abs(values).max())):
+            raise ValueError(
+                f"the drives of {system.name!r} ask at t = {t:g} for a position to which the joints do not let the "
+                f"bodies come: they get {(k - 1) / n:.0%} of the way. Give poses nearer to where the motion begins, "
+                "another motion, or keep fewer bodies"
+            )
+    return q
+
+
+def _open(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
+    """Which joints stay open, by what is left of their rows."""
+    misfit = {name: float(left[list(of)].max()) for name, of in rows.items()}
+    worst = max(misfit, key=lambda name: misfit[name])
+    others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
+    also = f" (nor do {', '.join(map(repr, others))})" if others else ""
+    return (
+        f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close{also}; with the "
+        f"least misfit of all joints {misfit[worst]:.3g} remain in it. Look at lengths, at the points of these joints, "
+        "and at what else holds their bodies"
+    )
 
 
 def _nearest(system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[int]) -> Array:

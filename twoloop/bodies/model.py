@@ -13,7 +13,7 @@ from twoloop.bodies.loads import Loads
 from twoloop.bodies.model_energy import ModelEnergy
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.model_system import joints_of, system_of
-from twoloop.bodies.parts import Body
+from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.sketches import drawing_of
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import check_positive, check_span, check_text, shown
@@ -73,19 +73,28 @@ class Model(Loads):
         """What `problem` makes, with parameters and a guess of the positions."""
         if not self.bodies:
             raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
-        tables = Tables(self.gravity, self.bodies, self.joints, self.forces, self._first_row())
-        if values is not None:
-            tables.replaced(dict(values))
-            self._check_inertias(tables)
-        joints = joints_of(tables)
+        tables = self._tables(self.joints, values)
+        self._check_inertias(tables)
         start = self._start() if guess is None else guess
         about = t_span[0], start, np.zeros_like(start)
-        system = system_of(self.dimension, tables, joints, name, about)
-        still = system_of(self.dimension, tables, joints, name, about, moves=False) if tables.motions else system
-        q = assembly.positions(still, t_span[0], start, self._turning(), keep, tables.rows)
+        system = system_of(self.dimension, tables, joints_of(tables), name, about)
+        coordinates = tuple(f"{each} of {body.name}" for body in self.bodies for each in self.coordinate_names)
+        bare, joints = tables, [joint for joint in self.joints if joint.kind != "drive"]
+        if len(joints) < len(self.joints):
+            bare = self._tables(joints, values)
+        q = assembly.positions(
+            system if bare is tables else system_of(self.dimension, bare, joints_of(bare), name, about),
+            t_span[0],
+            start,
+            self._turning(),
+            keep,
+            bare.rows,
+            coordinates,
+        )
+        if bare is not tables:
+            q = assembly.driven_there(system, t_span[0], q, keep)
         self._check_branches(t_span[0], q)
         given, known = self._velocities(q)
-        coordinates = tuple(f"{each} of {body.name}" for body in self.bodies for each in self.coordinate_names)
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
         return ModelProblem(
@@ -105,6 +114,12 @@ class Model(Loads):
             keep=keep,
             freedom=freedom,
         )
+
+    def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
+        """The tables of the model with some of its joints, and with other values of its parameters."""
+        tables = Tables(self.gravity, self.bodies, joints, self.forces, self._first_row())
+        tables.replaced(values or {})
+        return tables
 
     def _as_it_is(self) -> Model:
         """A copy to which nothing is added."""

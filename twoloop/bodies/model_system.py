@@ -38,16 +38,12 @@ def system_of(
     joints: list[Joint],
     name: str,
     start: tuple[float, Array, Array],
-    moves: bool = True,
 ) -> ConstrainedSystem:
-    """The system, whose programs of functions agree with these about the start.
-
-    `moves`: whether drives have their rates. Without, they hold the joints where they are at a time.
-    """
+    """The system, whose programs of functions agree with these about the start."""
     callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
     n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
     kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
-    if tables.motions and moves:
+    if tables.motions:
         kinds.append("constraint_rate")
     options: Any = {"n_q": n_q, "n_c": tables.n_rows, "joints": joints, "name": name, "parameters": tables.p}
     for each in (*tables.motions, *tables.functions):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,10 +97,11 @@ class Tables:
                 return False
         return all(is_constant(motion) for motion in self.motions)
 
-    def replaced(self, values: dict[str, float]) -> None:
-        """Put other values in the place of some."""
+    def replaced(self, values: Mapping[str, float]) -> None:
+        """Put other values in the place of those that are here."""
         for name, value in values.items():
-            self.p[self.places[name]] = value
+            if name in self.places:
+                self.p[self.places[name]] = value
 
     def _place_all(self, *parts: Numbers | None) -> None:
         for numbers in parts:
