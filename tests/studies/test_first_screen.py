@@ -184,7 +184,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "for mechanisms with compiled callbacks whose equations take few operations, 1 of 2 here;",
         "is 15 to 48 times slower than the cheapest of them, without code for the mechanism, at errors of 1e-2, 1e-4 "
         "and 1e-6 (",
-        "and a call from the same start takes 0.47 ms less. Rivals",
+        "and an equal call takes 0.47 ms less. Rivals",
         "off by over 1000 tolerances (1e-5 at 1e-8), or never ends. A tolerance bounds the local errors of steps, not",
         "Silently wrong runs under 17 kinds of sharp everyday forces, with parameters not used during development (",
         "in brackets: off by over 1e-3): ",

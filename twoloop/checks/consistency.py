@@ -12,7 +12,7 @@ from scipy.linalg import lapack, null_space
 
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import UNSYMMETRIC, check_derivatives, unsymmetric_mass
-from twoloop.checks.rank import in_words, largest_solution, redundant_rows
+from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
 from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
@@ -90,6 +90,7 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
     if system.called_in_python:
         return False
+    q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
     n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
     room, lam = np.zeros(first_look.room_size(n, n_c, system.n_a)), np.ones(n_c)
     mass, (rows, pattern) = np.zeros((n, n)), np.zeros((2, n_rows, n))
@@ -99,7 +100,9 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
         return False
     if not found & first_look.IN_ORDER:
         return False
-    system.remember_at("pattern", (t, q.tobytes()), pattern)
+    place = (t, q.tobytes())
+    system.remember_at("pattern", place, pattern)
+    system.remember_at("mass and rows", place, (mass, rows))
     if found & first_look.DEFINITE:
         system.remember_at("definite mass", _place(system, t, q), True)
     if found & first_look.CONSISTENT:
@@ -287,13 +290,18 @@ def _ways(n_q: int) -> Array:
     return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
 
 
+def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
+    """M, and C_q with A, at a position; not to be written to."""
+    return system.remembered_at("mass and rows", (t, q.tobytes()), lambda: (system.mass(t, q), system.rows(t, q)))
+
+
 def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
     """Whether M has an inverse at a position, and not only on velocities that the constraints allow."""
     return system.remembered_at("definite mass", _place(system, t, q), lambda: _is_definite(system.mass(t, q)))
 
 
 def _is_definite(mass: Array) -> bool:
-    return bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+    return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
 
 
 def _place(system: ConstrainedSystem, t: float, q: Array) -> Any:

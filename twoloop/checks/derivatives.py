@@ -367,7 +367,7 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
     v = _generic_velocities(system.jacobian(t, q), system.constraint_rate(t, q), q)[-1]
     for place in (q, q + NEAR_START * v):
         room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
-        if direct(kinematics_agree)(system.kit, t, place, v, *room, SAME, ROUNDED * EPS):
+        if direct(kinematics_agree)(system.kit, t, np.ascontiguousarray(place), v, *room, SAME, ROUNDED * EPS):
             continue
         separate = {
             "constraint": system.constraint(t, place),

@@ -13,6 +13,12 @@ MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their
 NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
 
 
+def eigenvalues(matrix: Array) -> Array:
+    """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
+    values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
+    return values
+
+
 def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
     """Rows of length 1, the lower triangle that makes those rows of them that count, and which these are.
 
@@ -22,7 +28,7 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
 
     most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
     basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
-    n = direct(independent_rows)(rows, least, basis, factors, kept)
+    n = direct(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
     return basis[:n], factors[:n, :n], kept[:n].tolist()
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from twoloop.checks.rank import orthogonalised
+from twoloop.checks.consistency import mass_and_rows
+from twoloop.checks.rank import eigenvalues, orthogonalised
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
@@ -52,14 +53,14 @@ class Choice:
         Untraceable
             If M is singular on velocities that the constraints allow.
         """
-        mass, G = system.mass(t, q), system.rows(t, q)
+        mass, G = mass_and_rows(system, t, q)
         rows = orthogonalised(G, RANK)[2]
         if not rows:
             return cls((), (), 1.0, 0.0)
         place = None if system.constant_mass else (t, q.tobytes())
         added: tuple[int, ...] = ()
         scale = 1.0
-        if not system.remembered_at("no weak mass", place, lambda: not _weak(_eigenvalues(mass)).any()):
+        if not system.remembered_at("no weak mass", place, lambda: not _weak(eigenvalues(mass)).any()):
             scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
             added = _rows_for_mass(mass, G, scale, system.name)
             mass = mass + scale * G[list(added)].T @ G[list(added)]
@@ -80,12 +81,6 @@ def _least_pivot(mass: Array, G: Array, name: str) -> float:
     return float(LEAST[place])
 
 
-def _eigenvalues(matrix: Array) -> Array:
-    """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
-    values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
-    return values
-
-
 def _weak(values: NDArray[Any]) -> NDArray[Any]:
     """Which of the eigenvalues of M, in order, are none."""
     return values < SINGULAR_MASS * values[-1]
@@ -95,11 +90,12 @@ def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int,
     """Rows of G with which M is definite, those of few entries first."""
     added: list[int] = []
     while True:
-        values, vectors = np.linalg.eigh(mass)
+        values, vectors, _ = lapack.dsyevd(mass)
         weak = _weak(values)
         if not weak.any():
             return tuple(added)
-        helps = np.linalg.norm(G @ vectors[:, weak], axis=1) > SINGULAR_MASS**0.5 * np.linalg.norm(G, axis=1)
+        helped = G @ vectors[:, weak]
+        helps = (helped * helped).sum(axis=1) > SINGULAR_MASS * (G * G).sum(axis=1)
         free = [k for k in np.argsort(np.count_nonzero(G, axis=1), kind="stable") if helps[k] and k not in added]
         if not free:
             raise Untraceable(f"the mass of {name!r} stays singular with constraints added")

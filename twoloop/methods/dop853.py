@@ -1,11 +1,9 @@
 """DOP853(...): an explicit method in the two-loop procedure."""
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_choice
 from twoloop.generate.stage_code import compiled_stages
@@ -14,8 +12,6 @@ from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_tolerances, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
@@ -90,7 +86,16 @@ class DOP853:
         s, free = len(tableau.B), self.stages == "free"
         plan = Plan(
             kernels.EXPLICIT,
-            _options(INNER_TOL if self.inner_tol is None else self.inner_tol, free),
+            kernels.options_array(
+                tableau.A,
+                tableau.B,
+                tableau.C,
+                tableau.E5,
+                COARSE_SHARE * tableau.E3,
+                INNER_TOL if self.inner_tol is None else self.inner_tol,
+                free,
+                LARGEST_MOVE,
+            ),
             np.zeros(kernels.memory_size(s, n_q)),
             exponent=1.0 / 8.0,
             safety=SAFETY,
@@ -109,12 +114,3 @@ class DOP853:
             own=(made.functions,),
             instead=kernels.explicit_step,
         )
-
-
-@cache
-def _options(inner_tol: float, free: bool) -> Array:
-    """The parameter block of the step."""
-    from twoloop.kernels.steps.explicit_step import options_array
-
-    coarse = COARSE_SHARE * tableau.E3
-    return options_array(tableau.A, tableau.B, tableau.C, tableau.E5, coarse, inner_tol, free, LARGEST_MOVE)

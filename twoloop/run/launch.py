@@ -19,7 +19,7 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-MOST, LARGEST = 16, 30_000  # runs that are kept with a system, and numbers of each
+MOST, LARGEST = 16, 100_000  # runs that are kept with a system, and numbers of each
 
 
 class Asked(NamedTuple):

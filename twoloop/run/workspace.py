@@ -26,28 +26,46 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    given = ("flags", system.functions.flags.tobytes())
-    flags = system.remembered_at(given, (t0, q0.tobytes()), lambda: _flags(system, t0, q0))
-    if plan is None:
-        return common.Kit(system.functions._replace(flags=flags.copy()), inner_loop)
-    return kit_with(system, flags, plan)
+    flags = _flags_at(system, t0, q0)
+    if plan is not None:
+        return kit_with(system, flags, plan)
+
+    def make() -> tuple[common.Kit, Any]:
+        functions = system.functions
+        return common.Kit(functions._replace(flags=flags.copy()), inner_loop), functions
+
+    if flags[common.FORM] == common.AUGMENTED:  # which a run may change
+        return make()[0]
+    made: tuple[common.Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
+    return made[0]
 
 
-def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+    """Flags at a position, not to be written to."""
+    definite = has_definite_mass(system, t0, q0)
+    key = ("flags", system.functions.flags.tobytes(), definite)
+    flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
+    if not sparse:
+        return flags  # type: ignore[no-any-return]
+    place = (t0, q0.tobytes())
+    if definite or system.remembered_at("inertia", place, lambda: least_inertia(system, t0, q0)[0]) > 0.0:
+        flags = flags.copy()
+        flags[common.FORM] = common.AUGMENTED
+    return flags  # type: ignore[no-any-return]
+
+
+def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
+    """Flags with dense or banded algebra, and whether sparse factors would pay."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
-        flags[common.DIAGONAL_MASS] = system.remembered("diagonal mass", lambda: _is_diagonal(system.mass(t0, q0)))
-    definite = has_definite_mass(system, t0, q0)
+        flags[common.DIAGONAL_MASS] = _is_diagonal(system.mass(t0, q0))
     reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
     flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
     flags[common.DENSE_FORM] = flags[common.FORM]
-    sparse = sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
-    if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
-        flags[common.FORM] = common.AUGMENTED
-    return flags
+    return flags, sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
 
 
 def _is_diagonal(mass: Array) -> bool:

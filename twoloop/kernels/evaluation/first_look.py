@@ -4,6 +4,7 @@ from numba import types
 
 from twoloop.kernels.algebra.linalg import ldl_factor
 from twoloop.kernels.data.common import (
+    CONSTANT_MASS,
     FORCE_BY_Q_GIVEN,
     FORCE_BY_V_GIVEN,
     GAMMA_GIVEN,
@@ -20,14 +21,22 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.finite import finite, finite_vector
 
-# flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; M definite
+# flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
+# varies definite
 IN_ORDER, CONSISTENT, DEFINITE = 1, 2, 4
 SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
     """How many numbers callbacks fill, beside M and the rows, and scratch."""
-    return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * (3 * n + n_c + n_a)
+    return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
+
+
+@exact
+def _clear(A):
+    for i in range(len(A)):
+        for j in range(A.shape[1]):
+            A[i, j] = 0.0
 
 
 @exact
@@ -92,9 +101,7 @@ def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
     for k in range(len(ways)):
         for j in range(q.size):
             place[j] = q[j] + max(abs(q[j]), largest) * ways[k, j]
-        for i in range(len(rows)):
-            for j in range(q.size):
-                rows[i, j] = 0.0
+        _clear(rows)
         f.jacobian(t, place, f.p, rows[:n_c])
         f.nonholonomic(t, place, f.p, rows[n_c:])
         _note_entries(rows, pattern)
@@ -138,24 +145,33 @@ def look(f, t, q, v, lam, room, mass, rows, ways, pattern, least):
         others = room[gamma : gamma + n_c * (n + 3)]
         matrix = others[3 * n_c :].reshape((n_c, n))
         f.kinematics(t, q, v, f.p, others[:n_c], matrix, others[n_c : 2 * n_c], others[2 * n_c : 3 * n_c])
-    tangents = room[gamma + n_c * (n + 3) :]
-    if flags[FORCE_BY_Q_GIVEN] == 1:
-        f.force_by_q(t, q, v, f.p, tangents[: n * n].reshape((n, n)))
-    if flags[FORCE_BY_V_GIVEN] == 1:
-        f.force_by_v(t, q, v, f.p, tangents[n * n : 2 * n * n].reshape((n, n)))
-    if flags[REACTION_BY_Q_GIVEN] == 1:
-        f.reaction_by_q(t, q, lam, f.p, tangents[2 * n * n : 3 * n * n].reshape((n, n)))
-    if not (finite(mass) and finite(rows) and finite_vector(room)):
+    end = gamma + n_c * (n + 3)
+    if not (finite(mass) and finite(rows) and finite_vector(room[:end])):
         return 0
+    scratch = room[end : end + n * n].reshape((n, n))
+    if flags[FORCE_BY_Q_GIVEN] == 1:
+        f.force_by_q(t, q, v, f.p, scratch)
+        if not finite(scratch):
+            return 0
+    if flags[FORCE_BY_V_GIVEN] == 1:
+        _clear(scratch)
+        f.force_by_v(t, q, v, f.p, scratch)
+        if not finite(scratch):
+            return 0
+    if flags[REACTION_BY_Q_GIVEN] == 1:
+        _clear(scratch)
+        f.reaction_by_q(t, q, lam, f.p, scratch)
+        if not finite(scratch):
+            return 0
     found = 0
     if _symmetric(mass, least[1]) and not _empty(rows):
         found = IN_ORDER
         if _consistent(room[force:C], room[C:rate], rows, q, v, least[0]):
             found |= CONSISTENT
-    if _definite(mass, least[2], tangents[: n * n].reshape((n, n))):
+    if flags[CONSTANT_MASS] == 0 and _definite(mass, least[2], scratch):
         found |= DEFINITE
-    near = tangents[n * n : n * n + n_rows * n].reshape((n_rows, n))
-    _note_entries_near(f, t, q, ways, room[rate : rate + n], near, n_c, pattern)
+    near = room[end : end + n_rows * n].reshape((n_rows, n))
+    _note_entries_near(f, t, q, ways, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
     return found
 
 
