@@ -24,6 +24,7 @@ from twoloop.problem.adapters import (
     through_python,
 )
 from twoloop.problem.description import Description
+from twoloop.problem.entries import VALUES_OF, DenseFunction, Entries, check_entries, dense_callback
 from twoloop.problem.jacobian import differenced_jacobian
 from twoloop.problem.joints import Joint, check_joints
 from twoloop.problem.pickling import packed, unpacked
@@ -53,6 +54,9 @@ class ConstrainedSystem:
         The vector `p` that every callback gets. It stays as it is: `with_parameters` makes a system of others.
     constant_mass : bool
         True: M depends neither on t nor on q, and is factored once.
+    mass_entries, jacobian_entries : (rows, columns), optional
+        Where the entries are that `mass_values` and `jacobian_values` give: two vectors of int each, of M for both
+        triangles. All others are zero at every state. Values of an entry that is named twice are added.
     bandwidth : int, optional
         No entry (i, j) with |i - j| > bandwidth is other than zero in M, in the derivatives of the force by q and v,
         and in the second derivatives of each constraint by q; C_q itself may be full. With it the cost of a step of a
@@ -86,6 +90,8 @@ class ConstrainedSystem:
         n_a: int = 0,
         parameters: ArrayLike = (),
         constant_mass: bool = False,
+        mass_entries: Any = None,
+        jacobian_entries: Any = None,
         bandwidth: int | None = None,
         joints: Sequence[Joint] = (),
         name: str = "system",
@@ -93,6 +99,7 @@ class ConstrainedSystem:
     ):
         self.n_q = check_size("n_q", n_q, 1)
         self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
+        self.entries = _checked_entries(callbacks, self.n_q, self.n_c, mass_entries, jacobian_entries)
         self.name = name
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
         self.description = Description()  # a Problem puts its own in its place
@@ -106,6 +113,7 @@ class ConstrainedSystem:
                 f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
             )
         self.given = _given(callbacks, self.n_c, self.n_a)
+        self.scattered: frozenset[str] = frozenset()  # dense kinds made of their values
         for kind, function in self.given.items():
             entry = KINDS[kind]
             if not isinstance(function, Dispatcher) or entry.signature.args not in function.overloads:
@@ -114,6 +122,7 @@ class ConstrainedSystem:
                     f"({', '.join(entry.arguments)}); given {function!r}. Plain Python functions enter by "
                     "ConstrainedSystem.from_python"
                 )
+        self._scatter()
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
@@ -132,6 +141,23 @@ class ConstrainedSystem:
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
         self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
+
+    @property
+    def n_mass_values(self) -> int:
+        """Number of entries of M that `mass_values` gives."""
+        return len(self.entries["mass"][0]) if "mass" in self.entries else 0
+
+    @property
+    def n_jacobian_values(self) -> int:
+        """Number of entries of C_q that `jacobian_values` gives."""
+        return len(self.entries["jacobian"][0]) if "jacobian" in self.entries else 0
+
+    def _scatter(self) -> None:
+        """Make dense callbacks of those that give values, where there are none."""
+        made = {kind: VALUES_OF[kind] for kind in self.entries if kind not in self.given}
+        dense = {kind: dense_callback(kind, self.given[of], self.entries[kind]) for kind, of in made.items()}
+        self.given = {kind: each for kind in KINDS if (each := dense.get(kind, self.given.get(kind))) is not None}
+        self.scattered = frozenset(dense)
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
@@ -197,6 +223,8 @@ class ConstrainedSystem:
         n_a: int = 0,
         parameters: ArrayLike | None = None,
         compile: bool = False,
+        mass_entries: Any = None,
+        jacobian_entries: Any = None,
         bandwidth: int | None = None,
         joints: Sequence[Joint] = (),
         name: str = "system",
@@ -217,6 +245,8 @@ class ConstrainedSystem:
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
+        mass_entries, jacobian_entries : (rows, columns), optional
+            As for the class.
         bandwidth : int, optional
             As for the class; `mass` must then be an array.
         joints : sequence of Joint
@@ -245,12 +275,15 @@ class ConstrainedSystem:
                 "with compiled callbacks to ConstrainedSystem(...)"
             )
         functions = _given(functions, n_c, n_a)
-        constant_mass = not callable(functions["mass"])
-        if constant_mass:
-            matrix = check_real("mass", functions["mass"])
-            if matrix.shape != (n_q, n_q):
-                raise ValueError(f"mass must have shape {(n_q, n_q)}; given an array of shape {matrix.shape}")
-            functions["mass"] = ConstantMatrix(matrix)
+        entries = _checked_entries(functions, n_q, n_c, mass_entries, jacobian_entries)
+        shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": entries["mass"][0].shape if "mass" in entries else ()}
+        masses = [kind for kind in shapes if kind in functions]
+        constant_mass = not any(callable(functions[kind]) for kind in masses)
+        for kind in masses if constant_mass else ():
+            matrix = check_real(kind, functions[kind])
+            if matrix.shape != shapes[kind]:
+                raise ValueError(f"{kind} must have shape {shapes[kind]}; given an array of shape {matrix.shape}")
+            functions[kind] = ConstantMatrix(matrix)
         for kind, function in functions.items():
             if not callable(function):
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
@@ -265,6 +298,8 @@ class ConstrainedSystem:
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
         options: dict[str, Any] = {
             "constant_mass": constant_mass,
+            "mass_entries": mass_entries,
+            "jacobian_entries": jacobian_entries,
             "bandwidth": bandwidth,
             "joints": joints,
             "name": name,
@@ -276,10 +311,15 @@ class ConstrainedSystem:
             system = cls(**sizes, **options, **compiled, parameters=p)
             system._returning, system._taking = functions, taking
             return system
+        made = {kind: VALUES_OF[kind] for kind in entries if kind not in functions}
+        sides = {"mass": (n_q, n_q), "jacobian": (n_c, n_q)}
+        functions |= {kind: DenseFunction(functions[of], entries[kind], sides[kind]) for kind, of in made.items()}
+        taking |= {kind for kind, of in made.items() if of in taking}
         python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
         system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, p))
         system._python, system._taking = python, taking  # the registry holds it weakly
+        system.scattered = frozenset(made)
         return system
 
     @property
@@ -396,12 +436,14 @@ class ConstrainedSystem:
         plain = self._returning or (self._python.functions if self._python is not None else {})
         options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "n_a": self.n_a}
         options |= {"bandwidth": self.bandwidth, "joints": self.joints, "name": self.name}
+        options |= {f"{kind}_entries": entries for kind, entries in self.entries.items()}
         if plain:
             options["compile"] = not self.called_in_python
             options["parameters"] = self.parameters if self._taking else None
         else:
             options |= {"constant_mass": self.constant_mass, "parameters": self.parameters}
-        functions = {kind: packed(self.name, kind, function) for kind, function in (plain or self.given).items()}
+        own = {kind: function for kind, function in (plain or self.given).items() if kind not in self.scattered}
+        functions = {kind: packed(self.name, kind, function) for kind, function in own.items()}
         known = self.description
         if known.energy is not None:
             packed(self.name, "energy", known.energy)
@@ -420,8 +462,9 @@ def _made_again(
 ) -> ConstrainedSystem:
     """The system that was pickled, of the functions that this process finds by the same names."""
     functions = {kind: unpacked(function) for kind, function in packed.items()}
-    if plain and isinstance(functions["mass"], ConstantMatrix):
-        functions["mass"] = functions["mass"].matrix
+    for kind in ("mass", "mass_values") if plain else ():
+        if isinstance(functions.get(kind), ConstantMatrix):
+            functions[kind] = functions[kind].matrix
     system = (cls.from_python if plain else cls)(**options, **functions)
     system.functions.flags[:] = flags
     system.description = known
@@ -444,10 +487,14 @@ def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
     sizes = {"n_c": n_c, "n_a": n_a}
     needed = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
     missing = [kind for kind in needed if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
+    if callbacks.get("mass_values") is not None:
+        missing = [kind for kind in missing if kind != "mass"]
     if missing:
         rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
         raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
     given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
+    if given.get("mass", "") is None:
+        del given["mass"]  # mass_values are there
     given = {
         kind: each
         for kind, each in given.items()
@@ -459,12 +506,26 @@ def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
         if kind in given and sizes.get(entry.shape[0], 1) == 0:
             of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
             raise ValueError(f"{kind} goes with {of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
-    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in given]
+    known = {*given, *(("jacobian",) if "jacobian_values" in given else ())}
+    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in known]
     if missing:
         raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
     if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
         raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
     return given
+
+
+def _checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
+    """Where the entries of M and C_q are whose values callbacks give, or what is wrong with them."""
+    made: dict[str, Entries] = {}
+    for kind, entries, shape in (("mass", mass, (n_q, n_q)), ("jacobian", jacobian, (n_c, n_q))):
+        values, name = VALUES_OF[kind], f"{kind}_entries"
+        if (callbacks.get(values) is None) != (entries is None):
+            given, other = (name, values) if entries is not None else (values, name)
+            raise ValueError(f"{values} and {name} go together: {given} is given, and {other} is not")
+        if entries is not None:
+            made[kind] = check_entries(name, entries, shape, symmetric=kind == "mass")
+    return made
 
 
 def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
