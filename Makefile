@@ -68,7 +68,7 @@ compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "import twoloop.kernels.steps.newton_step" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, lanes; \
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, diagonal_step, explicit_step, \
-	fixed_point_step, newmark_step" && wait $$! && \
+	fixed_point_step, newmark_step; from twoloop.kernels.evaluation import static_inner" && wait $$! && \
 	$(RUN) -c "import twoloop.kernels.control.switching"
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too

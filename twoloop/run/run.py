@@ -20,6 +20,7 @@ from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.record import Statistics
+from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, kit_with, workspace
 
 Array = NDArray[np.float64]
@@ -31,6 +32,7 @@ LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked a
 PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
+NONE = np.zeros((0, 0))
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
 
 
@@ -61,11 +63,12 @@ class Run:
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
-        self.kit = kit_of(system, t0, q0, plan)
+        others = () if plan.substitute is None else (plan.substitute,)
+        self.static = static_form(system, t0, q0, plan, *others)
+        self.kit = kit_of(system, t0, q0, plan, self.static)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        self.pattern = system.remembered_at("pattern", (t0, q0.tobytes()), lambda: pattern_of(system, t0, q0))
         self.work = self._workspace()
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.ATOL + system.n_q)
@@ -77,7 +80,7 @@ class Run:
         self.control[advance.MAX_STEP] = np.inf
         self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[advance.MAX_STEPS] = np.inf
-        self.control[advance.BRIDGE] = 1.0
+        self.control[advance.BRIDGE] = self.static is None
         rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
         self.control[advance.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
@@ -102,7 +105,7 @@ class Run:
         vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
         for name in ("state", "new_state", "tolerances", "control", "clock"):
             setattr(other, name, getattr(self, name).copy())
-        if self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
+        if self.static is None and self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         other.work = copy_of(self.work)
@@ -122,13 +125,53 @@ class Run:
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
         q0 = self.state[: self.system.n_q]
-        work = workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
+        pattern = self._pattern(q0) if self.static is None else NONE
+        work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, (rank, rank_v), self.static)
         work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
+
+    def _pattern(self, q: Array) -> Array:
+        """Where the rows have entries."""
+        system, t0 = self.system, self.t0
+        return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
+
+    def become_dense(self) -> None:
+        """Go on with the forms of saddle_point.py where the static one cannot decide: at the state there is."""
+        n = self.system.n_q
+        before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
+        rank = len(before.rows_v)
+        self.static = None
+        t, q = float(self.clock[self.a.T]), self.state[:n].copy()
+        self.kit = kit_of(self.system, t, q, self.plan)
+        self.functions = self.kit.functions
+        self.work = self._workspace(rank, rank)
+        self.work.counters[:] = before.counters
+        for place in (common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER):
+            self.work.notes[place] = before.notes[place]
+        self.control[self.a.BRIDGE] = 1.0
+        state = self.state.copy()
+        code = direct(self.a.start)(self.kit, self.work, t, state)
+        if code == common.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
+            self.work.notes[common.GENERATION] = 1.0
+            code = direct(self.a.start)(self.kit, self.work, t, state)
+        if before.notes[common.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
+            pivot = self.work.notes[common.PIVOT]
+            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[common.PIVOT])
 
     def _begin(self) -> None:
         start = direct(self.a.start)
         code = start(self.kit, self.work, self.t0, self.state)
+        if self.static is not None and code == common.RANK_DIFFERS:
+            rank = int(self.work.notes[common.RANK])
+            self.work = self._workspace(rank, rank)
+            code = start(self.kit, self.work, self.t0, self.state)
+        if self.static is not None and code not in (common.DONE, common.NOT_FINITE):
+            self.static = None
+            self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
+            self.functions = self.kit.functions
+            self.control[self.a.BRIDGE] = 1.0
+            self.work = self._workspace()
+            code = start(self.kit, self.work, self.t0, self.state)
         if code == common.RANK_DIFFERS:
             ranks = [int(self.work.notes[place]) for place in (common.RANK, common.RANK_V)]
             self.work = self._workspace(*ranks)
