@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space, qr
 
 from twoloop.checks.bounds import check_bounds
-from twoloop.checks.derivatives import check_derivatives, unsymmetric_mass
+from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, Scales, scales_of
+from twoloop.checks.sparse_rows import Rows, largest_in_rows
+from twoloop.checks.values import unsymmetric_mass
 from twoloop.kernels.compile.callbacks import KINDS
 
 if TYPE_CHECKING:
@@ -51,8 +53,8 @@ def check_start(
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
-    jacobian = system.jacobian(t0, q0)
-    rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
+    rows = system.sparse_rows(t0, q0)
+    jacobian = rows[: system.n_c]
     reason = not_finite(system, t0, q0, v0)
     if reason is not None:
         raise ValueError(f"at the start, t = {t0:g}, {reason}")
@@ -60,11 +62,12 @@ def check_start(
     if unsymmetric is not None:
         raise ValueError(unsymmetric)
     if not _at_rounding(system.constraint(t0, q0), jacobian, q0):
-        scales = scales_of(system, t0, q0, jacobian)
-        Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")
+        full = system.jacobian(t0, q0)
+        scales = scales_of(system, t0, q0, full)
+        Violation.of_position(system, t0, q0, full, scales).refuse("q0")
     if derivatives:
         check_derivatives(system, t0, q0, exact)
-    empty = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) == 0.0).tolist()
+    empty = np.flatnonzero(largest_in_rows(rows) == 0.0).tolist()
     if empty:
         raise ValueError(
             f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "
@@ -72,13 +75,14 @@ def check_start(
         )
     rate = system.rates(t0, q0)
     if not _at_rounding(rows @ v0 + rate, rows, v0, rate):
-        scales = scales_of(system, t0, q0, rows)
-        Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
+        full = system.rows(t0, q0)
+        scales = scales_of(system, t0, q0, full)
+        Violation.of_velocity(system, t0, q0, v0, full, scales).refuse("v0")
 
 
-def _at_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> bool:
+def _at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
     """Whether values are no more than rounding of their terms, which needs no scales to be accepted."""
-    return bool((np.abs(values) <= ROUNDING * EPS * (np.abs(rows) @ np.abs(state) + np.abs(rate))).all())
+    return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
 
 
 class Violation:
@@ -251,6 +255,7 @@ def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
 def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
     """Which callbacks give values that are not finite at (t, q, v); None: all are."""
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
-    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in system.given}
+    looked = [kind for kind in system.given if kind not in system.entries]  # whose values are looked at
+    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in looked}
     wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in _parts(value))]
     return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None

@@ -29,7 +29,7 @@ DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
 WIDTH = 9  # numbers of a joint
 GROUND = -1
-LARGE = 60  # coordinates from which on the values of entries serve
+LARGE = 100  # coordinates from which on the values of entries serve
 
 
 @helper

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import check_flag, check_number, check_real, check_size, shown
 from twoloop.checks.bounds import check_callback
+from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions
@@ -407,11 +408,17 @@ class ConstrainedSystem:
 
     def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
         """C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
-        return self.rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
+        return self.sparse_rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
 
     def rows(self, t: float, q: ArrayLike) -> Array:
         """C_q, then A, (n_c + n_a, n_q)."""
         return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
+
+    def sparse_rows(self, t: float, q: ArrayLike) -> Rows:
+        """The same by their entries, where `jacobian_values` gives these."""
+        if self.n_a > 0 or "jacobian" not in self.entries:
+            return self.rows(t, q)
+        return SparseRows(*self.entries["jacobian"], self.jacobian_values(t, q), (self.n_c, self.n_q))
 
     def rates(self, t: float, q: ArrayLike) -> Array:
         """C_t, then b, (n_c + n_a,)."""

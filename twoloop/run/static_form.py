@@ -19,7 +19,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-LARGE = 60  # coordinates from which on it is faster than the forms of saddle_point.py: measured on chains
+LARGE = 100  # coordinates from which on it is faster than the forms of saddle_point.py: measured on chains
 SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
 
 
