@@ -135,6 +135,15 @@ class Run:
         system, t0 = self.system, self.t0
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
+    def is_lost_without_dense(self, code: int) -> bool:
+        """Whether the static form found no step, however short, and others may."""
+        reasons = (common.INNER_DIVERGED, common.SINGULAR, common.MASS_NOT_DEFINITE)
+        return (
+            self.static is not None
+            and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
+            and int(self.clock[self.a.FAILURE_CODE]) in reasons
+        )
+
     def become_dense(self) -> None:
         """Go on with the forms of saddle_point.py where the static one cannot decide: at the state there is."""
         n = self.system.n_q
@@ -149,6 +158,10 @@ class Run:
         for place in (common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER):
             self.work.notes[place] = before.notes[place]
         self.control[self.a.BRIDGE] = 1.0
+        clock, a = self.clock, self.a
+        if clock[a.FAILURE_CODE] != common.DONE:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
+            clock[a.FAILURE_CODE] = common.DONE
         state = self.state.copy()
         code = direct(self.a.start)(self.kit, self.work, t, state)
         if code == common.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left

@@ -26,7 +26,7 @@ SPARSE = 0.05  # of the multiplications of dense factors: a program with more of
 class StaticForm(NamedTuple):
     """The program of a system, and what a workspace for it needs."""
 
-    program: NDArray[np.int64]
+    program: NDArray[np.int32]
     static: Static
     mass: Entries
     pattern: Array  # of a dense Jacobian, (n_c, n_q), 1 where it has entries; of no size beside jacobian_values

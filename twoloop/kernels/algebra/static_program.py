@@ -25,7 +25,7 @@ MOST_UPDATES = 3_000_000  # multiplications of a program: beyond, the matrix is 
 
 def static_program(
     n_q: int, n_rows: int, mass: Entries, jacobian: Entries, together: Iterable[Sequence[int]] = ()
-) -> Integers | None:
+) -> NDArray[np.int32] | None:
     """The program for M and G with these entries; None where there would be too many updates.
 
     Parameters
@@ -67,7 +67,7 @@ def static_program(
     source[:n_mass][rows[:n_mass] < columns[:n_mass]] = n + len(keys)  # the other triangle: a slot that nobody reads
     head = [n_q, n, len(keys), len(targets), n_mass, len(jacobian[0])]
     parts = [order, begin, row_of, targets, *mass, source[:n_mass], *jacobian, source[n_mass:]]
-    return np.concatenate([np.array(head), *parts]).astype(np.int64)
+    return np.concatenate([np.array(head), *parts]).astype(np.int32)
 
 
 _PAIRS: dict[int, Entries] = {}

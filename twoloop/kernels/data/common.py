@@ -26,6 +26,7 @@ from twoloop.kernels.compile.reference import Reference
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
+PLACES = types.int32[::1]  # of long programs, which are to stay in the cache
 
 # programs in the place of callbacks that are not given, see evaluation/program.py, and that of the elimination of large
 # systems, see algebra/static_program.py; of size 0 where there is none
@@ -268,7 +269,7 @@ KIT = Reference(
     "Kit",
     {
         **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
-        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, INTEGERS), strict=True)),
+        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, PLACES), strict=True)),
     },
 )
 for _name, _kind in KINDS.items():

@@ -95,9 +95,11 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
     _sample(f, w, t, q, way, begin, end)
     row, limit, mean, most = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
+        bend = _bend(w, i)
+        if bend == 0.0:  # of a row that does not depend on time
+            continue
         slope, size = _slope_and_size(w, i, h)
         least = max(_allowed(f, w, tolerances, v, i), ROUNDING * size, BY_TIME * slope * np.spacing(abs(end)))
-        bend = _bend(w, i)
         if bend > most * least:
             row, limit, mean, most = i, least, slope, bend / least
     if row < 0:
