@@ -13,7 +13,7 @@ from scipy.linalg import null_space, qr
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, Scales, scales_of
-from twoloop.checks.sparse_rows import Rows, largest_in_rows
+from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
 from twoloop.checks.values import unsymmetric_mass
 from twoloop.kernels.compile.callbacks import KINDS
 
@@ -61,7 +61,7 @@ def check_start(
     unsymmetric = unsymmetric_mass(system, t0, q0)
     if unsymmetric is not None:
         raise ValueError(unsymmetric)
-    if not _at_rounding(system.constraint(t0, q0), jacobian, q0):
+    if not is_at_rounding(system.constraint(t0, q0), jacobian, q0):
         full = system.jacobian(t0, q0)
         scales = scales_of(system, t0, q0, full)
         Violation.of_position(system, t0, q0, full, scales).refuse("q0")
@@ -74,14 +74,20 @@ def check_start(
             "there. Leave these constraints out, or start from another position"
         )
     rate = system.rates(t0, q0)
-    if not _at_rounding(rows @ v0 + rate, rows, v0, rate):
+    if not is_at_rounding(rows @ v0 + rate, rows, v0, rate):
         full = system.rows(t0, q0)
         scales = scales_of(system, t0, q0, full)
         Violation.of_velocity(system, t0, q0, v0, full, scales).refuse("v0")
 
 
-def _at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
-    """Whether values are no more than rounding of their terms, which needs no scales to be accepted."""
+def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
+    """Whether values are no more than rounding of their terms, which needs no scales to be accepted.
+
+    For rows by their entries, whose scales take full matrices, of entries as well, as large as the largest of a row.
+    """
+    if isinstance(rows, SparseRows):
+        terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
+        return bool((np.abs(values) <= ROUNDING * EPS * terms).all())
     return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
 
 

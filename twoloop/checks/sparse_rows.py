@@ -38,6 +38,10 @@ class SparseRows:
     def __abs__(self) -> SparseRows:
         return self._with(np.abs(self.values))
 
+    def pattern(self) -> SparseRows:
+        """1 for each entry."""
+        return self._with(np.ones(len(self.values)))
+
     def _with(self, values: Array) -> SparseRows:
         other = object.__new__(SparseRows)
         other.rows, other.columns, other.values, other.shape = self.rows, self.columns, values, self.shape
