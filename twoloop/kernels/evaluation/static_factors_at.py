@@ -6,7 +6,7 @@ from which the entries are taken.
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
+from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve
 from twoloop.kernels.algebra.static_factors import factor, load, refined
 from twoloop.kernels.algebra.static_program import N_PIVOTS, jacobian_of, mass_of, order_of
 from twoloop.kernels.data.common import (
@@ -30,8 +30,8 @@ from twoloop.kernels.evaluation.program import jacobian_by_program
 
 SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
 LEAST = 1e-10  # ... and one below this share no factors with pivots of one row can do with
-REDUNDANT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
-MOST_SUSPECTS = 64  # rows: each takes a solution at the start, and at every state for its multiplier
+DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
+MOST_REDUNDANT = 64  # rows: each takes a solution at every state, for multipliers of least norm
 ONCE, TWICE = 1e-4, 1e-7  # the smallest share, below which solutions are refined, and refined again
 
 
@@ -152,21 +152,12 @@ def _squared_in_mass(f, w, x):
 
 
 @compiled
-def _largest_sine(f, w):
-    """The row that does not count and depends least on those that do, and the sine of its angle to them."""
-    order, n_q = order_of(f.static_program), w.Q.size
-    found, largest = -1, 0.0
-    for k in range(order.size):
-        row = order[k] - n_q
-        if row < 0 or w.counts[row] != 0.0:
-            continue
-        _row_as_force(f, w, row)
-        solve_values(f, w, 2)
-        part = _squared_in_mass(f, w, w.unknowns[:n_q])
-        sine = np.sqrt(part / w.pivot_sizes[k]) if w.pivot_sizes[k] > 0.0 else 0.0
-        if found < 0 or not sine <= largest:  # also true for NaN
-            found, largest = row, sine
-    return found, largest
+def _sine(f, w, row, size):
+    """The sine of the angle of a row that does not count to those that do; `size` is its square in the metric of M^-1."""
+    _row_as_force(f, w, row)
+    solve_values(f, w, 2)
+    part = _squared_in_mass(f, w, w.unknowns[: w.Q.size])
+    return np.sqrt(part / size) if size > 0.0 else 0.0
 
 
 @compiled
@@ -179,23 +170,30 @@ def _number(counts):
 
 @compiled
 def _choose(f, w, t, q):
-    """Which rows count, into w.counts, and the factors of these; DONE, or why that cannot be said."""
+    """Which rows count, into w.counts, and the factors of these; DONE, or why that cannot be said.
+
+    Rows with small pivots are left out at first, and taken one after another if they are independent of those that
+    count by then.
+    """
     w.counts[:] = 1.0
     if not _factor(f, w, SUSPECT) > 0.0:
         return _fault(w, t, q)
-    n_suspects = w.counts.size - _number(w.counts)
-    if n_suspects > MOST_SUSPECTS:
-        return _fault(w, t, q)
-    for _ in range(n_suspects):
-        row, sine = _largest_sine(f, w)
-        if sine <= REDUNDANT:
-            return DONE
+    order, n_q, n_redundant = order_of(f.static_program), w.Q.size, 0
+    copy(w.counts, w.z)  # 0 for rows to look at
+    for k in range(order.size):
+        row = order[k] - n_q
+        if row < 0 or w.z[row] != 0.0:
+            continue
+        sine = _sine(f, w, row, w.pivot_sizes[k])
+        if sine <= DEPENDENT:
+            n_redundant += 1
+            continue
         number = _number(w.counts)
         w.counts[row] = 1.0
         smallest = _factor(f, w, LEAST) if sine * sine > LEAST else 0.0
         if not smallest > 0.0 or _number(w.counts) != number + 1:
             return _fault(w, t, q)
-    return DONE
+    return DONE if n_redundant <= MOST_REDUNDANT else NEEDS_DENSE
 
 
 @compiled
