@@ -144,7 +144,8 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_c + 1,),
         **{"rows": (rank,), "dependent": (n_q,), "independent": (n_q,), "index": (index_size(0),)},
-        "index_a": (index_size(0),),
+        **dict.fromkeys(("rows_v", "dependent_v", "independent_v"), (0,)),  # those of positions
+        **dict.fromkeys(("index_v", "index_a"), (index_size(0),)),
     }
     return numbers, integers
 

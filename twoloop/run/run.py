@@ -179,6 +179,8 @@ class Run:
             self.work = self._workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code not in (common.DONE, common.NOT_FINITE):
+            if self.work.notes[common.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
+                self.system.made["static form"] = None
             self.static = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
             self.functions = self.kit.functions
