@@ -27,7 +27,9 @@ class Bars:
     def __init__(self, angles: Array):
         self.angles, n = np.asarray(angles), len(angles)
         self.half = 0.5 / n
-        self.bodies = PlanarBodies([f"bar {k}" for k in range(n)], np.full(n, 1.0 / n), np.full(n, self.half**2 / n / 3.0))
+        self.bodies = PlanarBodies(
+            [f"bar {k}" for k in range(n)], np.full(n, 1.0 / n), np.full(n, self.half**2 / n / 3.0)
+        )
         self.centres = np.zeros((n, 2))
 
     def end(self, k: int, side: float) -> Array:

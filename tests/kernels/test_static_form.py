@@ -57,7 +57,7 @@ class Started:
 
 
 def compare(seed, most):
-    """The errors of accelerations and multipliers of a random assembly, and its size; None where dense has to decide."""
+    """The larger error of accelerations and multipliers of a random assembly; None where dense has to decide."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(5, most))
     assembly = Assembly(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))

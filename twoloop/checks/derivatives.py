@@ -313,7 +313,8 @@ def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: Sparse
     unit = float(np.median(scales))
 
     def full(x: Array) -> Array:
-        return system.sparse_rows(t, x).matrix()
+        rows = system.sparse_rows(t, x)
+        return rows.matrix() if isinstance(rows, SparseRows) else rows
 
     def product(way: Array) -> Array:
         return _rounding(lambda x: system.sparse_rows(t, x) @ way, jacobian @ way, q)

@@ -33,7 +33,7 @@ class SparseRows:
         return self.shape[0]
 
     def __matmul__(self, x: Array) -> Array:
-        return np.bincount(self.rows, self.values * x[self.columns], self.shape[0])
+        return np.bincount(self.rows, self.values * x[self.columns], self.shape[0]).astype(np.float64)
 
     def __abs__(self) -> SparseRows:
         return self._with(np.abs(self.values))
@@ -101,4 +101,3 @@ def rows_of(matrix: Array) -> SparseRows:
     """The entries of a matrix that are not zero."""
     rows, columns = np.nonzero(matrix)
     return SparseRows(rows, columns, matrix[rows, columns], matrix.shape)  # type: ignore[arg-type]
-

@@ -1,4 +1,4 @@
-"""Do the values of entries belong to the dense matrices beside them, and does M have them on both sides?"""
+"""Whether values of entries belong to the dense matrices beside them, and M has them on both sides."""
 
 from __future__ import annotations
 

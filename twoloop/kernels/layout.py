@@ -114,7 +114,7 @@ def _cleared(work: Work) -> Work:
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Shapes of the numbers and the integers that the static form changes: no partition, and no matrix it can do without.
+    """Shapes of numbers and integers that the static form changes: no partition, no matrix that it can do without.
 
     All coordinates stand for the dependent ones, whose predictions are compared, and for the independent ones.
     """

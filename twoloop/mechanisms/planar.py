@@ -291,7 +291,8 @@ class PlanarBodies:
         bodies = np.column_stack([self.masses, self.inertias])
         sizes = [len(bodies), len(self._joints), self.gravity]
         moves = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
-        n_q, values = 3 * len(bodies), {}
+        n_q = 3 * len(bodies)
+        values: dict[str, Any] = {}
         if n_q >= LARGE:
             values = {
                 "mass_values": mass_values,

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_flag, check_number, check_real, check_size, shown
+from twoloop.checks.arguments import check_flag, check_number, check_real, check_size
 from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
-from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
+from twoloop.kernels.compile.callbacks import KINDS, STATE
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions
 from twoloop.problem.adapters import (
@@ -25,8 +25,8 @@ from twoloop.problem.adapters import (
     through_python,
 )
 from twoloop.problem.description import Description
-from twoloop.problem.entries import VALUES_OF, DenseFunction, Entries, check_entries, dense_callback
-from twoloop.problem.jacobian import differenced_jacobian
+from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
+from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of
 from twoloop.problem.joints import Joint, check_joints
 from twoloop.problem.pickling import packed, unpacked
 from twoloop.problem.system_methods import add_callbacks
@@ -100,11 +100,11 @@ class ConstrainedSystem:
     ):
         self.n_q = check_size("n_q", n_q, 1)
         self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
-        self.entries = _checked_entries(callbacks, self.n_q, self.n_c, mass_entries, jacobian_entries)
+        self.entries = checked_entries(callbacks, self.n_q, self.n_c, mass_entries, jacobian_entries)
         self.name = name
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
         self.description = Description()  # a Problem puts its own in its place
-        p = _checked_parameters(parameters)
+        p = checked_parameters(parameters)
         if not isinstance(constant_mass, (bool, np.bool_)):
             raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
         self.constant_mass = bool(constant_mass)
@@ -113,7 +113,7 @@ class ConstrainedSystem:
             raise ValueError(
                 f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
             )
-        self.given = _given(callbacks, self.n_c, self.n_a)
+        self.given = given_callbacks(callbacks, self.n_c, self.n_a)
         self.scattered: frozenset[str] = frozenset()  # dense kinds made of their values
         for kind, function in self.given.items():
             entry = KINDS[kind]
@@ -128,7 +128,7 @@ class ConstrainedSystem:
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
-        all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
+        all_callbacks = {kind: self.given.get(kind) or in_place_of(kind, self.given) for kind in KINDS}
         none = (np.zeros(0, np.int64), np.zeros(0))
         programs = dict(zip(PROGRAMS, (*none, *none, np.zeros(0, np.int32)), strict=True))
         self.functions: Any = Functions(**all_callbacks, p=p, flags=flags, **programs)  # type: ignore[call-arg]
@@ -198,7 +198,7 @@ class ConstrainedSystem:
         TypeError, ValueError
             If the parameters are not as many finite numbers, or the system is made of functions that take none.
         """
-        p, known = _checked_parameters(parameters), self.parameters
+        p, known = checked_parameters(parameters), self.parameters
         if not self._taking and (self._python is not None or self._returning):
             raise TypeError(
                 f"{self.name!r} has no parameters: it is made by from_python without them. Give it parameters=p, which "
@@ -275,9 +275,10 @@ class ConstrainedSystem:
                 "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
                 "with compiled callbacks to ConstrainedSystem(...)"
             )
-        functions = _given(functions, n_c, n_a)
-        entries = _checked_entries(functions, n_q, n_c, mass_entries, jacobian_entries)
-        shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": entries["mass"][0].shape if "mass" in entries else ()}
+        functions = given_callbacks(functions, n_c, n_a)
+        entries = checked_entries(functions, n_q, n_c, mass_entries, jacobian_entries)
+        of_values = entries["mass"][0].shape if "mass" in entries else ()
+        shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": of_values}
         masses = [kind for kind in shapes if kind in functions]
         constant_mass = not any(callable(functions[kind]) for kind in masses)
         for kind in masses if constant_mass else ():
@@ -290,7 +291,7 @@ class ConstrainedSystem:
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
         known = parameters is not None
         taking = frozenset(kind for kind, function in functions.items() if check_arguments(kind, function, known))
-        p = _checked_parameters(() if parameters is None else parameters)
+        p = checked_parameters(() if parameters is None else parameters)
         if known and not taking:
             raise ValueError(
                 f"parameters are given, but none of the functions of {name!r} takes them: let those that need them "
@@ -476,73 +477,6 @@ def _made_again(
     system.functions.flags[:] = flags
     system.description = known
     return system
-
-
-def _checked_parameters(parameters: Any) -> Array:
-    """The parameters as a new vector, or what is wrong with them."""
-    p = check_real("parameters", parameters)
-    if p.ndim != 1 or not np.isfinite(p).all():
-        raise ValueError(f"parameters must be a vector of finite numbers; given {shown(parameters)}")
-    return p
-
-
-def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
-    """The callbacks that are given, in the order of KINDS, or what is wrong with their choice."""
-    unknown = [kind for kind in callbacks if kind not in KINDS]
-    if unknown:
-        raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
-    sizes = {"n_c": n_c, "n_a": n_a}
-    needed = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
-    missing = [kind for kind in needed if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
-    if callbacks.get("mass_values") is not None:
-        missing = [kind for kind in missing if kind != "mass"]
-    if missing:
-        rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
-        raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
-    given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
-    if given.get("mass", "") is None:
-        del given["mass"]  # mass_values are there
-    given = {
-        kind: each
-        for kind, each in given.items()
-        if not (
-            KINDS[kind].optional and (each is None or (KINDS[kind].absent != "differences" and each is stand_in(kind)))
-        )
-    }
-    for kind, entry in KINDS.items():
-        if kind in given and sizes.get(entry.shape[0], 1) == 0:
-            of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
-            raise ValueError(f"{kind} goes with {of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
-    known = {*given, *(("jacobian",) if "jacobian_values" in given else ())}
-    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in known]
-    if missing:
-        raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
-    if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
-        raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
-    return given
-
-
-def _checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
-    """Where the entries of M and C_q are whose values callbacks give, or what is wrong with them."""
-    made: dict[str, Entries] = {}
-    for kind, entries, shape in (("mass", mass, (n_q, n_q)), ("jacobian", jacobian, (n_c, n_q))):
-        values, name = VALUES_OF[kind], f"{kind}_entries"
-        if (callbacks.get(values) is None) != (entries is None):
-            given, other = (name, values) if entries is not None else (values, name)
-            raise ValueError(f"{values} and {name} go together: {given} is given, and {other} is not")
-        if entries is not None:
-            made[kind] = check_entries(name, entries, shape, symmetric=kind == "mass")
-    return made
-
-
-def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
-    """The callback that stands in the place of one that is not given."""
-    if KINDS[kind].absent != "differences" or "constraint" not in given:
-        return stand_in(kind)
-    constraint = given["constraint"]
-    # what is called in Python cannot be watched, and need not be: it is looked up at every call
-    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
-    return differenced_jacobian(constraint, watched)
 
 
 def check_system(system: object) -> None:

@@ -1,4 +1,4 @@
-"""A guess for a large system put on its constraints, by sparse factors: what consistent_state does, without its matrices.
+"""A guess for a large system put on its constraints by sparse factors: consistent_state without its matrices.
 
 What is not plain sailing is left to it: rows that depend on one another beside the constraints only nearly, places near
 a dead centre, other guesses that may lead elsewhere.
@@ -36,7 +36,7 @@ class _Metric:
         diagonal = np.where(rows == columns, 1.0, 0.0)
         self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
 
-    def ask(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
+    def ask(self, task: int, q: Array, v: Array, a: Array | None = None) -> int:
         """What the inner loop says to a task; q and v are changed."""
         a = self.work.x if a is None else a
         code = direct(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, self.work.lam)

@@ -155,8 +155,8 @@ class Run:
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = before.counters
-        for place in (common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER):
-            self.work.notes[place] = before.notes[place]
+        kept = [common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER]
+        self.work.notes[kept] = before.notes[kept]
         self.control[self.a.BRIDGE] = 1.0
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != common.DONE:

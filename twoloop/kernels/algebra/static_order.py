@@ -10,6 +10,7 @@ hang on nothing yet.
 
 import heapq
 from collections.abc import Iterable, Sequence
+from collections.abc import Set as AbstractSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,14 +68,14 @@ class _Holds:
             self.hangs[body].discard(hub)
         self._join([hub, *hanging], False, frozenset())
 
-    def _join(self, bodies: Iterable[int], grounded: bool, hubs: frozenset[int] | set[int]) -> None:
+    def _join(self, bodies: Iterable[int], grounded: bool, hubs: AbstractSet[int]) -> None:
         first, *others = bodies
         part = self.parts.find(first)
         for other in others:
             other = self.parts.find(other)
             if other != part:
                 grounded = grounded or self.grounded[other] or self.grounded[part]
-                hubs = hubs | self.hangs[other] | self.hangs[part]
+                hubs = {*hubs, *self.hangs[other], *self.hangs[part]}
                 part = self.parts.join(part, other)
         self.grounded[part] = self.grounded[part] or grounded
         self.hangs[part] |= hubs
@@ -137,7 +138,7 @@ def _minimum_degree(
     sizes: Sequence[int],
     n_bodies: int,
 ) -> list[int]:
-    """Joints, and hubs as len(joints) + their place, each time one of those that may come whose neighbours are fewest."""
+    """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours."""
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
     near: list[set[int]] = [set() for _ in sizes]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.static_order import elimination_order
-from twoloop.kernels.data.common import inlined, merged
+from twoloop.kernels.data.common import inlined
 
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # rows and columns
@@ -94,12 +94,6 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
         made.append(np.array(rows, dtype=np.int64))
         below[column] = set()
     return made
-
-
-@merged
-def n_slots(program):
-    """How many numbers the factors are, and one for what is not needed."""
-    return program[N_PIVOTS] + program[N_OFF] + 1
 
 
 @inlined

@@ -348,7 +348,9 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:  # a constant step cannot become shorter
+        if (
+            code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC
+        ):  # a constant step cannot become shorter
             _enter(w, options, memory, n, IMPLICIT, t)
             _restart(second)
             w.notes[EXPLICIT_STEP] = 0.0

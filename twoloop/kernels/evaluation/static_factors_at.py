@@ -153,7 +153,7 @@ def _squared_in_mass(f, w, x):
 
 @compiled
 def _sine(f, w, row, size):
-    """The sine of the angle of a row that does not count to those that do; `size` is its square in the metric of M^-1."""
+    """The sine of the angle of a row that does not count to those that do; `size` is g M^-1 g^T."""
     _row_as_force(f, w, row)
     solve_values(f, w, 2)
     part = _squared_in_mass(f, w, w.unknowns[: w.Q.size])

@@ -39,13 +39,11 @@ from twoloop.kernels.evaluation.static_factors_at import (
 from twoloop.kernels.evaluation.tasks import (
     ACCELERATIONS,
     EVALUATE,
-    EVALUATE_STATE,
     EVALUATE_THERE,
-    MULTIPLIERS,
     GAMMA_TASK,
     MASS_TASK,
+    MULTIPLIERS,
     POSITIONS,
-    PROJECT,
     REDUNDANT,
     RENEW,
     RESTORE,
@@ -243,7 +241,7 @@ def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     code = DONE
     if task != ACCELERATIONS:
         code = _to_constraints(f, w, t, q, v, tolerance)
-        if code != DONE or task == RESTORE or task == POSITIONS:
+        if code != DONE or task in (RESTORE, POSITIONS):
             return code
     code = _accelerate(f, w, t, q, v, a)
     if code != DONE or task == EVALUATE:
