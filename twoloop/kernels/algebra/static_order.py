@@ -78,7 +78,7 @@ class _Holds:
                 hubs = {*hubs, *self.hangs[other], *self.hangs[part]}
                 part = self.parts.join(part, other)
         self.grounded[part] = self.grounded[part] or grounded
-        self.hangs[part] |= hubs
+        self.hangs[part].update(hubs)
 
 
 def elimination_order(
@@ -107,8 +107,8 @@ def elimination_order(
         rows_of.setdefault(frozenset(bodies), []).append(i)
     joints = list(rows_of)
     joints_of: list[list[int]] = [[] for _ in range(n_q)]  # by body
-    for k, bodies in enumerate(joints):
-        for body in bodies:
+    for k, joint in enumerate(joints):
+        for body in joint:
             joints_of[body].append(k)
     hubs = {body for body in range(n_q) if len(joints_of[body]) > MOST_JOINTS}
     coordinates: dict[int, list[int]] = {}
