@@ -26,6 +26,7 @@ RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
+SHOWN = 5  # rows that depend on others, of which the equations are written out
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 
 
@@ -198,13 +199,18 @@ def redundant_rows(scaled: Array) -> list[int]:
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients."""
     others = [i for i in range(len(jacobian)) if i not in redundant]
-    first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
+    shares: Array = np.linalg.lstsq(jacobian[others].T, jacobian[redundant[:SHOWN]].T, rcond=None)[0].T
+    return equations_in_words(redundant, others, shares, np.linalg.norm(jacobian, axis=1))
+
+
+def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
+    """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
     equations = []
-    for i, factors in zip(first, np.linalg.lstsq(jacobian[others].T, jacobian[first].T, rcond=None)[0].T, strict=True):
+    for i, factors in zip(redundant, shares, strict=False):
         parts = np.abs(factors) * lengths[others]
         terms = [f"{factors[k]:.4g} row {others[k]}" for k in np.flatnonzero(parts > 1e-9 * lengths[i])]
         equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
-    more = ", ..." if len(redundant) > 5 else ""
+    more = ", ..." if len(redundant) > SHOWN else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
 
 

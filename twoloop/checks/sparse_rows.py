@@ -52,6 +52,16 @@ class SparseRows:
         assert part == slice(self.shape[0])
         return self
 
+    def part(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> Array:
+        """Some rows and columns as a full matrix."""
+        made = np.zeros((len(rows), len(columns)))
+        for k, row in enumerate(rows):
+            first, last = np.searchsorted(self.rows, [row, row + 1])  # entries are in the order of rows
+            for column, value in zip(self.columns[first:last].tolist(), self.values[first:last], strict=True):
+                if column in columns:
+                    made[k, columns.index(column)] = value
+        return made
+
     def matrix(self) -> Array:
         """The full matrix."""
         made = np.zeros(self.shape)
@@ -76,6 +86,14 @@ def is_finite(rows: Rows) -> bool:
 def largest_in_rows(rows: Rows) -> Array:
     """The largest entry of each row, its sign left out."""
     return rows.largest() if isinstance(rows, SparseRows) else np.abs(rows).max(axis=1, initial=0.0)
+
+
+def norms(rows: Rows) -> Array:
+    """The length of each row."""
+    if isinstance(rows, SparseRows):
+        return np.sqrt(np.bincount(rows.rows, rows.values**2, rows.shape[0]))
+    lengths: Array = np.linalg.norm(rows, axis=1)
+    return lengths
 
 
 def apart(rows: SparseRows) -> list[Integers]:

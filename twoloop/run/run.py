@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import (
+    SHOWN,
     dependent_rows,
+    equations_in_words,
     in_words,
     least_inertia,
     pattern_of,
 )
+from twoloop.checks.sparse_rows import norms
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.kernels.layout import copy_of
@@ -220,20 +223,32 @@ class Run:
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
         redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
-        rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+        rows, a = self.system.sparse_rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
         off = np.abs(rows @ a - self.work.Gamma)
-        allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
+        allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
         wrong = np.flatnonzero(off > allowed).tolist()
         if wrong:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
-                f"{in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
+                f"{self._in_words(wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
         return redundant, (
             f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
-            f"{in_words(rows, redundant.tolist())}. They are left out of the solution and checked at every "
+            f"{self._in_words(redundant.tolist())}. They are left out of the solution and checked at every "
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
+
+    def _in_words(self, rows: list[int]) -> str:
+        """Which rows depend on which others; the static form has found the shares when it found the multipliers."""
+        q = self.state[: self.system.n_q]
+        counted = self.work.rows_v.tolist()
+        if self.static is None or set(rows) & set(counted):
+            return in_words(self.system.rows(self.t0, q), rows)
+        n_rows = self.system.n_c
+        shares = -self.work.minimum[: (n_rows - len(counted)) * n_rows].reshape(-1, n_rows)
+        all_rows = self.system.sparse_rows(self.t0, q)
+        lengths = norms(all_rows)
+        return equations_in_words(rows, counted, shares[:SHOWN, counted], lengths)
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""
