@@ -14,6 +14,7 @@ from twoloop.kernels.data import common
 from twoloop.kernels.evaluation import tasks
 from twoloop.mechanisms import planar
 from twoloop.mechanisms.planar import GROUND
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
 from twoloop.run.static_form import static_form
@@ -338,3 +339,26 @@ def test_starts_of_large_systems(large):
         assert worst(state[1], dense[1]) < 1e-9
         assert (state.moved_q.coordinate, len(state.dependent)) == (dense.moved_q.coordinate, system.n_c)
         assert abs(state.margin - dense.margin) < 1e-6
+
+
+def test_bodies_whose_mass_matrix_is_singular(any_size, large):
+    """Four Euler parameters a body: M has rank 6 of 7, and the rows of their norms stiffen it."""
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
+        for k in range(6):
+            along = np.array([0.3, 0.1 * np.sin(k), -0.15])
+            body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
+            if k % 2:
+                bodies.spherical(before, body, at)
+            else:
+                bodies.revolute(before, body, at, (0.1 * k, 1.0, 0.2))
+            before, at = body, at + along
+        system, (q, v) = bodies.system("spatial chain"), bodies.start
+        result = solve_dae(system, (0.0, 0.1), q, v, "DOP853", 1e-9, 1e-9, compiled=False)
+        assert result.success
+        ends.append(result)
+    assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static is not None
+    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-11
+    assert worst(ends[0].lam[:, -1], ends[1].lam[:, -1]) < 1e-9 * np.abs(ends[0].lam[:, -1]).max()

@@ -199,8 +199,8 @@ def redundant_rows(scaled: Array) -> list[int]:
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients."""
     others = [i for i in range(len(jacobian)) if i not in redundant]
-    shares: Array = np.linalg.lstsq(jacobian[others].T, jacobian[redundant[:SHOWN]].T, rcond=None)[0].T
-    return equations_in_words(redundant, others, shares, np.linalg.norm(jacobian, axis=1))
+    shares = np.linalg.lstsq(jacobian[others].T, jacobian[redundant[:SHOWN]].T, rcond=None)[0].T
+    return equations_in_words(redundant, others, shares.astype(np.float64), np.linalg.norm(jacobian, axis=1))
 
 
 def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:

@@ -139,7 +139,7 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
         "factors": (static.n_factors,),
         "pivot_sizes": (n,),
         "unknowns": (n,),
-        "solutions": (3 * n,),
+        "solutions": (3 * n + n_c,),
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_c + 1,),

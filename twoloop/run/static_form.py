@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import NEARBY, pattern_of
+from twoloop.kernels.algebra.static_order import bodies_of
 from twoloop.kernels.algebra.static_program import (
     N_OFF,
     N_PIVOTS,
@@ -20,6 +21,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LARGE = 100  # coordinates from which on it is faster than the forms of saddle_point.py: measured on chains
+SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
 SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
 
 
@@ -60,12 +62,44 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
     together = [joint.translation + joint.rotation for joint in system.joints]
-    program = static_program(system.n_q, system.n_c, mass, jacobian, together)
+    stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
+    program = static_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
     if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
     return StaticForm(program, static, mass, pattern, mass_pattern)
+
+
+def _stiff_rows(
+    system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
+) -> list[int]:
+    """Rows of single bodies whose M is singular, with no entry but where M has some: see static_factors.py."""
+    values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
+    body_of = np.array(bodies_of(system.n_q, mass, together))
+    coordinates: dict[int, list[int]] = {}
+    for j, body in enumerate(body_of.tolist()):
+        coordinates.setdefault(body, []).append(j)
+    blocks: dict[int, Array] = {body: np.zeros((len(own), len(own))) for body, own in coordinates.items()}
+    place = {j: k for own in coordinates.values() for k, j in enumerate(own)}
+    there = set()
+    for i, j, value in zip(*(each.tolist() for each in (*mass, values)), strict=True):
+        blocks[int(body_of[i])][place[i], place[j]] += value
+        there.add((i, j))
+    singular = {body for body, block in blocks.items() if not _is_definite(block)}
+    columns: dict[int, list[int]] = {}
+    for i, j in zip(*(each.tolist() for each in jacobian), strict=True) if singular else ():
+        columns.setdefault(i, []).append(j)
+    return [
+        i
+        for i, own in columns.items()
+        if body_of[own[0]] in singular and all((j, k) in there for j in own for k in own)
+    ]
+
+
+def _is_definite(block: Array) -> bool:
+    values = np.linalg.eigvalsh(block) if np.isfinite(block).all() else np.zeros(1)
+    return bool(values[0] > SINGULAR * values[-1])
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:

@@ -5,6 +5,10 @@ bodies put into it, that is the sine squared of the angle between the row and th
 `smallest` is the least of these. A row that does not count has 0 in the place of 1 / pivot, which takes it out of the
 solution without another program. Solutions lose as many digits as the smallest pivot has; refined against M and G they
 have them again.
+
+Where a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with
+M + s g g^T accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need not be
+positive definite but on what such rows allow.
 """
 
 from twoloop.kernels.algebra.static_program import (
@@ -14,6 +18,7 @@ from twoloop.kernels.algebra.static_program import (
     jacobian_of,
     mass_of,
     order_of,
+    stiffened_of,
     targets_of,
 )
 from twoloop.kernels.data.common import compiled, merged
@@ -21,8 +26,34 @@ from twoloop.kernels.data.common import compiled, merged
 NOT_DEFINITE = -1.0  # what stands for the smallest pivot where one of M is not positive
 
 
+@compiled
+def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
+    """How much each row stiffens M: as much as the largest entry on its diagonal, of the rows that count."""
+    n_q = program[N_COORDINATES]
+    for k in range(program[N_PIVOTS]):
+        scratch[k] = 0.0
+    rows, columns, _ = mass_of(program)
+    for k in range(rows.size):
+        if rows[k] == columns[k]:
+            scratch[rows[k]] += mass[k]
+    _, columns, _ = jacobian_of(program)
+    which, first, second, _ = stiffened_of(program)
+    for u in range(which.size):
+        stiffness[which[u]] = 0.0
+    for u in range(which.size):
+        if first[u] == second[u]:
+            row, number = which[u], jacobian[first[u]]
+            stiffness[row] = max(stiffness[row], scratch[columns[first[u]]])
+            scratch[n_q + row] += number * number
+    for u in range(which.size):
+        row = which[u]
+        if scratch[n_q + row] > 0.0:
+            stiffness[row] *= counts[row] / scratch[n_q + row]
+            scratch[n_q + row] = 0.0
+
+
 @merged
-def load(program, mass, jacobian, values):
+def load(program, mass, jacobian, counts, values, stiffness, scratch):
     """The numbers of M and G into their slots."""
     for s in range(values.size):
         values[s] = 0.0
@@ -32,6 +63,11 @@ def load(program, mass, jacobian, values):
     _, _, slots = jacobian_of(program)
     for k in range(slots.size):
         values[slots[k]] += jacobian[k]
+    which, first, second, slots = stiffened_of(program)
+    if which.size > 0:
+        _find_stiffness(program, mass, jacobian, counts, stiffness, scratch)
+        for u in range(which.size):
+            values[slots[u]] += stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
 
 
 @compiled
@@ -81,9 +117,10 @@ def factor(program, counts, values, sizes, least):
 
 
 @compiled
-def solve(program, values, x, y):
+def solve(program, values, stiffness, x, y):
     """The solution for x = [r, c] in its place, by the factors; y is scratch."""
-    n, order = program[N_PIVOTS], order_of(program)
+    n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
+    # of M + s g g^T: the right-hand side is r + s g c, and the multiplier less by s c, so that r serves
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -97,7 +134,8 @@ def solve(program, values, x, y):
             total -= values[n + s] * y[row_of[s]]
         y[k] = total
     for k in range(n):
-        x[order[k]] = y[k]
+        i = order[k]
+        x[i] = y[k] + stiffness[i - n_q] * x[i] if i >= n_q else y[k]
 
 
 @compiled
@@ -118,7 +156,7 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 
 @compiled
-def refined(program, mass, jacobian, counts, values, x, times, right, residual, y):
+def refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
     """Solve for x = [r, c] in its place, and refine the solution so many times; the rest is scratch.
 
     Returns the largest of the last correction over the largest of the solution; 0 without any.
@@ -129,12 +167,12 @@ def refined(program, mass, jacobian, counts, values, x, times, right, residual, 
     for i in range(counts.size):
         if counts[i] == 0.0:
             x[n_q + i] = right[n_q + i] = 0.0
-    solve(program, values, x, y)
+    solve(program, values, stiffness, x, y)
     for _ in range(times):
         for k in range(x.size):
             residual[k] = right[k]
         subtract_product(program, mass, jacobian, counts, x, residual)
-        solve(program, values, residual, y)
+        solve(program, values, stiffness, residual, y)
         largest = change = 0.0
         for k in range(n_q):
             x[k] += residual[k]

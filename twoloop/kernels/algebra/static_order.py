@@ -98,7 +98,7 @@ def elimination_order(
     together : iterable of sequence of int
         Coordinates of one body each, beyond those that M couples.
     """
-    body_of = _bodies(n_q, mass_entries, together)
+    body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]
     for i, j in zip(*(each.tolist() for each in jacobian_entries), strict=True):
         touched[i].add(body_of[j])
@@ -121,7 +121,8 @@ def elimination_order(
     return np.array(order, dtype=np.int64)
 
 
-def _bodies(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
+def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
+    """Of each coordinate, the first of its body."""
     sets = _Sets(n_q)
     for i, j in zip(*(each.tolist() for each in mass_entries), strict=True):
         sets.join(i, j)

@@ -19,12 +19,17 @@ Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # rows and columns
 
 # places in the program; then what `_sections` names
-N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_OF_MASS, N_OF_JACOBIAN, N_HEAD = range(7)
+N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(8)
 MOST_UPDATES = 3_000_000  # multiplications of a program: beyond, the matrix is not sparse
 
 
 def static_program(
-    n_q: int, n_rows: int, mass: Entries, jacobian: Entries, together: Iterable[Sequence[int]] = ()
+    n_q: int,
+    n_rows: int,
+    mass: Entries,
+    jacobian: Entries,
+    together: Iterable[Sequence[int]] = (),
+    stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
     """The program for M and G with these entries; None where there would be too many updates.
 
@@ -35,6 +40,8 @@ def static_program(
         Of M, both triangles, and of G. An entry may occur more than once: the numbers are added.
     together : iterable of sequence of int
         Coordinates of one body each, as far as they are known.
+    stiff_rows : sequence of int
+        Rows g along which M is to be stiffened, by a multiple of g g^T, whose entries M has.
     """
     n = n_q + n_rows
     order = elimination_order(n_q, n_rows, mass, jacobian, together)
@@ -65,9 +72,22 @@ def static_program(
     source = slots(low, high)
     n_mass = len(mass[0])
     source[:n_mass][rows[:n_mass] < columns[:n_mass]] = n + len(keys)  # the other triangle: a slot that nobody reads
-    head = [n_q, n, len(keys), len(targets), n_mass, len(jacobian[0])]
-    parts = [order, begin, row_of, targets, *mass, source[:n_mass], *jacobian, source[n_mass:]]
+    which, first, second = _products(jacobian[0], stiff_rows)
+    one, other = (position[jacobian[1][each]] for each in (first, second))
+    stiffened = [which, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
+    head = [n_q, n, len(keys), len(targets), n_mass, len(jacobian[0]), len(which)]
+    parts = [order, begin, row_of, targets, *mass, source[:n_mass], *jacobian, source[n_mass:], *stiffened]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
+
+
+def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
+    """All products of two entries of one of these rows: the row, and where the entries are."""
+    found = [
+        (row, *(here[each] for each in _pairs(len(here)))) for row in chosen for here in [np.flatnonzero(rows == row)]
+    ]
+    made = [(np.full(len(first), row), first, second) for row, first, second in found]
+    whole = [np.concatenate([np.zeros(0, np.int64), *each]) for each in zip(*made, strict=True)]
+    return (whole[0], whole[1], whole[2]) if whole else (rows[:0], rows[:0], rows[:0])
 
 
 _PAIRS: dict[int, Entries] = {}
@@ -131,3 +151,13 @@ def jacobian_of(program):
     n = program[N_OF_JACOBIAN]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES] + 3 * program[N_OF_MASS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
+
+
+@inlined
+def stiffened_of(program):
+    """Rows, two entries of each, and slots of the products that M is stiffened by."""
+    n = program[N_STIFFENED]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
+    first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
+    middle = first + 2 * n
+    return program[first : first + n], program[first + n : middle], program[middle : middle + n], program[middle + n :]

@@ -112,7 +112,7 @@ class Work(NamedTuple):
     factors: Any
     pivot_sizes: Any  # (N)
     unknowns: Any  # (N) right-hand side and solution
-    solutions: Any  # (3 N) scratch
+    solutions: Any  # (3 N) scratch, and (n_c) what M is stiffened by along rows, see algebra/static_factors.py
 
     sizes: Any = None  # by which it was made
     address: Any = 0  # of the table by which kernels find these arrays

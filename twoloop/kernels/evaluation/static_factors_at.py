@@ -70,7 +70,8 @@ def jacobian_values_there(f, w, t, q):
 def _factor(f, w, least):
     """The factors for the values there are; the smallest pivot over its size, see static_factors.py."""
     w.counters[N_FACTORIZATIONS] += 1
-    load(f.static_program, w.mass_values, w.jacobian_values, w.factors)
+    stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
+    load(f.static_program, w.mass_values, w.jacobian_values, w.counts, w.factors, stiffness, w.pivot_sizes)
     smallest = factor(f.static_program, w.counts, w.factors, w.pivot_sizes, least)
     w.notes[SMALLEST] = smallest
     w.notes[PIVOT] = np.sqrt(max(smallest, 0.0))
@@ -116,11 +117,12 @@ def solve_values(f, w, times):
         w.jacobian_values,
         w.counts,
         w.factors,
+        scratch[3 * n :],
         w.unknowns,
         times,
         scratch[:n],
         scratch[n : 2 * n],
-        scratch[2 * n :],
+        scratch[2 * n : 3 * n],
     )
 
 
