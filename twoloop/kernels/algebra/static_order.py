@@ -87,6 +87,7 @@ def elimination_order(
     mass_entries: tuple[Integers, Integers],
     jacobian_entries: tuple[Integers, Integers],
     together: Iterable[Sequence[int]] = (),
+    first: Sequence[int] = (),
 ) -> Integers:
     """Coordinates j, and rows i as n_q + i, in the order of elimination.
 
@@ -97,14 +98,18 @@ def elimination_order(
         Of M and of G.
     together : iterable of sequence of int
         Coordinates of one body each, beyond those that M couples.
+    first : sequence of int
+        Rows of single bodies that come before all joints, but for those of hubs, so that they always count.
     """
     body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]
     for i, j in zip(*(each.tolist() for each in jacobian_entries), strict=True):
         touched[i].add(body_of[j])
+    early = set(first)
     rows_of: dict[frozenset[int], list[int]] = {}
     for i, bodies in enumerate(touched):
-        rows_of.setdefault(frozenset(bodies), []).append(i)
+        if i not in early:
+            rows_of.setdefault(frozenset(bodies), []).append(i)
     joints = list(rows_of)
     joints_of: list[list[int]] = [[] for _ in range(n_q)]  # by body
     for k, joint in enumerate(joints):
@@ -115,9 +120,12 @@ def elimination_order(
     for j, body in enumerate(body_of):
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
+    order += [n_q + i for i in first if not touched[i] & hubs]
+    late = [n_q + i for i in first if touched[i] & hubs]
     nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
     for node in _minimum_degree(joints, joints_of, sorted(hubs), [len(node) for node in nodes], n_q):
         order += nodes[node]
+    order += late
     return np.array(order, dtype=np.int64)
 
 

@@ -44,7 +44,7 @@ def static_program(
         Rows g along which M is to be stiffened, by a multiple of g g^T, whose entries M has.
     """
     n = n_q + n_rows
-    order = elimination_order(n_q, n_rows, mass, jacobian, together)
+    order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
     rows = np.concatenate([position[mass[0]], position[n_q + jacobian[0]]])
@@ -82,12 +82,15 @@ def static_program(
 
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
     """All products of two entries of one of these rows: the row, and where the entries are."""
-    found = [
-        (row, *(here[each] for each in _pairs(len(here)))) for row in chosen for here in [np.flatnonzero(rows == row)]
-    ]
-    made = [(np.full(len(first), row), first, second) for row, first, second in found]
-    whole = [np.concatenate([np.zeros(0, np.int64), *each]) for each in zip(*made, strict=True)]
-    return (whole[0], whole[1], whole[2]) if whole else (rows[:0], rows[:0], rows[:0])
+    parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
+    where = np.argsort(rows, kind="stable")
+    ordered = rows[where]
+    for row in chosen:
+        here = where[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
+        one, other = _pairs(len(here))
+        parts.append((np.full(len(one), row), here[one], here[other]))
+    which, first, second = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return which, first, second
 
 
 _PAIRS: dict[int, Entries] = {}
