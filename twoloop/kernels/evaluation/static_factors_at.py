@@ -32,7 +32,7 @@ SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a r
 LEAST = 1e-10  # ... and one below this share no factors with pivots of one row can do with
 DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
 MOST_REDUNDANT = 64  # rows: each takes a solution at every state, for multipliers of least norm
-ONCE, TWICE = 1e-4, 1e-7  # the smallest share, below which solutions are refined, and refined again
+ONCE, TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
 
 
 @compiled
