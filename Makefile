@@ -68,7 +68,7 @@ compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation; \
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, diagonal_step, explicit_step, \
-	fixed_point_step, newmark_step; \
+	fixed_point_step, newmark_step; from twoloop.kernels.evaluation import static_inner; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor" && wait $$! && \
 	$(RUN) -c "import twoloop.kernels.control.switching"
 

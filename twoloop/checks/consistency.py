@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack, null_space
 
 from twoloop.checks.bounds import check_bounds
-from twoloop.checks.derivatives import UNSYMMETRIC, check_derivatives, unsymmetric_mass
+from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
 from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
+from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
+from twoloop.checks.values import UNSYMMETRIC, unsymmetric_mass
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
 
@@ -28,6 +30,7 @@ NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+LARGE = 100  # coordinates from which on rows are looked at by their entries, where these are given
 LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel takes them
 
 
@@ -59,36 +62,38 @@ def check_start(
         if derivatives:
             check_derivatives(system, t0, q0, exact)
         return
-    jacobian = system.jacobian(t0, q0)
-    rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
+    rows = system.sparse_rows(t0, q0)
+    jacobian = rows[: system.n_c]
     reason = not_finite(system, t0, q0, v0)
     if reason is not None:
         raise ValueError(f"at the start, t = {t0:g}, {reason}")
     unsymmetric = unsymmetric_mass(system, t0, q0)
     if unsymmetric is not None:
         raise ValueError(unsymmetric)
-    if not _at_rounding(system.constraint(t0, q0), jacobian, q0):
-        scales = scales_of(system, t0, q0, jacobian)
-        Violation.of_position(system, t0, q0, jacobian, scales).refuse("q0")
+    if not is_at_rounding(system.constraint(t0, q0), jacobian, q0):
+        full = system.jacobian(t0, q0)
+        scales = scales_of(system, t0, q0, full)
+        Violation.of_position(system, t0, q0, full, scales).refuse("q0")
     if derivatives:
         check_derivatives(system, t0, q0, exact)
-    empty = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) == 0.0).tolist()
+    empty = np.flatnonzero(largest_in_rows(rows) == 0.0).tolist()
     if empty:
         raise ValueError(
             f"row(s) {empty} of the constraint Jacobian of {system.name!r} are zero at t = {t0:g}: they hold nothing "
             "there. Leave these constraints out, or start from another position"
         )
     rate = system.rates(t0, q0)
-    if not _at_rounding(rows @ v0 + rate, rows, v0, rate):
-        scales = scales_of(system, t0, q0, rows)
-        Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
+    if not is_at_rounding(rows @ v0 + rate, rows, v0, rate):
+        full = system.rows(t0, q0)
+        scales = scales_of(system, t0, q0, full)
+        Violation.of_velocity(system, t0, q0, v0, full, scales).refuse("v0")
 
 
 def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
     from twoloop.kernels.evaluation import first_look
 
-    if system.called_in_python:
+    if system.called_in_python or (system.n_q >= LARGE and system.entries):
         return False
     q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
     n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
@@ -146,9 +151,15 @@ def _surely_consistent(
     return bool(times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min())
 
 
-def _at_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> bool:
-    """Whether values are no more than rounding of their terms, which needs no scales to be accepted."""
-    return bool((np.abs(values) <= ROUNDING * EPS * (np.abs(rows) @ np.abs(state) + np.abs(rate))).all())
+def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
+    """Whether values are no more than rounding of their terms, which needs no scales to be accepted.
+
+    For rows by their entries, whose scales take full matrices, of entries as well, as large as the largest of a row.
+    """
+    if isinstance(rows, SparseRows):
+        terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
+        return bool((np.abs(values) <= ROUNDING * EPS * terms).all())
+    return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
 
 
 class Violation:
@@ -316,6 +327,7 @@ def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
 def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
     """Which callbacks give values that are not finite at (t, q, v); None: all are."""
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
-    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in system.given}
+    looked = [kind for kind in system.given if kind not in system.entries]  # whose values are looked at
+    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in looked}
     wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in _parts(value))]
     return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None

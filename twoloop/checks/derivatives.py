@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
 from twoloop.checks.scales import column_scales, generic_factors, median, sizes
+from twoloop.checks.sparse_rows import Rows, SparseRows, apart, is_finite
+from twoloop.checks.values import check_values, unsymmetric_mass
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
@@ -30,13 +32,13 @@ TIME = 0.1  # s: first guess at how fast constraints move
 NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
-UNSYMMETRIC = 1e-10  # of the largest entry of M
 SAME = 1e-11  # relative: values that two callbacks must share ...
 ROUNDED = 100.0  # ... and times rounding of the terms of a constraint
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 WHAT = {
     "jacobian": "the derivative of constraint with respect to q",
+    "jacobian_values": "the entries of the derivative of constraint with respect to q, zero where none is named",
     "constraint_rate": "the derivative of constraint with respect to t",
     "gamma": "-((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = gamma",
     "nonholonomic_gamma": "-((A v)_q v + A_t v + b_q v + b_t), the right-hand side of A a = nonholonomic_gamma",
@@ -75,6 +77,8 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
     _check_constant_mass(system, t, q)
     if system.bandwidth is not None:
         _check_bandwidth(system, system.bandwidth, t, q)
+    near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
+    check_values(system, t, q if _defined(lambda: system.constraint(t, near)) is None else near)
     system.checked = True
 
 
@@ -89,20 +93,20 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     unsymmetric = None if system.constant_mass else unsymmetric_mass(system, t, q)
     if unsymmetric is not None:
         return unsymmetric
-    jacobian, rate = system.rows(t, q), system.rates(t, q)
-    if jacobian.size == 0 or not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+    jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
+    if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     n_c = system.n_c
     generic = _generic_velocities(jacobian, rate, q)[-1]
     generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
     scale = min(TIME, _time_scale(q, generic))
-    noise = EPS * (np.abs(jacobian) @ np.abs(q))[:n_c]
+    noise = EPS * (abs(jacobian) @ np.abs(q))[:n_c]
     given = (jacobian @ generic + rate)[:n_c]
     spacing = _spacing(t, q, generic)
     suspicious = False
     if n_c > 0:
         found = _along_a_run(_along(system, t, q, generic), scale, noise, given, spacing)
-        suspicious = found.disagrees(given, EPS * (np.abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
+        suspicious = found.disagrees(given, EPS * (abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
     for kind, rows in _gammas(system):
         if suspicious:
             break
@@ -110,7 +114,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
         if right is None:
             return None
         given = -right
-        noise = EPS * (np.abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
+        noise = EPS * (abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
         rate_along = _along_a_line(system, t, q, generic, rows)
         found = _along_a_run(rate_along, scale, noise, given, spacing)
         suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
@@ -175,15 +179,15 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
     wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
     if wrong is not None:
         return wrong
-    jacobian, rate = system.rows(t, q), system.rates(t, q)
-    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+    jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
+    if not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     for kind, rows in _gammas(system):
         for v in _generic_velocities(jacobian, rate, q):
             given = _defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
             if given is None:
                 continue
-            noise = EPS * (np.abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
+            noise = EPS * (abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
             rounding = _rounding(lambda x, kind=kind, v=v: system.evaluate(kind, t, x, v), given, q)  # type: ignore[misc]
             turned = _minus(_along_a_line(system, t, q, v, rows))
             compared = _Comparison(system, kind, t, turned, 0.0, given, spacing=_spacing(t, q, v))
@@ -191,19 +195,6 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
             if wrong is not None:
                 return wrong
     return None
-
-
-def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Say which entry of M is not that of its transpose, or None."""
-    mass = system.mass(t, q)
-    off = np.abs(mass - mass.T)
-    if not off.max() > UNSYMMETRIC * np.abs(mass).max():
-        return None
-    i, j = sorted(int(each) for each in np.unravel_index(int(off.argmax()), off.shape))
-    return (
-        f"mass of {system.name!r} must be symmetric; at t = {t:.10g} its entry {(i, j)} is {mass[i, j]:.9g} and its "
-        f"entry {(j, i)} is {mass[j, i]:.9g}"
-    )
 
 
 def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
@@ -225,13 +216,17 @@ def _gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
 
 def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
     """Which entry of C_q or C_t is wrong."""
-    jacobian, rate = system.jacobian(t, q), system.constraint_rate(t, q)
-    if not (np.isfinite(jacobian).all() and np.isfinite(rate).all()):
+    jacobian, rate = system.sparse_rows(t, q)[: system.n_c], system.constraint_rate(t, q)
+    if not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None  # outside what they are made for; at a state of the run consistency.py names it
-    wrong = _wrong_column(system, "jacobian", t, q, lambda x: system.constraint(t, x), lambda x: system.jacobian(t, x))
+    if isinstance(jacobian, SparseRows):
+        wrong = _wrong_group(system, t, q, jacobian)
+    else:
+        parts = (lambda x: system.constraint(t, x), lambda x: system.jacobian(t, x))
+        wrong = _wrong_column(system, "jacobian", t, q, *parts)
     if wrong is not None:
         return wrong
-    noise = EPS * (np.abs(jacobian) @ np.abs(q))
+    noise = EPS * (abs(jacobian) @ np.abs(q))
     rounding = _rounding(lambda x: system.constraint_rate(t, x), rate, q)
     in_t = _Comparison(system, "constraint_rate", t, lambda s: system.constraint(t + s, q), t, rate)
     return in_t.wrong(TIME, noise, np.abs(rate), rounding, sides)
@@ -310,6 +305,38 @@ def _wrong_column(
     return None
 
 
+def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: SparseRows) -> str | None:
+    """The same for C_q by its entries: columns that share no row are displaced together, each by its own scale.
+
+    A group in which something is wrong is looked at column by column, to name the entry. So is one that hides an entry
+    which is not named: it adds to another column, or stands where there should be nothing.
+    """
+    noise = EPS * (abs(jacobian) @ np.abs(q))
+    scales, largest = sizes(q), jacobian.largest()
+    unit = float(np.median(scales))
+
+    def full(x: Array) -> Array:
+        rows = system.sparse_rows(t, x)
+        return rows.matrix() if isinstance(rows, SparseRows) else rows
+
+    def product(way: Array) -> Array:
+        return _rounding(lambda x: system.sparse_rows(t, x) @ way, jacobian @ way, q)
+
+    for group in apart(jacobian):
+        way = np.zeros(len(q))
+        way[group] = scales[group] / unit
+
+        def displaced(shift: float, way: Array = way) -> Array:
+            return system.constraint(t, q + shift * way)
+
+        given = jacobian @ way
+        place = float(np.abs(q[group] / way[group]).max())
+        compared = _Comparison(system, "jacobian", t, displaced, 0.0, given, spacing=float(np.spacing(place)))
+        if compared.wrong(unit, noise, np.maximum(largest, np.abs(given)), product(way), ANYWHERE) is not None:
+            return _wrong_column(system, "jacobian_values", t, q, lambda x: system.constraint(t, x), full)
+    return None
+
+
 def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> Array:
     """What rounding of the arguments does to the values given."""
     largest = EPS * np.abs(given)
@@ -322,12 +349,12 @@ def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> A
     return largest
 
 
-def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
+def _generic_velocities(jacobian: Rows, rate: Array, q: Array) -> list[Array]:
     """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
     size = sizes(q)
     v = column_scales(jacobian, size) * generic_factors(len(q))
     v = v / median(np.abs(v) / size)
-    driven, moved = rate != 0.0, np.abs(jacobian) @ np.abs(v)
+    driven, moved = rate != 0.0, abs(jacobian) @ np.abs(v)
     if not (driven & (moved > 0.0)).any():
         return [v]
     faster = float(np.median(np.abs(rate[driven & (moved > 0.0)]) / moved[driven & (moved > 0.0)]))
@@ -364,7 +391,8 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
         return
     from twoloop.kernels.evaluation.first_look import kinematics_agree
 
-    v = _generic_velocities(system.jacobian(t, q), system.constraint_rate(t, q), q)[-1]
+    rows = system.sparse_rows(t, q)[: system.n_c]
+    v = _generic_velocities(rows, system.constraint_rate(t, q), q)[-1]
     for place in (q, q + NEAR_START * v):
         room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
         if direct(kinematics_agree)(system.kit, t, np.ascontiguousarray(place), v, *room, SAME, ROUNDED * EPS):
@@ -393,8 +421,9 @@ def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
     if not system.constant_mass:
         return
     shift = 0.1 * sizes(q) * np.sign(generic_factors(system.n_q))
-    there = _defined(lambda: system.mass(t + 1.0, q + shift))
-    if there is not None and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
+    mass = system.mass_values if "mass" in system.entries else system.mass
+    there = _defined(lambda: mass(t + 1.0, q + shift))
+    if there is not None and np.abs(there - mass(t, q)).max() > 1e-10 * np.abs(there).max():
         raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
 
 

@@ -9,6 +9,7 @@ from twoloop.kernels.compile.linking import direct
 Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
+SHOWN = 5  # rows that depend on others, of which the equations are written out
 MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
 NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
 
@@ -56,9 +57,14 @@ def redundant_rows(scaled: Array) -> list[int]:
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
     others = [i for i in range(len(jacobian)) if i not in redundant]
-    first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
+    shares = _combinations(jacobian[others], jacobian[redundant[:SHOWN]])
+    return equations_in_words(redundant, others, shares, np.linalg.norm(jacobian, axis=1))
+
+
+def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
+    """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
     equations = []
-    for i, factors in zip(first, _combinations(jacobian[others], jacobian[first]), strict=True):
+    for i, factors in zip(redundant, shares, strict=False):
         parts = np.abs(factors) * lengths[others]
         of = np.flatnonzero(parts > 1e-9 * lengths[i])
         if len(of) > MOST_TERMS:
@@ -68,7 +74,7 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
             continue
         terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
         equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
-    more = ", ..." if len(redundant) > 5 else ""
+    more = ", ..." if len(redundant) > SHOWN else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
 
 

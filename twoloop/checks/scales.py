@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.linking import direct
 
 if TYPE_CHECKING:
@@ -70,16 +71,35 @@ def _middle(ordered: Array) -> float:
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
-def column_scales(jacobian: Array, typical: Array) -> Array:
+def column_scales(jacobian: Rows, typical: Array) -> Array:
     """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the typical ones."""
     from twoloop.kernels.algebra.scaling import like_sizes
 
+    if isinstance(jacobian, SparseRows):
+        return _sparse_column_scales(jacobian, typical)
     n_rows, n = jacobian.shape
     columns, room = np.zeros((2, n))
     direct(like_sizes)(
         np.ascontiguousarray(jacobian), typical, columns, *np.zeros((2, n_rows, n)), np.zeros(n_rows), room
     )
     return columns
+
+
+def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
+    """The same from the entries alone."""
+    size, (m, n) = np.abs(jacobian.values), jacobian.shape
+    counts = size > 1e-12 * jacobian.largest()[jacobian.rows]
+    i, j, logs = jacobian.rows[counts], jacobian.columns[counts], np.log(size[counts])
+    used = np.bincount(j, minlength=n) > 0
+    if not used.any():
+        return typical
+    in_row, in_column = np.maximum(np.bincount(i, minlength=m), 1), np.maximum(np.bincount(j, minlength=n), 1)
+    columns = np.zeros(n)
+    for _ in range(20):
+        rows = np.bincount(i, logs + columns[j], m) / in_row
+        columns = np.bincount(j, rows[i] - logs, n) / in_column
+    columns = np.exp(columns + median(np.log(typical[used]) - columns[used]))
+    return np.where(used, columns, typical)
 
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:

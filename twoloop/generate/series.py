@@ -23,6 +23,8 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
+MOST_ENTRIES = 200_000  # of M and C_q, above which no series is looked for unless asked for
+
 READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 MOST = 20_000  # operations; with more the program would take longer to make than a run
 
@@ -114,6 +116,11 @@ class SeriesProgram:
     def n_nodes(self) -> int:
         """Number of quantities."""
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
+
+
+def is_quick(system: ConstrainedSystem) -> bool:
+    """Whether a series is found in a second or so: what is traced are full matrices."""
+    return system.n_q * (system.n_q + system.n_c + system.n_a) <= MOST_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:

@@ -37,6 +37,7 @@ from twoloop.kernels.data.common import (
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
     NEARLY_SINGULAR,
+    NEEDS_DENSE,
     NOT_FINITE,
     NULL_SPACE,
     ORIENTATION,
@@ -44,6 +45,7 @@ from twoloop.kernels.data.common import (
     PIVOT,
     SENSITIVITY,
     SINGULAR,
+    STATIC,
     STRAIGHT,
     UNCHECKED,
     VECTOR,
@@ -78,11 +80,13 @@ from twoloop.kernels.evaluation.partition import CHANGED, partition_is_poor
     NEAR_SINGULAR,
     HAS_TO_GIVE_WAY,
     AT_JUMP,  # of C_t or b; the caller is to put the state beyond it into new_state
-) = range(10)
+    HAS_TO_BE_DENSE,  # the static form cannot decide what it was asked
+) = range(11)
 GO_ON = -1  # nothing of these yet
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
+STATIC_SINGULAR = 0.01  # of the largest: the smallest sine of a row, below which the static form is not relied on
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
 FADING = 0.98  # of the longest step, with each accepted one
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
@@ -253,6 +257,8 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
+    if code == NEEDS_DENSE:
+        return HAS_TO_BE_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
     clock[FAILURE_CODE] = code
     clock[H_FAILED] = size
@@ -268,7 +274,7 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
         clock[LIMIT_AGE] = 0.0
         clock[H_NEXT] = 0.5 * size
     if poor and renew_partition(f, w, t, state[:n]) != DONE:
-        return RANK_LOST
+        return HAS_TO_BE_DENSE if f.flags[FORM] == STATIC else RANK_LOST
     return GO_ON
 
 
@@ -307,6 +313,9 @@ def _look_at_partition(f, w, control, clock, size, lands, state):
 
     The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
     """
+    if f.flags[FORM] == STATIC:
+        clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+        return HAS_TO_BE_DENSE if w.notes[PIVOT] < STATIC_SINGULAR * clock[LARGEST_PIVOT] else GO_ON
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
     every = 1

@@ -18,7 +18,17 @@ MOST_FREE, LARGEST_FREE = 32, 100_000  # workspaces that wait for their next run
 WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin
 
 
-Sizes = tuple[int, int, int, int, int, bool, bool, int]
+class Static(NamedTuple):
+    """What the static form needs beside the sizes of a system."""
+
+    n_factors: int
+    n_mass_values: int
+    n_jacobian_values: int
+    dense_mass: bool  # whether M, or C_q, is filled as a matrix, from which the values are taken
+    dense_jacobian: bool
+
+
+Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None]
 Places = list[tuple[str, int, int, tuple[int, ...]]]  # of arrays in a piece of memory: name, begin, end, shape
 
 
@@ -47,6 +57,7 @@ def make_work(
     reduced: bool = True,
     augmented: bool = False,
     n_nodes: int = 0,
+    static: Static | None = None,
 ) -> Work:
     """The workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a.
 
@@ -54,14 +65,14 @@ def make_work(
     """
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
-    sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes)
+    sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes, static)
     given_back = _given_back(sizes)
     return _new(sizes) if given_back is None else _cleared(given_back)
 
 
 def copy_of(work: Work) -> Work:
     """A workspace with the same in it."""
-    sizes = _sizes(work)
+    sizes = work.sizes
     other = _given_back(sizes) or _new(sizes)
     other.notes.base[:] = work.notes.base
     other.counters.base[:] = work.counters.base
@@ -83,30 +94,16 @@ def _new(sizes: Sizes) -> Work:
     arrays |= {name: integers[a:b].reshape(shape) for name, a, b, shape in layout.integers}
     arrays["G_of_S"][:] = np.nan
     table = layout.table + layout.of_numbers * numbers.ctypes.data + layout.of_integers * integers.ctypes.data
-    return Work(**arrays, table=table, address=table.ctypes.data)
+    return Work(**arrays, sizes=sizes, table=table, address=table.ctypes.data)
 
 
 def give_back(work: Work) -> None:
     """Let the next run of the same sizes have this workspace, of which nothing is used any more."""
     if work.notes.base.size <= LARGEST_FREE and sum(map(len, list(_free.values()))) < MOST_FREE:
-        _free.setdefault(_sizes(work), []).append(work)
+        _free.setdefault(work.sizes, []).append(work)
 
 
 _free: dict[Sizes, list[Work]] = {}  # those that were given back
-
-
-def _sizes(work: Work) -> Sizes:
-    n_q, n_c = work.Q.size, work.C.size
-    return (
-        n_q,
-        n_c,
-        work.Rate.size - n_c,
-        work.rows.size,
-        work.rows_v.size,
-        work.A.size > 0,
-        work.right.size > 0,
-        work.nodes.size,
-    )
 
 
 def _cleared(work: Work) -> Work:
@@ -116,8 +113,47 @@ def _cleared(work: Work) -> Work:
     return work
 
 
+def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
+    """Shapes of numbers and integers that the static form changes: no partition, no matrix that it can do without.
+
+    All coordinates stand for the dependent ones, whose predictions are compared, and for the independent ones.
+    """
+    n, n_redundant = n_q + n_c, n_c - rank
+    n_rows = n_c if static.dense_jacobian else 0
+    side = n_q if static.dense_mass else 0
+    matrices = dict.fromkeys(("L", "S", "W", "A", "MT", "Gx", "G_of_S"), (0, 0))
+    nothing = dict.fromkeys(("values", "values_v", "values_a", "right"), (0,))
+    numbers: dict[str, tuple[int, ...]] = {
+        "augmented": ((n_rows + 1) * n_q * static.dense_jacobian + side * side,),
+        **matrices,
+        **nothing,
+        "D": (n_q + 1, 0),
+        "pattern": (n_rows, n_q),
+        "mass_pattern": (side, side),
+        "z": (n_c,),
+        "minimum": (n_redundant * (n_c + n_redundant + 1),),
+        "predicted": (n_q,),
+        "mass_values": (static.n_mass_values,),
+        "jacobian_values": (static.n_jacobian_values,),
+        "counts": (n_c,),
+        "factors": (static.n_factors,),
+        "pivot_sizes": (n,),
+        "unknowns": (n,),
+        "solutions": (3 * n + n_c,),
+    }
+    integers: dict[str, tuple[int, ...]] = {
+        "places": (n_c + 1,),
+        **{"rows": (rank,), "dependent": (n_q,), "independent": (n_q,), "index": (index_size(0),)},
+        **dict.fromkeys(("rows_v", "dependent_v", "independent_v"), (0,)),  # those of positions
+        **dict.fromkeys(("index_v", "index_a"), (index_size(0),)),
+    }
+    return numbers, integers
+
+
 @cache
-def _layout(n_q: int, n_c: int, n_a: int, r: int, r_v: int, reduced: bool, augmented: bool, n_nodes: int) -> Layout:
+def _layout(
+    n_q: int, n_c: int, n_a: int, r: int, r_v: int, reduced: bool, augmented: bool, n_nodes: int, static: Static | None
+) -> Layout:
     n_rows = n_c + n_a
     n_redundant = n_rows - r_v
     n_dof = n_q - r_v if reduced else 0
@@ -149,6 +185,8 @@ def _layout(n_q: int, n_c: int, n_a: int, r: int, r_v: int, reduced: bool, augme
         "predicted": (r,),
         "notes": (N_NOTES,),
         "nodes": (n_nodes,),
+        **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
+        **dict.fromkeys(("unknowns", "solutions"), (0,)),
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_rows + 1 + n_rows * n_q,),
@@ -160,10 +198,17 @@ def _layout(n_q: int, n_c: int, n_a: int, r: int, r_v: int, reduced: bool, augme
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
     }
+    rows_of_G, side = n_rows + 1, n_q
+    if static is not None:
+        changed = _of_static_form(n_q, n_c, r, static)
+        numbers |= changed[0]
+        integers |= changed[1]
+        rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
+        n_entries = rows_of_G * n_q
     of_numbers, n_numbers = _placed(numbers)
     of_integers, n_integers = _placed(integers)
-    of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (n_rows + 1, n_q))
-    of_numbers["M"] = n_entries, n_entries + n_q * n_q, (n_q, n_q)
+    of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
+    of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]
         for name in ("rows", "dependent", "independent", "index"):

@@ -29,6 +29,7 @@ DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
 WIDTH = 9  # numbers of a joint
 GROUND = -1
+LARGE = 100  # coordinates from which on the values of entries serve
 
 
 @helper
@@ -164,6 +165,56 @@ def kinematics(t, q, v, p, C, Cq, Ct, Qd):
             Qd[row] = (bu - au) * (au - bu) + (bv - av) * (av - bv) + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
 
 
+@callback("mass_values")
+def mass_values(t, q, p, values):
+    for body in range(int(p[0])):
+        values[3 * body] = values[3 * body + 1] = p[3 + 2 * body]
+        values[3 * body + 2] = p[4 + 2 * body]
+
+
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    first, place_of = 3 + 2 * int(p[0]), 0
+    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+        i, j = int(p[k + 2]), int(p[k + 5])
+        if p[k] == COORDINATE:
+            values[place_of] = 1.0
+            place_of += 1
+            continue
+        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        fx, fy = ax - bx, ay - by
+        for body, sign, dx, dy in ((i, 1.0, adx, ady), (j, -1.0, bdx, bdy)):
+            if body < 0:
+                continue
+            if p[k] == PIN:
+                values[place_of], values[place_of + 1] = sign, sign * dx
+                values[place_of + 2], values[place_of + 3] = sign, sign * dy
+                place_of += 4
+            else:
+                values[place_of], values[place_of + 1] = sign * fx, sign * fy
+                values[place_of + 2] = sign * (fx * dx + fy * dy)
+                place_of += 3
+
+
+def jacobian_entries(joints: Sequence[Sequence[float]]) -> tuple[list[int], list[int]]:
+    """Rows and columns of what `jacobian_values` gives, in its order."""
+    rows, columns = [], []
+    for kind, first, i, _, _, j, *_ in joints:
+        row = int(first)
+        if kind == COORDINATE:
+            rows.append(row)
+            columns.append(int(i))
+            continue
+        for body in (int(i), int(j)):
+            if body == GROUND:
+                continue
+            x, y, angle = range(3 * body, 3 * body + 3)
+            rows += [row, row, row + 1, row + 1] if kind == PIN else [row] * 3
+            columns += [x, angle, y, angle] if kind == PIN else [x, y, angle]
+    return rows, columns
+
+
 @dataclass(frozen=True, eq=False)
 class Energy:
     """Kinetic energy and potential of the weight, J, of one state or of many."""
@@ -240,8 +291,18 @@ class PlanarBodies:
         bodies = np.column_stack([self.masses, self.inertias])
         sizes = [len(bodies), len(self._joints), self.gravity]
         moves = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
+        n_q = 3 * len(bodies)
+        values: dict[str, Any] = {}
+        if n_q >= LARGE:
+            values = {
+                "mass_values": mass_values,
+                "mass_entries": (range(n_q), range(n_q)),
+                "jacobian_values": jacobian_values,
+                "jacobian_entries": jacobian_entries(self._joints),
+            }
         return ConstrainedSystem(
-            n_q=3 * len(bodies),
+            **values,
+            n_q=n_q,
             n_c=self.n_c,
             mass=mass,
             force=force,

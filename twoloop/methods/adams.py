@@ -69,6 +69,7 @@ class Adams:
             kernels.ADAMS,
             np.array([LARGEST_MOVE]),
             np.zeros(kernels.memory_size(n_q)),
+            projects=True,
             exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
         )

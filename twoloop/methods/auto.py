@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+from twoloop.generate.series import is_quick
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.kernels.compile.caches import Newest
@@ -14,6 +15,7 @@ MANY = 16  # coordinates from which on evaluations cost more than the algebra of
 CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
 TIGHT_MANY = 1e-10  # ... or the tolerance is below this ...
 VERY_MANY = 64  # ... or there are so many coordinates
+HUGE = 1000  # coordinates above which Newton's method, whose matrices are full, is not tried
 LONG_STEPS = 1e-9  # tolerance whose rule holds at looser ones, too, for runs of few steps
 SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... up to so many operations a coordinate ...
@@ -93,6 +95,9 @@ class Auto:
     matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-9, else `tight`. It is left the same way. Counts
     decide, not times: a run can be repeated.
 
+    Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
+    more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does).
+
     While the implicit method runs, errors of positions are within the tolerances; those of velocities are tested
     for what they will make of the positions before they turn back or decay.
     With constant steps it is `fixed` throughout.
@@ -134,7 +139,8 @@ class Auto:
         chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
         if code is not None and isinstance(self.few, DOP853):
             chosen = replace(chosen, few=self.few.for_system(system, code))
-        if self.series is None or (code is None and system.called_in_python):
+        plain = code is None and (system.called_in_python or not is_quick(system))
+        if self.series is None or plain:
             return replace(chosen, series=None)
         try:
             return replace(chosen, series=self.series.for_system(system, code, check))
@@ -190,4 +196,6 @@ class Auto:
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (few, LIMIT_FEW, LOOKS_FEW)
         if explicit is few and n_q >= MANY:  # whose evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1
+        if n_q > HUGE:
+            return explicit.plan(n_q, rtol, atol, False)
         return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks, dearer)

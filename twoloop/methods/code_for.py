@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import shown
-from twoloop.generate.series import series_for
+from twoloop.generate.series import is_quick, series_for
 from twoloop.generate.straight_code import OwnCode, own_code
 from twoloop.generate.traced_values import Check
 from twoloop.generate.tracing import Untraceable
@@ -69,6 +69,8 @@ def is_small(system: ConstrainedSystem) -> bool:
 
 
 def _is_small(system: ConstrainedSystem) -> bool:
+    if not is_quick(system):
+        return False
     try:
         return series_for(system).n_operations <= SMALL
     except Untraceable:

@@ -100,6 +100,7 @@ class DOP853:
             exponent=1.0 / 8.0,
             safety=SAFETY,
             watchful=free,
+            projects=free,
             least_error=LEAST_ERROR if free else 0.0,
             rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,

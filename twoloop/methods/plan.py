@@ -41,6 +41,7 @@ class Plan:
     rough: float = 1.0  # how many times less than its error the estimate of a step may be where a force jumps
     reuse: float = 0.0  # correction of a position up to which the Jacobian before it serves, within a step
     watchful: bool = False  # whether short steps are a reason to look how near a singular position is
+    projects: bool = False  # whether its steps ask for accelerations as a state stands and for the way back alone
     lands: bool = False  # whether steps are shortened to end at output times
     apart: bool = False  # whether errors of q and v are independent, so that the slope of q between steps is not v
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py

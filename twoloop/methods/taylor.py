@@ -131,6 +131,7 @@ class Taylor:
             safety=1.0,
             factor_max=taylor.GROWTH,
             watchful=True,
+            projects=True,
             looks_within=True,
             parts=min(max(highest // 3, FEWEST), MOST),
             traced=(program.traced,),

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_flag, check_number, check_real, check_size, shown
+from twoloop.checks.arguments import check_flag, check_number, check_real, check_size
 from twoloop.checks.bounds import check_callback
-from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
+from twoloop.checks.sparse_rows import Rows, SparseRows
+from twoloop.kernels.compile.callbacks import KINDS, STATE
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions, Kit
 from twoloop.problem.adapters import (
@@ -24,7 +25,8 @@ from twoloop.problem.adapters import (
     through_python,
 )
 from twoloop.problem.description import Description
-from twoloop.problem.jacobian import differenced_jacobian
+from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
+from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of
 from twoloop.problem.joints import Joint, check_joints
 from twoloop.problem.pickling import packed, unpacked
 from twoloop.problem.system_methods import add_callbacks
@@ -53,6 +55,9 @@ class ConstrainedSystem:
         The vector `p` that every callback gets. It stays as it is: `with_parameters` makes a system of others.
     constant_mass : bool
         True: M depends neither on t nor on q, and is factored once.
+    mass_entries, jacobian_entries : (rows, columns), optional
+        Where the entries are that `mass_values` and `jacobian_values` give: two vectors of int each, of M for both
+        triangles. All others are zero at every state. Values of an entry that is named twice are added.
     bandwidth : int, optional
         No entry (i, j) with |i - j| > bandwidth is other than zero in M, in the derivatives of the force by q and v,
         and in the second derivatives of each constraint by q; C_q itself may be full. With it the cost of a step of a
@@ -86,6 +91,8 @@ class ConstrainedSystem:
         n_a: int = 0,
         parameters: ArrayLike = (),
         constant_mass: bool = False,
+        mass_entries: Any = None,
+        jacobian_entries: Any = None,
         bandwidth: int | None = None,
         joints: Sequence[Joint] = (),
         name: str = "system",
@@ -93,10 +100,11 @@ class ConstrainedSystem:
     ):
         self.n_q = check_size("n_q", n_q, 1)
         self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
+        self.entries = checked_entries(callbacks, self.n_q, self.n_c, mass_entries, jacobian_entries)
         self.name = name
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
         self.description = Description()  # a Problem puts its own in its place
-        p = _checked_parameters(parameters)
+        p = checked_parameters(parameters)
         if not isinstance(constant_mass, (bool, np.bool_)):
             raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
         self.constant_mass = bool(constant_mass)
@@ -105,7 +113,8 @@ class ConstrainedSystem:
             raise ValueError(
                 f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
             )
-        self.given = _given(callbacks, self.n_c, self.n_a)
+        self.given = given_callbacks(callbacks, self.n_c, self.n_a)
+        self.scattered: frozenset[str] = frozenset()  # dense kinds made of their values
         for kind, function in self.given.items():
             entry = KINDS[kind]
             if not isinstance(function, Dispatcher) or entry.signature.args not in function.overloads:
@@ -114,13 +123,14 @@ class ConstrainedSystem:
                     f"({', '.join(entry.arguments)}); given {function!r}. Plain Python functions enter by "
                     "ConstrainedSystem.from_python"
                 )
+        self._scatter()
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
-        all_callbacks = {kind: self.given.get(kind) or _in_place_of(kind, self.given) for kind in KINDS}
+        all_callbacks = {kind: self.given.get(kind) or in_place_of(kind, self.given) for kind in KINDS}
         none = (np.zeros(0, np.int64), np.zeros(0))
-        programs = dict(zip(PROGRAMS, 2 * none, strict=True))
+        programs = dict(zip(PROGRAMS, (*none, *none, np.zeros(0, np.int32)), strict=True))
         self.functions: Any = Functions(**all_callbacks, p=p, flags=flags, **programs)  # type: ignore[call-arg]
         self._python: PythonFunctions | None = None
         self._returning: dict[str, Any] = {}
@@ -132,6 +142,23 @@ class ConstrainedSystem:
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
         self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
+
+    @property
+    def n_mass_values(self) -> int:
+        """Number of entries of M that `mass_values` gives."""
+        return len(self.entries["mass"][0]) if "mass" in self.entries else 0
+
+    @property
+    def n_jacobian_values(self) -> int:
+        """Number of entries of C_q that `jacobian_values` gives."""
+        return len(self.entries["jacobian"][0]) if "jacobian" in self.entries else 0
+
+    def _scatter(self) -> None:
+        """Make dense callbacks of those that give values, where there are none."""
+        made = {kind: VALUES_OF[kind] for kind in self.entries if kind not in self.given}
+        dense = {kind: dense_callback(kind, self.given[of], self.entries[kind]) for kind, of in made.items()}
+        self.given = {kind: each for kind in KINDS if (each := dense.get(kind, self.given.get(kind))) is not None}
+        self.scattered = frozenset(dense)
 
     def __repr__(self) -> str:
         return f"ConstrainedSystem({self.name!r}, n_q={self.n_q}, n_c={self.n_c})"
@@ -171,7 +198,7 @@ class ConstrainedSystem:
         TypeError, ValueError
             If the parameters are not as many finite numbers, or the system is made of functions that take none.
         """
-        p, known = _checked_parameters(parameters), self.parameters
+        p, known = checked_parameters(parameters), self.parameters
         if not self._taking and (self._python is not None or self._returning):
             raise TypeError(
                 f"{self.name!r} has no parameters: it is made by from_python without them. Give it parameters=p, which "
@@ -197,6 +224,8 @@ class ConstrainedSystem:
         n_a: int = 0,
         parameters: ArrayLike | None = None,
         compile: bool = False,
+        mass_entries: Any = None,
+        jacobian_entries: Any = None,
         bandwidth: int | None = None,
         joints: Sequence[Joint] = (),
         name: str = "system",
@@ -217,6 +246,8 @@ class ConstrainedSystem:
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
             the values of closures and globals as they are now.
+        mass_entries, jacobian_entries : (rows, columns), optional
+            As for the class.
         bandwidth : int, optional
             As for the class; `mass` must then be an array.
         joints : sequence of Joint
@@ -244,19 +275,23 @@ class ConstrainedSystem:
                 "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
                 "with compiled callbacks to ConstrainedSystem(...)"
             )
-        functions = _given(functions, n_c, n_a)
-        constant_mass = not callable(functions["mass"])
-        if constant_mass:
-            matrix = check_real("mass", functions["mass"])
-            if matrix.shape != (n_q, n_q):
-                raise ValueError(f"mass must have shape {(n_q, n_q)}; given an array of shape {matrix.shape}")
-            functions["mass"] = ConstantMatrix(matrix)
+        functions = given_callbacks(functions, n_c, n_a)
+        entries = checked_entries(functions, n_q, n_c, mass_entries, jacobian_entries)
+        of_values = entries["mass"][0].shape if "mass" in entries else ()
+        shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": of_values}
+        masses = [kind for kind in shapes if kind in functions]
+        constant_mass = not any(callable(functions[kind]) for kind in masses)
+        for kind in masses if constant_mass else ():
+            matrix = check_real(kind, functions[kind])
+            if matrix.shape != shapes[kind]:
+                raise ValueError(f"{kind} must have shape {shapes[kind]}; given an array of shape {matrix.shape}")
+            functions[kind] = ConstantMatrix(matrix)
         for kind, function in functions.items():
             if not callable(function):
                 raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
         known = parameters is not None
         taking = frozenset(kind for kind, function in functions.items() if check_arguments(kind, function, known))
-        p = _checked_parameters(() if parameters is None else parameters)
+        p = checked_parameters(() if parameters is None else parameters)
         if known and not taking:
             raise ValueError(
                 f"parameters are given, but none of the functions of {name!r} takes them: let those that need them "
@@ -265,6 +300,8 @@ class ConstrainedSystem:
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
         options: dict[str, Any] = {
             "constant_mass": constant_mass,
+            "mass_entries": mass_entries,
+            "jacobian_entries": jacobian_entries,
             "bandwidth": bandwidth,
             "joints": joints,
             "name": name,
@@ -276,10 +313,15 @@ class ConstrainedSystem:
             system = cls(**sizes, **options, **compiled, parameters=p)
             system._returning, system._taking = functions, taking
             return system
+        made = {kind: VALUES_OF[kind] for kind in entries if kind not in functions}
+        sides = {"mass": (n_q, n_q), "jacobian": (n_c, n_q)}
+        functions |= {kind: DenseFunction(functions[of], entries[kind], sides[kind]) for kind, of in made.items()}
+        taking |= {kind for kind, of in made.items() if of in taking}
         python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
         system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, p))
         system._python, system._taking = python, taking  # the registry holds it weakly
+        system.scattered = frozenset(made)
         return system
 
     @property
@@ -377,11 +419,17 @@ class ConstrainedSystem:
 
     def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
         """C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
-        return self.rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
+        return self.sparse_rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
 
     def rows(self, t: float, q: ArrayLike) -> Array:
         """C_q, then A, (n_c + n_a, n_q)."""
         return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
+
+    def sparse_rows(self, t: float, q: ArrayLike) -> Rows:
+        """The same by their entries, where `jacobian_values` gives these."""
+        if self.n_a > 0 or "jacobian" not in self.entries:
+            return self.rows(t, q)
+        return SparseRows(*self.entries["jacobian"], self.jacobian_values(t, q), (self.n_c, self.n_q))
 
     def rates(self, t: float, q: ArrayLike) -> Array:
         """C_t, then b, (n_c + n_a,)."""
@@ -406,12 +454,14 @@ class ConstrainedSystem:
         plain = self._returning or (self._python.functions if self._python is not None else {})
         options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "n_a": self.n_a}
         options |= {"bandwidth": self.bandwidth, "joints": self.joints, "name": self.name}
+        options |= {f"{kind}_entries": entries for kind, entries in self.entries.items()}
         if plain:
             options["compile"] = not self.called_in_python
             options["parameters"] = self.parameters if self._taking else None
         else:
             options |= {"constant_mass": self.constant_mass, "parameters": self.parameters}
-        functions = {kind: packed(self.name, kind, function) for kind, function in (plain or self.given).items()}
+        own = {kind: function for kind, function in (plain or self.given).items() if kind not in self.scattered}
+        functions = {kind: packed(self.name, kind, function) for kind, function in own.items()}
         known = self.description
         if known.energy is not None:
             packed(self.name, "energy", known.energy)
@@ -430,61 +480,13 @@ def _made_again(
 ) -> ConstrainedSystem:
     """The system that was pickled, of the functions that this process finds by the same names."""
     functions = {kind: unpacked(function) for kind, function in packed.items()}
-    if plain and isinstance(functions["mass"], ConstantMatrix):
-        functions["mass"] = functions["mass"].matrix
+    for kind in ("mass", "mass_values") if plain else ():
+        if isinstance(functions.get(kind), ConstantMatrix):
+            functions[kind] = functions[kind].matrix
     system = (cls.from_python if plain else cls)(**options, **functions)
     system.functions.flags[:] = flags
     system.description = known
     return system
-
-
-def _checked_parameters(parameters: Any) -> Array:
-    """The parameters as a new vector, or what is wrong with them."""
-    p = check_real("parameters", parameters)
-    if p.ndim != 1 or not np.isfinite(p).all():
-        raise ValueError(f"parameters must be a vector of finite numbers; given {shown(parameters)}")
-    return p
-
-
-def _given(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
-    """The callbacks that are given, in the order of KINDS, or what is wrong with their choice."""
-    unknown = [kind for kind in callbacks if kind not in KINDS]
-    if unknown:
-        raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
-    sizes = {"n_c": n_c, "n_a": n_a}
-    needed = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
-    missing = [kind for kind in needed if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
-    if missing:
-        rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
-        raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
-    given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
-    given = {
-        kind: each
-        for kind, each in given.items()
-        if not (
-            KINDS[kind].optional and (each is None or (KINDS[kind].absent != "differences" and each is stand_in(kind)))
-        )
-    }
-    for kind, entry in KINDS.items():
-        if kind in given and sizes.get(entry.shape[0], 1) == 0:
-            of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
-            raise ValueError(f"{kind} goes with {of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
-    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in given]
-    if missing:
-        raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
-    if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
-        raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
-    return given
-
-
-def _in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
-    """The callback that stands in the place of one that is not given."""
-    if KINDS[kind].absent != "differences" or "constraint" not in given:
-        return stand_in(kind)
-    constraint = given["constraint"]
-    # what is called in Python cannot be watched, and need not be: it is looked up at every call
-    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
-    return differenced_jacobian(constraint, watched)
 
 
 def check_system(system: object) -> None:

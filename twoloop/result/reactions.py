@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_text
+from twoloop.checks.sparse_rows import SparseRows
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
@@ -67,10 +68,11 @@ def reaction(result: Record, name: str) -> Reaction:
 
 def _rows(system: ConstrainedSystem, joint: Joint, t: float, q: Array) -> Array:
     """Derivatives of the joint's equations by the coordinates of its body."""
-    rows = system.rows(t, q)
+    columns = joint.translation + joint.rotation
     if joint.equations is not None:
-        rows = joint.equations @ rows
-    return rows[np.ix_(joint.rows, joint.translation + joint.rotation)]
+        return (joint.equations @ system.rows(t, q))[np.ix_(joint.rows, columns)]
+    rows = system.sparse_rows(t, q)
+    return rows.part(joint.rows, columns) if isinstance(rows, SparseRows) else rows[np.ix_(joint.rows, columns)]
 
 
 def _point(joint: Joint, q: Array) -> Array:

@@ -173,7 +173,10 @@ class Course:
     def _go_on(self, across: bool, n_steps: int) -> None:
         """Choose what makes the next steps, where it is not what made the last ones."""
         run, a = self.run, self.run.a
-        if self.code == a.HAS_TO_GIVE_WAY:
+        if self.code == a.HAS_TO_BE_DENSE or run.is_lost_without_dense(self.code):
+            run.become_dense()
+            self.kit, self.code = run.kit, a.PAUSED
+        elif self.code == a.HAS_TO_GIVE_WAY:
             give_way(run)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.AT_JUMP and not across and leap(run, self.t1):

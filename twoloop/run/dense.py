@@ -18,6 +18,7 @@ from twoloop.kernels.data import common
 from twoloop.kernels.data import intervals as names
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, workspace
 
 Array = NDArray[np.float64]
@@ -78,7 +79,6 @@ class Interpolator:
         ranks: tuple[int, int],
         plans: Mapping[int, Plan] = MappingProxyType({}),
     ):
-        from twoloop.kernels import advance
         from twoloop.kernels import interpolation as dense
 
         self.kernels = dense
@@ -89,17 +89,31 @@ class Interpolator:
         self.tolerances[common.RTOL] = rtol
         self.parts = max((plan.parts for plan in self.plans.values()), default=REPAIRED)
         self.parts = max(self.parts, REPAIRED)
-        q0 = row[: system.n_q]
-        self.kits = {kind: kit_of(system, t0, q0, plan) for kind, plan in self.plans.items()}
-        self.kit = kit_of(system, t0, q0)
-        self.work = workspace(system, self.kit, pattern_of(system, t0, q0), q0, rtol, 0.0, ranks)
-        self.work.notes[common.GENERATION] = 1.0  # the ranks are known
-        advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
+        self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
+        self._prepare()
         self.filled: dict[float, tuple[Array, Array]] = {}
         self.sound: set[float] = set()  # where intervals begin whose neighbours serve
         self.judges = True
-        self.repairs: dict[bool, tuple[Plan, Any]] = {}
         self._make_room()
+
+    def _prepare(self) -> None:
+        """The workspace, and what is called with it."""
+        from twoloop.kernels import advance
+
+        system, t0, row = self.made_of[:3]
+        q0, static = row[: system.n_q], self.static
+        self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
+        self.kit = kit_of(system, t0, q0, None, static)
+        pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
+        self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static)
+        self.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
+        self.repairs: dict[bool, tuple[Plan, Any]] = {}
+
+    def _become_dense(self) -> None:
+        """Leave the static form, which could not decide something."""
+        self.static = None
+        self._prepare()
 
     def _make_room(self) -> None:
         """Scratch for the coefficients of two polynomials."""
@@ -137,9 +151,12 @@ class Interpolator:
 
     def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
         known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
-        return int(
-            direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, times, self.nodes, self.room, out)
-        )
+        rest = (times, self.nodes, self.room, out)
+        failures = int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+        if failures > 0 and self.static is not None:
+            self._become_dense()
+            failures = int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+        return failures
 
     def _settle(self, table: Table, groups: Groups) -> None:
         """See to it that each interval has interior states, or is known to need none."""
@@ -207,7 +224,10 @@ class Interpolator:
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
             atol = float(self.tolerances[common.ATOL :].min())
             plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=REPAIRED)
-            self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], self.made_of[2][: self.system.n_q], plan)
+            if not plan.projects and self.static is not None:
+                self._become_dense()
+            q0 = self.made_of[2][: self.system.n_q]
+            self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], q0, plan, self.static)
         return self.repairs[stiff]
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
@@ -271,6 +291,9 @@ class Interpolator:
     def complete(self, times: Array, states: Array, out: Array) -> None:
         """Fill rows [a, lam] at rows [q, v] on the constraints."""
         failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
+        if failures > 0 and self.static is not None:
+            self._become_dense()
+            failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
         if failures > 0:
             _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
 

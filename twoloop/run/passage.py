@@ -8,7 +8,7 @@ from twoloop.kernels.data import common
 from twoloop.methods.plan import Plan
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.run import Run
-from twoloop.run.workspace import kit_with
+from twoloop.run.workspace import kit_of, kit_with
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,10 @@ def give_way(run: Run) -> None:
     """Go on with the plan that takes over where values of this one are not finite."""
     assert run.plan.substitute is not None
     run.plan = run.plan.substitute.fresh()
-    run.kit = kit_with(run.system, run.functions.flags, run.plan)
+    if run.static is None:
+        run.kit = kit_with(run.system, run.functions.flags, run.plan)
+    else:
+        run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static)
     run.functions = run.kit.functions
     run.memory = run.plan.memory.copy()
     run.substituted = True

@@ -4,7 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,7 @@ from twoloop.checks.bounds import check_bounds
 from twoloop.checks.consistency import Violation, not_finite
 from twoloop.checks.scales import Scales, scales_of
 from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.run.large_projection import project_sparsely
 
 Array = NDArray[np.float64]
 
@@ -106,6 +107,9 @@ def consistent_state(
     reason = not_finite(system, t, guess, speeds)
     if reason is not None:
         raise ValueError(f"q and v cannot be projected: {reason} at t = {t:g}")
+    large = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
+    if large is not None:
+        return _state_of_large(system, t, guess, speeds, *large)
     found = _position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
     jacobian = system.rows(t, found)
     change = _least_change(jacobian, free, -system.velocity_constraint(t, found, speeds))
@@ -118,6 +122,31 @@ def consistent_state(
     state = ConsistentState((found, velocity))
     state.moved_q, state.moved_v = _move(found - guess), _move(velocity - speeds)
     state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
+    return state
+
+
+class _LargeState(ConsistentState):
+    """The same of a large system, which says on which assembly it is when it is asked: that takes full matrices."""
+
+    system: ConstrainedSystem
+    t: float
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("dependent", "determinant_sign", "margin"):
+            raise AttributeError(name)
+        q = self[0]
+        jacobian = self.system.rows(self.t, q)
+        scaled = scales_of(self.system, self.t, q, jacobian).scaled(jacobian)
+        self.dependent, self.determinant_sign, self.margin = _assembly(scaled, np.arange(len(q)))
+        return vars(self)[name]
+
+
+def _state_of_large(
+    system: ConstrainedSystem, t: float, guess: Array, speeds: Array, found: Array, velocity: Array
+) -> ConsistentState:
+    state = _LargeState((found, velocity))
+    state.system, state.t = system, t
+    state.moved_q, state.moved_v = _move(found - guess), _move(velocity - speeds)
     return state
 
 

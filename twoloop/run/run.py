@@ -12,7 +12,8 @@ from twoloop.checks.consistency import (
     least_inertia,
     pattern_of,
 )
-from twoloop.checks.rank import in_words
+from twoloop.checks.rank import SHOWN, equations_in_words, in_words
+from twoloop.checks.sparse_rows import norms
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.kernels.layout import copy_of
@@ -20,6 +21,7 @@ from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.record import Statistics
+from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, kit_with, workspace
 
 Array = NDArray[np.float64]
@@ -31,6 +33,7 @@ LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked a
 PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
+NONE = np.zeros((0, 0))
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
 
 
@@ -61,13 +64,14 @@ class Run:
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
-        self.kit = kit_of(system, t0, q0, plan)
+        others = () if plan.substitute is None else (plan.substitute,)
+        self.static = static_form(system, t0, q0, plan, *others)
+        self.kit = kit_of(system, t0, q0, plan, self.static)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        self.pattern = pattern_of(system, t0, q0)
         # ranks are found anew at every start: those of the last one are a guess, which spares a second workspace
-        self.work = self._workspace(*system.made.get("ranks", (None, None)))
+        self.work = self._workspace(*(system.made.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.ATOL + system.n_q)
         self.tolerances[common.RTOL] = rtol
@@ -78,7 +82,7 @@ class Run:
         self.control[advance.MAX_STEP] = np.inf
         self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[advance.MAX_STEPS] = np.inf
-        self.control[advance.BRIDGE] = 1.0
+        self.control[advance.BRIDGE] = self.static is None
         rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
         self.control[advance.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
@@ -103,7 +107,7 @@ class Run:
         vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
         for name in ("state", "new_state", "tolerances", "control", "clock"):
             setattr(other, name, getattr(self, name).copy())
-        if self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
+        if self.static is None and self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         other.work = copy_of(self.work)
@@ -123,13 +127,68 @@ class Run:
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
         q0 = self.state[: self.system.n_q]
-        work = workspace(self.system, self.kit, self.pattern, q0, self.rtol, self.reuse, (rank, rank_v))
+        pattern = self._pattern(q0) if self.static is None else NONE
+        work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, (rank, rank_v), self.static)
         work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
+
+    def _pattern(self, q: Array) -> Array:
+        """Where the rows have entries."""
+        system, t0 = self.system, self.t0
+        return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
+
+    def is_lost_without_dense(self, code: int) -> bool:
+        """Whether the static form found no step, however short, and others may."""
+        reasons = (common.INNER_DIVERGED, common.SINGULAR, common.MASS_NOT_DEFINITE)
+        return (
+            self.static is not None
+            and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
+            and int(self.clock[self.a.FAILURE_CODE]) in reasons
+        )
+
+    def become_dense(self) -> None:
+        """Go on with the forms of saddle_point.py where the static one cannot decide: at the state there is."""
+        n = self.system.n_q
+        before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
+        rank = len(before.rows_v)
+        self.static = None
+        t, q = float(self.clock[self.a.T]), self.state[:n].copy()
+        self.kit = kit_of(self.system, t, q, self.plan)
+        self.functions = self.kit.functions
+        self.work = self._workspace(rank, rank)
+        self.work.counters[:] = before.counters
+        kept = [common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER]
+        self.work.notes[kept] = before.notes[kept]
+        self.control[self.a.BRIDGE] = 1.0
+        clock, a = self.clock, self.a
+        if clock[a.FAILURE_CODE] != common.DONE:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
+            clock[a.FAILURE_CODE] = common.DONE
+        state = self.state.copy()
+        code = direct(self.a.start)(self.kit, self.work, t, state)
+        if code == common.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
+            self.work.notes[common.GENERATION] = 1.0
+            code = direct(self.a.start)(self.kit, self.work, t, state)
+        if before.notes[common.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
+            pivot = self.work.notes[common.PIVOT]
+            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[common.PIVOT])
 
     def _begin(self) -> None:
         start = direct(self.a.start)
         code = start(self.kit, self.work, self.t0, self.state)
+        if self.static is not None and code == common.RANK_DIFFERS:
+            rank = int(self.work.notes[common.RANK])
+            self.work = self._workspace(rank, rank)
+            code = start(self.kit, self.work, self.t0, self.state)
+        if self.static is not None and code not in (common.DONE, common.NOT_FINITE):
+            if self.work.notes[common.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
+                self.system.made["static form"] = None
+            self.static = None
+            self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
+            self.functions = self.kit.functions
+            self.control[self.a.BRIDGE] = 1.0
+            self.work = self._workspace()
+            code = start(self.kit, self.work, self.t0, self.state)
         if code == common.RANK_DIFFERS:
             self.system.made["ranks"] = ranks = int(self.work.notes[common.RANK]), int(self.work.notes[common.RANK_V])
             self.work = self._workspace(*ranks)
@@ -165,20 +224,32 @@ class Run:
         left_out = np.ones(n_rows, dtype=bool)
         left_out[self.work.rows_v] = False
         redundant = np.flatnonzero(left_out)
-        rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+        rows, a = self.system.sparse_rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
         off = np.abs(rows @ a - self.work.Gamma)
-        allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
+        allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
         wrong = np.flatnonzero(off > allowed).tolist()
         if wrong:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
-                f"{in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
+                f"{self._in_words(wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
         return redundant, (
             f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
-            f"{in_words(rows, redundant.tolist())}. They are left out of the solution and checked at every "
+            f"{self._in_words(redundant.tolist())}. They are left out of the solution and checked at every "
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
+
+    def _in_words(self, rows: list[int]) -> str:
+        """Which rows depend on which others; the static form has found the shares when it found the multipliers."""
+        q = self.state[: self.system.n_q]
+        counted = self.work.rows_v.tolist()
+        if self.static is None or set(rows) & set(counted):
+            return in_words(self.system.rows(self.t0, q), rows)
+        n_rows = self.system.n_c
+        shares = -self.work.minimum[: (n_rows - len(counted)) * n_rows].reshape(-1, n_rows)
+        all_rows = self.system.sparse_rows(self.t0, q)
+        lengths = norms(all_rows)
+        return equations_in_words(rows, counted, shares[:SHOWN, counted], lengths)
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""

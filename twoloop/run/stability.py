@@ -93,9 +93,9 @@ def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
 
 def _rates(kit: Any, work: Any, look: Look, directions: list[Array]) -> tuple[float, float]:
     """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
-    from twoloop.kernels.evaluation import calls
+    from twoloop.kernels.evaluation import tasks
 
-    if kit.inner(kit, work, calls.RENEW, look.t, look.q, look.v, 0.0, work.x, work.lam) != common.DONE:
+    if kit.inner(kit, work, tasks.RENEW, look.t, look.q, look.v, 0.0, work.x, work.lam) != common.DONE:
         return 0.0, 0.0
     squared, opposed_q = _largest(kit, work, look, directions[0], work.independent, False)
     rate, opposed_v = _largest(kit, work, look, directions[1], work.independent_v, True)
@@ -107,7 +107,7 @@ def _largest(
     kit: Any, work: Any, look: Look, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
     """The largest factor by which dF/dq or dF/dv makes a direction longer, and whether it turns it round."""
-    from twoloop.kernels.evaluation import calls
+    from twoloop.kernels.evaluation import tasks
 
     size = DISPLACEMENT * max(1.0, float(np.abs(look.v if by_v else look.q).max()))
     factor, opposed = 0.0, False
@@ -115,7 +115,7 @@ def _largest(
     for _ in range(ITERATIONS):
         Q, V = look.q.copy(), look.v.copy()
         (V if by_v else Q)[places] += size * direction[places]
-        if kit.inner(kit, work, calls.EVALUATE, look.t, Q, V, INNER_TOL, a, work.lam) != common.DONE:
+        if kit.inner(kit, work, tasks.EVALUATE, look.t, Q, V, INNER_TOL, a, work.lam) != common.DONE:
             return 0.0, False
         image = (a - look.a)[places]
         longest = float(np.abs(image).max(initial=0.0))

@@ -14,6 +14,7 @@ from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import make_work
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.static_form import StaticForm
 
 Array = NDArray[np.float64]
 
@@ -22,10 +23,14 @@ MOST_KITS = 16  # that are kept with a system
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
-def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None) -> common.Kit:
+def kit_of(
+    system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
+) -> common.Kit:
     """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
+    if static is not None:
+        return _static_kit(system, plan, static)
     flags = _flags_at(system, t0, q0)
     if plan is not None:
         return kit_with(system, flags, plan)
@@ -38,6 +43,19 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
         return make()[0]
     made: tuple[common.Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
     return made[0]
+
+
+def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> common.Kit:
+    """The same for the static form."""
+    from twoloop.kernels.evaluation.static_inner import static_inner_loop
+
+    flags = system.functions.flags.copy()
+    flags[common.FORM] = common.STATIC
+    functions = system.functions._replace(flags=flags, static_program=form.program)
+    if plan is None:
+        return common.Kit(functions, static_inner_loop)
+    called = (plan.step, plan.first, plan.second)
+    return common.Kit(functions, static_inner_loop, *called, static_inner_loop, plan.instead)
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -102,19 +120,33 @@ def workspace(
     rtol: float,
     reuse: float,
     ranks: tuple[int | None, int | None] = (None, None),
+    static: StaticForm | None = None,
 ) -> common.Work:
     """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows."""
     flags = kit.flags
     reduced, augmented = flags[common.DENSE_FORM] == common.NULL_SPACE, flags[common.FORM] == common.AUGMENTED
     programs = [each for each in (kit.jacobian_program, kit.gamma_program) if each.size]
     n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
-    work = make_work(system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
+    sizes = (system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
+    work = make_work(*sizes, None if static is None else static.static)
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
     work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf
     work.notes[common.ROUNDED] = ROUNDING * float(np.abs(q0).max())
     work.notes[common.REUSE] = max(reuse, work.notes[common.ROUNDED])
+    if static is not None:
+        _fill(work, system, static, q0)
+        return work
     work.pattern[:] = pattern
     if flags[common.BANDWIDTH] >= 0:
         work.lapack[:] = addresses()
     return work
+
+
+def _fill(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
+    """What stays as it is in a workspace of the static form."""
+    work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
+    work.dependent[:] = work.independent[:] = np.arange(system.n_q)
+    work.counts[:] = 1.0
+    if system.constant_mass and "mass" not in system.entries:
+        work.mass_values[:] = system.mass(0.0, q0)[form.mass]

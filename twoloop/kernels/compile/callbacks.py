@@ -180,6 +180,24 @@ KINDS = {
         absent="zeros",
         more=(("Cq", ("n_c", "n_q")), ("Ct", ("n_c",)), ("Qd", ("n_c",))),
     ),
+    "mass_values": Kind(
+        ("q",),
+        "values",
+        ("n_mass_values",),
+        "the entries of M that mass_entries names",
+        "For large systems, beside mass or in its place: nothing of size n_q x n_q is filled where accelerations are "
+        "found by sparse factors. Both triangles.",
+        absent="zeros",
+    ),
+    "jacobian_values": Kind(
+        ("q",),
+        "values",
+        ("n_jacobian_values",),
+        "the entries of C_q that jacobian_entries names",
+        "For large systems, beside jacobian or in its place: nothing of size n_c x n_q is filled where accelerations "
+        "are found by sparse factors.",
+        absent="zeros",
+    ),
 }
 OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
 

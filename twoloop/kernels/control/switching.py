@@ -24,13 +24,16 @@ from twoloop.kernels.data.common import (
     ESTIMATE,
     EXPLICIT_STEP,
     FORCE_BY_Q_GIVEN,
+    FORM,
     GAP,
     N_EVALUATIONS,
     N_JACOBIANS,
+    NEEDS_DENSE,
     OUTER_DIVERGED,
     REUSE,
     ROUNDED,
     SETTLE,
+    STATIC,
     STRAIGHT,
     Attempt,
     Step,
@@ -39,7 +42,8 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.calls import PROJECT, evaluate, renew_partition
+from twoloop.kernels.evaluation.calls import evaluate, renew_partition
+from twoloop.kernels.evaluation.tasks import PROJECT
 
 EARLY = 100.0  # evaluations before the first look at the rate
 INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
@@ -337,12 +341,16 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 _restart(second if was_explicit else first)
     explicit = _is_explicit(memory)
     w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
+    if not explicit and f.flags[FORM] == STATIC:  # Newton's method needs a partition
+        return Attempt(NEEDS_DENSE, np.inf, 0.0)
     begin = N_OPTIONS + int(options[SIZE_1])
     each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
     w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0:  # a constant step cannot become shorter
+        if (
+            code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC
+        ):  # a constant step cannot become shorter
             _enter(w, options, memory, n, IMPLICIT, t)
             _restart(second)
             w.notes[EXPLICIT_STEP] = 0.0

@@ -26,9 +26,11 @@ from twoloop.kernels.compile.reference import Reference
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
+PLACES = types.int32[::1]  # of long programs, which are to stay in the cache
 
-# programs in the place of callbacks that are not given, see evaluation/program.py; of size 0 where there is none
-PROGRAMS = ("jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers")
+# programs in the place of callbacks that are not given, see evaluation/program.py, and that of the elimination of large
+# systems, see algebra/static_program.py; of size 0 where there is none
+PROGRAMS = ("jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "static_program")
 # the callbacks of a mechanism, its parameters, its flags and its programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 
@@ -37,7 +39,7 @@ Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # t
 # are found, see algebra/saddle_point.py; DENSE_FORM: what it becomes where sparse factors have too many entries;
 # STRAIGHT: 1 where the inner loop is code made for the mechanism, see straight_code.py
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
-MULTIPLIERS, NULL_SPACE, AUGMENTED = range(3)  # forms
+MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # forms; the last has an inner loop of its own, static_inner.py
 GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
@@ -46,6 +48,7 @@ CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION
 NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
     GIVEN[name] for name in ("nonholonomic_rate", "nonholonomic_gamma")
 )
+MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_values", "jacobian_values"))
 
 
 class Work(NamedTuple):
@@ -102,7 +105,16 @@ class Work(NamedTuple):
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see below
     nodes: Any  # what the operations of a program make
+    # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
+    mass_values: Any  # entries of M, see algebra/static_program.py
+    jacobian_values: Any  # entries of G
+    counts: Any  # (n_c) 1 for rows that count, else 0
+    factors: Any
+    pivot_sizes: Any  # (N)
+    unknowns: Any  # (N) right-hand side and solution
+    solutions: Any  # (3 N) scratch, and (n_c) what M is stiffened by along rows, see algebra/static_factors.py
 
+    sizes: Any = None  # by which it was made
     address: Any = 0  # of the table by which kernels find these arrays
     table: Any = None
 
@@ -116,7 +128,7 @@ _MATRIX_FIELDS = {
 }
 WORK = Reference(
     "Work",
-    {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-2]},
+    {n: MATRIX if n in _MATRIX_FIELDS else INTEGERS if n in _INTEGER_FIELDS else VECTOR for n in Work._fields[:-3]},
 )
 
 
@@ -170,8 +182,9 @@ def _type_of_work(value: Any, context: Any) -> Any:
     KINK_BEFORE,  # times between which no jump of C_t or b is known
     KINK_AFTER,
     LEANING,  # largest share of a row that counts in a redundant one, as at the first look under this partition
+    SMALLEST,  # of the static form: least pivot of a row over its size, the sine squared of its angle to others
     N_NOTES,
-) = range(30)
+) = range(31)
 
 # what a kernel returns: DONE, or why it could not
 (
@@ -184,7 +197,8 @@ def _type_of_work(value: Any, context: Any) -> Any:
     GAMMA_INACCURATE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
-) = range(9)
+    NEEDS_DENSE,  # the static form cannot decide it
+) = range(10)
 
 
 class Attempt(NamedTuple):
@@ -255,7 +269,7 @@ KIT = Reference(
     "Kit",
     {
         **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
-        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR), strict=True)),
+        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, PLACES), strict=True)),
     },
 )
 for _name, _kind in KINDS.items():

@@ -25,24 +25,23 @@ from twoloop.kernels.evaluation.partition import (
     renew,
     write_programs,
 )
-
-(
+from twoloop.kernels.evaluation.tasks import (
+    ACCELERATIONS,
     EVALUATE,
     EVALUATE_STATE,
-    RESTORE,
-    POSITIONS,
-    ACCELERATIONS,
-    MULTIPLIERS,
     EVALUATE_THERE,
-    PROJECT,
-    TANGENTS,
-    GAMMA,
-    MASS,
-    RENEW,
+    GAMMA_TASK,
+    MASS_TASK,
     MIDPOINT,
+    MULTIPLIERS,
     PATTERN,
+    POSITIONS,
+    PROJECT,
     REDUNDANT,
-) = range(15)
+    RENEW,
+    RESTORE,
+    TANGENTS,
+)
 
 ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
 ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
@@ -63,10 +62,10 @@ def _other_task(f, w, task, t, q, v):
         if code == DONE:
             tangents(f, w, t, q)
         return code
-    if task == GAMMA:
+    if task == GAMMA_TASK:
         w.notes[KNOWN] = 0.0
         return acceleration_constraint(f, w, t, q, v)
-    if task == MASS:
+    if task == MASS_TASK:
         return mass_there(f, w, t, q)
     if task == RENEW:
         return renew(f, w, t, q)
@@ -178,13 +177,13 @@ def find_tangents(f, w, t, q):
 @merged
 def find_gamma(f, w, t, q, v):
     """The right-hand side of the acceleration constraints, in w.Gamma."""
-    return f.inner(f, w, GAMMA, t, q, v, 0.0, w.x, w.lam)
+    return f.inner(f, w, GAMMA_TASK, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
     """M(t, q) and its factors, where they are needed."""
-    return f.inner(f, w, MASS, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, MASS_TASK, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged

@@ -9,7 +9,8 @@ is the jump, in one of the halves, however short they are.
 
 import numpy as np
 
-from twoloop.kernels.data.common import ATOL, RTOL, compiled
+from twoloop.kernels.algebra.static_program import jacobian_of
+from twoloop.kernels.data.common import ATOL, FORM, RTOL, STATIC, compiled
 from twoloop.kernels.data.finite import finite_vector
 from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.constraints import constraint_rates
@@ -58,9 +59,16 @@ def _slope_and_size(w, row, length):
 
 
 @compiled
-def _allowed(w, tolerances, x, row):
+def _allowed(f, w, tolerances, x, row):
     """What a row may be off for the tolerances of coordinates, or velocities, x."""
     largest = 0.0
+    if f.flags[FORM] == STATIC:
+        rows, columns, _ = jacobian_of(f.static_program)
+        for k in range(rows.size):
+            if rows[k] == row:
+                tolerance = tolerances[ATOL + columns[k]] + tolerances[RTOL] * abs(x[columns[k]])
+                largest = max(largest, abs(w.jacobian_values[k]) * tolerance)
+        return largest
     for m in range(x.size):
         tolerance = tolerances[ATOL + m] + tolerances[RTOL] * abs(x[m])
         largest = max(largest, abs(w.G[row, m]) * tolerance)
@@ -90,9 +98,11 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
     _sample(f, w, t, q, way, begin, end)
     row, limit, mean, most = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
-        slope, size = _slope_and_size(w, i, h)
-        least = max(_allowed(w, tolerances, v, i), ROUNDING * size, BY_TIME * slope * np.spacing(abs(end)))
         bend = _bend(w, i)
+        if bend == 0.0:  # of a row that does not depend on time
+            continue
+        slope, size = _slope_and_size(w, i, h)
+        least = max(_allowed(f, w, tolerances, v, i), ROUNDING * size, BY_TIME * slope * np.spacing(abs(end)))
         if bend > most * least:
             row, limit, mean, most = i, least, slope, bend / least
     if row < 0:

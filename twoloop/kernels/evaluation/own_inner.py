@@ -12,9 +12,9 @@ from twoloop.kernels.data.common import (
     ROUNDED,
     kernel,
 )
-from twoloop.kernels.evaluation.calls import EVALUATE_THERE, MULTIPLIERS, PROJECT, REDUNDANT, TANGENTS
 from twoloop.kernels.evaluation.inner import CONTRACTION, MAX_INNER
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
+from twoloop.kernels.evaluation.tasks import EVALUATE_THERE, MULTIPLIERS, PROJECT, REDUNDANT, TANGENTS
 
 
 @kernel(INNER)

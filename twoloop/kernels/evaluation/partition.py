@@ -309,7 +309,7 @@ def partition_is_poor(w):
         w.notes[SENSITIVITY] = max(largest, 1.0)
     if not largest <= WORSE * w.notes[SENSITIVITY]:
         return True
-    if w.rows_v.size == w.Rate.size:
+    if w.rows_v.size == w.Rate.size or w.factors.size > 0:  # whose rows that count are chosen at every state
         return False
     share = _largest_share(w)
     if w.notes[LEANING] == 0.0:

@@ -29,7 +29,8 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.calls import EVALUATE_THERE, evaluate, evaluate_state, evaluate_there, project
+from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_there, project
+from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are

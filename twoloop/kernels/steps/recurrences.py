@@ -6,7 +6,7 @@ See the head of taylor.py.
 import numpy as np
 
 from twoloop.kernels.algebra.saddle_point import solve_both
-from twoloop.kernels.data.common import DONE, N_EVALUATIONS, NOT_FINITE, compiled, inlined, merged
+from twoloop.kernels.data.common import DONE, FORM, N_EVALUATIONS, NOT_FINITE, STATIC, compiled, inlined, merged
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -17,6 +17,7 @@ from twoloop.kernels.evaluation.operations import (
     SINE,
     SQUARE_ROOT,
 )
+from twoloop.kernels.evaluation.tasks import SOLVE
 
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits
@@ -304,7 +305,10 @@ def expand(f, w, options, memory, t, state, unit):
         a, lam = N[k, A : A + n], N[k, LAM : LAM + n_rows]
         if w.rows_v.size < n_rows:
             lam[:] = 0.0
-        solve_both(f, w, r, c, a, lam)
+        if f.flags[FORM] == STATIC:
+            f.inner(f, w, SOLVE, t, r, c, 0.0, a, lam)
+        else:
+            solve_both(f, w, r, c, a, lam)
         take_order(w, K, unit, N, series, a)
         _complete(options, EARLY, N[K], Y1[K])
         _complete(options, LATE, N[k], Y2[k])

@@ -38,7 +38,8 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.calls import EVALUATE_THERE, evaluate_there, project
+from twoloop.kernels.evaluation.calls import evaluate_there, project
+from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 from twoloop.kernels.steps.recurrences import (
     ATTEMPTS,
     KEEP,

@@ -1,0 +1,364 @@
+"""Large systems by sparse factors with a static program, against dense algebra in NumPy and the other forms."""
+
+import numpy as np
+import pytest
+
+import twoloop.run.static_form as static_module
+from studies.bench.large import ASSEMBLIES, closed_chain, ladder, open_chain
+from tests.large_systems import Assembly, dense_solution
+from tests.problems import worst
+from twoloop import ConstrainedSystem, ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
+from twoloop.kernels import advance
+from twoloop.kernels.algebra.static_program import N_UPDATES
+from twoloop.kernels.data import common
+from twoloop.kernels.evaluation import tasks
+from twoloop.mechanisms import planar
+from twoloop.mechanisms.planar import GROUND
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.methods.dop853 import DOP853
+from twoloop.run.run import Run
+from twoloop.run.static_form import static_form
+from twoloop.run.workspace import kit_of, workspace
+
+
+@pytest.fixture
+def large(monkeypatch):
+    """What sets from how many coordinates on the static form is taken: here by all."""
+
+    def set_to(n):
+        monkeypatch.setattr(static_module, "LARGE", n)
+        monkeypatch.setattr(planar, "LARGE", n)
+
+    set_to(0)
+    return set_to
+
+
+class Started:
+    """The static form of a system with its factors at a state; None of `code` but DONE."""
+
+    def __init__(self, system, q, v):
+        form, n = static_form(system, 0.0, q), system.n_q
+        assert form is not None
+        self.system, self.kit = system, kit_of(system, 0.0, q, None, form)
+        ranks = (None, None)
+        for _ in range(2):
+            self.work = workspace(system, self.kit, None, q, 1e-8, 0.0, ranks, form)
+            state = np.concatenate([q, v, np.zeros(n + system.n_c)])
+            self.code = advance.start(self.kit, self.work, 0.0, state)
+            if self.code != common.RANK_DIFFERS:
+                break
+            ranks = (int(self.work.notes[common.RANK]),) * 2
+        self.a, self.lam, self.rank = state[2 * n : 3 * n], state[3 * n :], len(self.work.rows_v)
+
+    def project(self, q, v, theta=1e-13):
+        q, v, a, lam = q.copy(), v.copy(), np.zeros_like(q), np.zeros_like(self.lam)
+        code = self.kit.inner(self.kit, self.work, tasks.PROJECT, 0.0, q, v, theta, a, lam)
+        assert code == common.DONE
+        return q, v
+
+
+def compare(seed, most):
+    """The larger error of accelerations and multipliers of a random assembly; None where dense has to decide."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(5, most))
+    assembly = Assembly(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))
+    system = assembly.bodies.system("random")
+    v = assembly.v(system)
+    a, lam, rank, nearest = dense_solution(system, assembly.q, v)
+    started = Started(system, assembly.q, v)
+    if started.code == common.NEEDS_DENSE:
+        return None
+    assert started.code == common.DONE
+    assert started.rank == rank
+    allowed = max(1.0, 1e-5 / nearest)  # what is nearly singular takes digits from both
+    errors = worst(started.a, a) / np.abs(a).max(), worst(started.lam, lam) / np.abs(lam).max()
+    return max(errors) / allowed
+
+
+@pytest.fixture
+def any_size(large, monkeypatch):
+    """The static form also for what is too small for it to pay."""
+    monkeypatch.setattr(static_module, "SPARSE", 1e9)
+
+
+def test_random_assemblies_agree_with_dense_algebra(any_size):
+    found = [compare(seed, 100) for seed in range(24)]
+    assert max(error for error in found if error is not None) < 1e-9
+    assert found.count(None) <= 2
+
+
+@pytest.mark.slow
+def test_more_random_assemblies_agree_with_dense_algebra(any_size):
+    found = [compare(seed, 300) for seed in range(1000, 1200)]
+    assert max(error for error in found if error is not None) < 1e-9
+    assert found.count(None) <= 10
+
+
+@pytest.mark.parametrize("ratio", [1e6, 1e10])
+def test_mass_ratios(any_size, ratio):
+    for seed in range(4):
+        assembly = Assembly(seed, 30, 2, 0, heaviest=ratio)
+        system = assembly.bodies.system("heavy and light")
+        v = np.zeros(system.n_q)
+        started = Started(system, assembly.q, v)
+        if started.code == common.NEEDS_DENSE:
+            continue
+        root, (a, *_) = np.sqrt(np.diag(system.mass(0.0, assembly.q))), dense_solution(system, assembly.q, v)
+        assert worst(root * started.a, root * a) < 1e-8 * np.abs(root * a).max()
+
+
+def test_projection_is_that_in_the_metric_of_the_masses(any_size):
+    assembly = Assembly(3, 40, 4, 1)
+    system = assembly.bodies.system("projected")
+    started = Started(system, assembly.q, np.zeros(system.n_q))
+    rng = np.random.default_rng(1)
+    q = expected = assembly.q + 1e-4 * rng.normal(size=system.n_q)
+    speeds = rng.normal(size=system.n_q)
+    root = np.sqrt(np.diag(system.mass(0.0, q)))
+
+    def least(values, at):
+        return np.linalg.pinv(system.jacobian(0.0, at) / root, rcond=1e-5) @ values / root
+
+    # beside the constraints redundant rows are so only nearly: the same that count are taken
+    rows = np.sort(started.work.rows_v)
+
+    def least_of(values, at):
+        return np.linalg.pinv(system.jacobian(0.0, at)[rows] / root, rcond=1e-10) @ values[rows] / root
+
+    for _ in range(6):
+        expected = expected - least_of(system.constraint(0.0, expected), expected)
+    found, v = started.project(q, speeds)
+    assert worst(found, expected) < 1e-11
+    found, v = started.project(found, speeds)
+    assert worst(v, speeds - least(system.jacobian(0.0, found) @ speeds, found)) < 1e-9
+
+
+def started_run(system, q):
+    n = system.n_q
+    return Run(system, DOP853().plan(n, 1e-8, 1e-8, False), 0.0, q, 0.0 * q, 1e-8, np.full(n, 1e-8), None)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Adams", "Taylor", "auto"])
+def test_runs_are_those_of_the_other_forms(large, method):
+    found = []
+    for least in (10**9, 0):
+        large(least)
+        system, q = closed_chain(18)
+        options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "compiled": False, "dense_output": True}
+        found.append(solve_dae(system, (0.0, 0.05), q, np.zeros_like(q), **options))
+    one, other = found
+    assert one.success
+    assert other.success
+    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-10
+    assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-8
+    assert abs(one.stats.n_evaluations - other.stats.n_evaluations) <= 0.1 * one.stats.n_evaluations
+    times = np.linspace(0.0, 0.05, 23)
+    ours, theirs = other.sol(times), one.sol(times)
+    assert worst(ours.q, theirs.q) < 1e-9
+    assert worst(ours.a, theirs.a) < 1e-5 * np.abs(theirs.a).max()
+    assert max(worst(system.constraint(0.0, q), 0.0) for q in ours.q.T) < 1e-13
+    name = system.joints[5].name
+    assert worst(one.reactions(name).force[:, -1], other.reactions(name).force[:, -1]) < 1e-7
+
+
+def test_redundant_rows_are_named_and_held(large):
+    assembly = Assembly(5, 24, 2, 2)
+    system, q = assembly.bodies.system("redundant"), assembly.q
+    with pytest.warns(ConstraintWarning, match="depend on the others"):
+        result = solve_dae(system, (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-9, 1e-9)
+    large(10**9)
+    with pytest.warns(ConstraintWarning, match="depend on the others"):
+        other = solve_dae(assembly.bodies.system("redundant"), (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-9, 1e-9)
+    assert result.success
+    assert result.rank == other.rank == system.n_c - len(result.redundant)
+    assert worst(result.q[:, -1], other.q[:, -1]) < 1e-9
+    assert worst(result.lam[:, -1], other.lam[:, -1]) < 1e-6 * np.abs(other.lam[:, -1]).max()
+    assert worst(system.constraint(0.02, result.q[:, -1]), 0.0) < 1e-12
+
+
+def test_programs_grow_with_the_bodies_and_no_faster(large):
+    for make in ASSEMBLIES:
+        updates = {}
+        for n in (99, 999):
+            system, q = make(n)
+            form = static_form(system, 0.0, q)
+            updates[n] = int(form.program[N_UPDATES])
+            run = started_run(system, q)
+            assert run.static is not None
+            assert run.work.notes.base.size + run.work.counters.base.size < 120 * system.n_q  # nothing n_c x n_q
+        assert updates[999] <= 10.6 * updates[99]
+        assert updates[999] <= 150 * 999
+
+
+def test_small_mechanisms_have_the_forms_that_they_had():
+    for name in ("bricard", "closed_chain", "n_four_bar", "andrews", "spatial_slider_crank"):
+        problem = getattr(mechanisms, name)()
+        assert static_form(problem.system, 0.0, problem.q0) is None
+
+
+def masses_on_rods(n, dense, plain, varying):
+    """A chain of point masses in plain functions, its matrices dense or by values; masses that vary by a millionth."""
+    rows = np.repeat(np.arange(n), [2] + [4] * (n - 1))
+    columns = np.concatenate([[0, 1]] + [[2 * k - 2, 2 * k - 1, 2 * k, 2 * k + 1] for k in range(1, n)])
+
+    def differences(q):
+        return np.diff(np.vstack([np.zeros((1, 2)), q.reshape(n, 2)]), axis=0)
+
+    def values(t, q):
+        d = differences(q)
+        return np.concatenate([d[0], np.hstack([-d[1:], d[1:]]).ravel()])
+
+    def matrix(t, q):
+        made = np.zeros((n, 2 * n))
+        made[rows, columns] = values(t, q)
+        return made
+
+    def masses(t, q):
+        return 1.0 + 1e-6 * np.sin(q)
+
+    options = {"jacobian": matrix} if dense else {"jacobian_values": values, "jacobian_entries": (rows, columns)}
+    both = np.arange(2 * n)
+    if dense:
+        options["mass"] = (lambda t, q: np.diag(masses(t, q))) if varying else np.eye(2 * n)
+    else:
+        options |= {"mass_values": masses if varying else np.ones(2 * n), "mass_entries": (both, both)}
+    system = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        force=lambda t, q, v: np.tile([0.0, -9.81], n),
+        constraint=lambda t, q: 0.5 * ((differences(q) ** 2).sum(axis=1) - 1.0 / n**2),
+        gamma=lambda t, q, v: -(differences(v) ** 2).sum(axis=1),
+        name="masses on rods",
+        **options,
+    )
+    angles = np.linspace(0.1, 1.3, n)
+    return system, np.cumsum(np.column_stack([np.cos(angles), np.sin(angles)]) / n, axis=0).ravel()
+
+
+@pytest.mark.parametrize("varying", [False, True])
+def test_plain_functions_dense_or_by_values(large, varying):
+    found = []
+    for dense, least in ((True, 10**9), (True, 0), (False, 0)):
+        large(least)
+        system, q = masses_on_rods(30, dense, True, varying)
+        run = started_run(system, q)
+        assert (run.static is not None) == (least == 0)
+        found.append(solve_dae(system, (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-8, 1e-8))
+    assert all(result.success for result in found)
+    assert worst(found[0].q[:, -1], found[1].q[:, -1]) < 1e-12
+    assert worst(found[0].q[:, -1], found[2].q[:, -1]) < 1e-12
+
+
+def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(large):
+    """Coordinates that are held, the first of which comes to lean on another where the second is beyond 0.5."""
+    n = 12
+
+    def beyond(x, order=0):
+        return [1.0, 4.0, 12.0][order] * max(0.0, x - 0.5) ** (4 - order)
+
+    def constraint(t, q):
+        return q[:n] + np.eye(n)[0] * beyond(q[1]) * q[n] - np.eye(n)[1] * t
+
+    def jacobian(t, q):
+        made = np.eye(n, 2 * n)
+        made[0, 1], made[0, n] = beyond(q[1], 1) * q[n], beyond(q[1])
+        return made
+
+    def gamma(t, q, v):
+        return -np.eye(n)[0] * (beyond(q[1], 2) * q[n] * v[1] ** 2 + 2.0 * beyond(q[1], 1) * v[1] * v[n])
+
+    system = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        mass=np.eye(2 * n),
+        force=lambda t, q, v: np.ones(2 * n),
+        constraint=constraint,
+        constraint_rate=lambda t, q: -np.eye(n)[1],
+        jacobian=jacobian,
+        gamma=gamma,
+    )
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        result = solve_dae(system, (0.0, 1.2), np.zeros(2 * n), np.eye(2 * n)[1], "DOP853", time_limit=20.0)
+        assert result.success
+        ends.append(result.q[:, -1])
+    assert abs(ends[0][0]) > 0.05
+    assert worst(*ends) < 1e-9
+
+
+def test_stiff_motion_goes_on_by_newton(large):
+    """The default leaves the static form when Newton's method is due: both ways lead to the same end."""
+    n = 12
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        system, q = masses_on_rods(n, True, True, False)
+        functions = dict(system.python_functions)
+        functions["force"] = lambda t, q, v: np.tile([0.0, -9.81], n) - 3e3 * v
+        stiff = ConstrainedSystem.from_python(n_q=2 * n, n_c=n, **functions | {"mass": np.eye(2 * n)})
+        result = solve_dae(stiff, (0.0, 2.0), q, 0.0 * q, "auto", 1e-4, 1e-4)
+        assert result.success
+        assert result.stats.n_jacobians > 0
+        ends.append(result.q[:, -1])
+    assert worst(*ends) < 1e-3
+
+
+def test_a_position_that_is_nearly_singular_is_left_to_the_dense_forms(any_size, large):
+    """A parallelogram that comes to its flat position: the static form says what the others say."""
+    bodies = planar.PlanarBodies([f"bar {k}" for k in range(3)], np.ones(3), np.full(3, 0.1))
+    bodies.pin(GROUND, (0.0, 0.0), 0, (-0.5, 0.0))
+    bodies.pin(GROUND, (1.0, 0.0), 1, (-0.5, 0.0))
+    bodies.pin(0, (0.5, 0.0), 2, (-0.5, 0.0))
+    bodies.pin(1, (0.5, 0.0), 2, (0.5, 0.0))
+    angle, speed = 0.3, 4.0
+    c, s = np.cos(angle), np.sin(angle)
+    q = np.array([0.5 * c, 0.5 * s, angle, 1.0 + 0.5 * c, 0.5 * s, angle, 0.5 + c, s, 0.0])
+    v = -speed * np.array([-0.5 * s, 0.5 * c, 1.0, -0.5 * s, 0.5 * c, 1.0, -s, c, 0.0])
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        system = bodies.system("parallelogram")
+        result = solve_dae(system, (0.0, 0.2), q, v, "DOP853", 1e-8, 1e-8, compiled=False)
+        ends.append((result.status, result.t[-1]))
+    assert ends[0][0] == ends[1][0] == Status.STEP_TOO_SMALL
+    assert abs(ends[0][1] - ends[1][1]) < 1e-4
+
+
+def test_starts_of_large_systems(large):
+    for make in (open_chain, closed_chain, ladder):
+        system, q = make(36)
+        rng = np.random.default_rng(2)
+        guess, speeds = q + 1e-5 * rng.normal(size=len(q)), rng.normal(size=len(q))
+        large(10**9)
+        dense = consistent_state(system, 0.0, guess, speeds)
+        large(0)
+        state = consistent_state(system, 0.0, guess, speeds)
+        assert type(state) is not type(dense)
+        assert worst(state[0], dense[0]) < 1e-11
+        assert worst(state[1], dense[1]) < 1e-9
+        assert (state.moved_q.coordinate, len(state.dependent)) == (dense.moved_q.coordinate, system.n_c)
+        assert abs(state.margin - dense.margin) < 1e-6
+
+
+def test_bodies_whose_mass_matrix_is_singular(any_size, large):
+    """Four Euler parameters a body: M has rank 6 of 7, and the rows of their norms stiffen it."""
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
+        for k in range(6):
+            along = np.array([0.3, 0.1 * np.sin(k), -0.15])
+            body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
+            if k % 2:
+                bodies.spherical(before, body, at)
+            else:
+                bodies.revolute(before, body, at, (0.1 * k, 1.0, 0.2))
+            before, at = body, at + along
+        system, (q, v) = bodies.system("spatial chain"), bodies.start
+        result = solve_dae(system, (0.0, 0.1), q, v, "DOP853", 1e-9, 1e-9, compiled=False)
+        assert result.success
+        ends.append(result)
+    assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static is not None
+    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-11
+    assert worst(ends[0].lam[:, -1], ends[1].lam[:, -1]) < 1e-9 * np.abs(ends[0].lam[:, -1]).max()

@@ -1,0 +1,121 @@
+"""Rows of constraints by their entries, for what checks do with a Jacobian that is not to be a full matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+class SparseRows:
+    """A matrix (m, n) by its entries, none of them twice; with the operations of an array that checks of it need.
+
+    Attributes
+    ----------
+    rows, columns : ndarray of int
+    values : ndarray
+    shape : (int, int)
+    """
+
+    def __init__(self, rows: Integers, columns: Integers, values: Array, shape: tuple[int, int]):
+        places, which = np.unique(rows * shape[1] + columns, return_inverse=True)
+        self.rows, self.columns, self.shape = places // shape[1], places % shape[1], shape
+        self.values = np.bincount(which, values, len(places)) if len(places) else np.zeros(0)
+
+    @property
+    def size(self) -> int:
+        """Of the full matrix."""
+        return self.shape[0] * self.shape[1]
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __matmul__(self, x: Array) -> Array:
+        return np.bincount(self.rows, self.values * x[self.columns], self.shape[0]).astype(np.float64)
+
+    def __abs__(self) -> SparseRows:
+        return self._with(np.abs(self.values))
+
+    def pattern(self) -> SparseRows:
+        """1 for each entry."""
+        return self._with(np.ones(len(self.values)))
+
+    def _with(self, values: Array) -> SparseRows:
+        other = object.__new__(SparseRows)
+        other.rows, other.columns, other.values, other.shape = self.rows, self.columns, values, self.shape
+        return other
+
+    def __getitem__(self, part: slice) -> SparseRows:
+        """All rows: other parts are not asked for."""
+        assert part == slice(self.shape[0])
+        return self
+
+    def part(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> Array:
+        """Some rows and columns as a full matrix."""
+        made = np.zeros((len(rows), len(columns)))
+        for k, row in enumerate(rows):
+            first, last = np.searchsorted(self.rows, [row, row + 1])  # entries are in the order of rows
+            for column, value in zip(self.columns[first:last].tolist(), self.values[first:last], strict=True):
+                if column in columns:
+                    made[k, columns.index(column)] = value
+        return made
+
+    def matrix(self) -> Array:
+        """The full matrix."""
+        made = np.zeros(self.shape)
+        made[self.rows, self.columns] = self.values
+        return made
+
+    def largest(self) -> Array:
+        """The largest entry of each row, its sign left out, (m,)."""
+        found = np.zeros(self.shape[0])
+        np.maximum.at(found, self.rows, np.abs(self.values))
+        return found
+
+
+Rows = Array | SparseRows
+
+
+def is_finite(rows: Rows) -> bool:
+    """Whether all entries are finite."""
+    return bool(np.isfinite(rows.values if isinstance(rows, SparseRows) else rows).all())
+
+
+def largest_in_rows(rows: Rows) -> Array:
+    """The largest entry of each row, its sign left out."""
+    return rows.largest() if isinstance(rows, SparseRows) else np.abs(rows).max(axis=1, initial=0.0)
+
+
+def norms(rows: Rows) -> Array:
+    """The length of each row."""
+    if isinstance(rows, SparseRows):
+        return np.sqrt(np.bincount(rows.rows, rows.values**2, rows.shape[0]))
+    lengths: Array = np.linalg.norm(rows, axis=1)
+    return lengths
+
+
+def apart(rows: SparseRows) -> list[Integers]:
+    """The columns in groups, in each of which no two have entries in the same row."""
+    in_row: list[list[int]] = [[] for _ in range(rows.shape[0])]
+    in_column: list[list[int]] = [[] for _ in range(rows.shape[1])]
+    for i, j in zip(rows.rows.tolist(), rows.columns.tolist(), strict=True):
+        in_row[i].append(j)
+        in_column[j].append(i)
+    group_of = [-1] * rows.shape[1]
+    groups: list[list[int]] = []
+    for j, of_rows in enumerate(in_column):
+        taken = {group_of[k] for i in of_rows for k in in_row[i]}
+        group = next((g for g in range(len(groups)) if g not in taken), len(groups))
+        if group == len(groups):
+            groups.append([])
+        groups[group].append(j)
+        group_of[j] = group
+    return [np.array(group, dtype=np.int64) for group in groups]
+
+
+def rows_of(matrix: Array) -> SparseRows:
+    """The entries of a matrix that are not zero."""
+    rows, columns = np.nonzero(matrix)
+    return SparseRows(rows, columns, matrix[rows, columns], matrix.shape)  # type: ignore[arg-type]

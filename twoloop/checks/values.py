@@ -1,0 +1,80 @@
+"""Whether values of entries belong to the dense matrices beside them, and M has them on both sides."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+SAME = 1e-11  # relative: values that two callbacks must share
+UNSYMMETRIC = 1e-10  # of the largest entry of M
+
+
+def check_values(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare what `mass_values` and `jacobian_values` give with dense callbacks that are given beside them.
+
+    Raises
+    ------
+    ValueError
+        Naming the callback, the entry and both numbers.
+    """
+    for kind, (rows, columns) in system.entries.items():
+        if kind in system.scattered:
+            continue
+        dense, values = system.evaluate(kind, t, q), system.evaluate(f"{kind}_values", t, q)
+        level = SAME * float(np.abs(dense).max(initial=0.0))
+        np.subtract.at(dense, (rows, columns), values)
+        off = np.abs(dense, out=dense)
+        if not off.max(initial=0.0) > level:
+            continue
+        i, j = (int(each) for each in np.unravel_index(int(off.argmax()), off.shape))
+        given = float(values[(rows == i) & (columns == j)].sum())
+        raise ValueError(
+            f"{kind}_values of {system.name!r} does not give what {kind} gives: entry {(i, j)} is {given:.9g} and "
+            f"{float(system.evaluate(kind, t, q)[i, j]):.9g} (near t = {t:.10g}). Correct the values, or name the "
+            f"entry in {kind}_entries, or leave one of the two callbacks out"
+        )
+
+
+def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """Say which entry of M is not that of its transpose, or None."""
+    if "mass" in system.entries:
+        i, j, one, other = _largest_of_values(system, t, q)
+    else:
+        i, j, one, other = _largest_of_matrix(system.mass(t, q))
+    if one == other:
+        return None
+    return (
+        f"mass of {system.name!r} must be symmetric; at t = {t:.10g} its entry {(i, j)} is {one:.9g} and its "
+        f"entry {(j, i)} is {other:.9g}"
+    )
+
+
+def _largest_of_matrix(mass: Array) -> tuple[int, int, float, float]:
+    """The entry that differs most from that of the transpose, and both; (0, 0, 0.0, 0.0) where that is rounding."""
+    off = np.abs(mass - mass.T)
+    if not off.max() > UNSYMMETRIC * np.abs(mass).max():
+        return 0, 0, 0.0, 0.0
+    i, j = sorted(int(each) for each in np.unravel_index(int(off.argmax()), off.shape))
+    return i, j, mass[i, j], mass[j, i]
+
+
+def _largest_of_values(system: ConstrainedSystem, t: float, q: Array) -> tuple[int, int, float, float]:
+    """The same from the entries."""
+    (rows, columns), values = system.entries["mass"], system.mass_values(t, q)
+    where, other = rows * system.n_q + columns, columns * system.n_q + rows
+    places = np.unique(where)  # of both triangles
+    one = np.bincount(np.searchsorted(places, where), values, len(places))
+    two = np.bincount(np.searchsorted(places, other), values, len(places))
+    off = np.abs(one - two)
+    if not off.max(initial=0.0) > UNSYMMETRIC * np.abs(one).max(initial=0.0):
+        return 0, 0, 0.0, 0.0
+    k = int(off.argmax())
+    i, j = int(places[k] // system.n_q), int(places[k] % system.n_q)
+    return (i, j, one[k], two[k]) if i < j else (j, i, two[k], one[k])

@@ -1,0 +1,183 @@
+"""Factors of the matrix of a large system by its program, see static_program.py, and solutions with them.
+
+A row of G that counts has a negative pivot, the square of what is left of it beside the rows before. Over what the
+bodies put into it, that is the sine squared of the angle between the row and those before, in the metric of M^-1:
+`smallest` is the least of these. A row that does not count has 0 in the place of 1 / pivot, which takes it out of the
+solution without another program. Solutions lose as many digits as the smallest pivot has; refined against M and G they
+have them again.
+
+Where a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with
+M + s g g^T accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need not be
+positive definite but on what such rows allow.
+"""
+
+from twoloop.kernels.algebra.static_program import (
+    N_COORDINATES,
+    N_PIVOTS,
+    columns_of,
+    jacobian_of,
+    mass_of,
+    order_of,
+    stiffened_of,
+    targets_of,
+)
+from twoloop.kernels.data.common import compiled, merged
+
+NOT_DEFINITE = -1.0  # what stands for the smallest pivot where one of M is not positive
+
+
+@compiled
+def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
+    """How much each row stiffens M: as much as the largest entry on its diagonal, of the rows that count."""
+    n_q = program[N_COORDINATES]
+    for k in range(program[N_PIVOTS]):
+        scratch[k] = 0.0
+    rows, columns, _ = mass_of(program)
+    for k in range(rows.size):
+        if rows[k] == columns[k]:
+            scratch[rows[k]] += mass[k]
+    _, columns, _ = jacobian_of(program)
+    which, first, second, _ = stiffened_of(program)
+    for u in range(which.size):
+        stiffness[which[u]] = 0.0
+    for u in range(which.size):
+        if first[u] == second[u]:
+            row, number = which[u], jacobian[first[u]]
+            stiffness[row] = max(stiffness[row], scratch[columns[first[u]]])
+            scratch[n_q + row] += number * number
+    for u in range(which.size):
+        row = which[u]
+        if scratch[n_q + row] > 0.0:
+            stiffness[row] *= counts[row] / scratch[n_q + row]
+            scratch[n_q + row] = 0.0
+
+
+@merged
+def load(program, mass, jacobian, counts, values, stiffness, scratch):
+    """The numbers of M and G into their slots."""
+    for s in range(values.size):
+        values[s] = 0.0
+    _, _, slots = mass_of(program)
+    for k in range(slots.size):
+        values[slots[k]] += mass[k]
+    _, _, slots = jacobian_of(program)
+    for k in range(slots.size):
+        values[slots[k]] += jacobian[k]
+    which, first, second, slots = stiffened_of(program)
+    if which.size > 0:
+        _find_stiffness(program, mass, jacobian, counts, stiffness, scratch)
+        for u in range(which.size):
+            values[slots[u]] += stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
+
+
+@compiled
+def factor(program, counts, values, sizes, least):
+    """The factors in the place of the numbers, 1 / pivot on the diagonal; the smallest pivot of a row over its size.
+
+    NOT_DEFINITE where M is not positive definite on what the rows so far allow. `counts` is 0 for rows that do not
+    count, and becomes 0 for those whose pivot is below `least` of its size; these are not among the smallest.
+    `sizes` is scratch.
+    """
+    (
+        n_q,
+        n,
+    ) = program[N_COORDINATES], program[N_PIVOTS]
+    order, targets = order_of(program), targets_of(program)
+    begin, row_of = columns_of(program)
+    for k in range(n):
+        sizes[k] = 0.0
+    smallest, u = 1.0, 0
+    for k in range(n):
+        first, last = n + begin[k], n + begin[k + 1]
+        pivot, of_row = values[k], order[k] >= n_q
+        if of_row:
+            row = order[k] - n_q
+            if counts[row] != 0.0 and not -pivot > least * sizes[k]:  # also true for NaN
+                counts[row] = 0.0
+            if counts[row] == 0.0:
+                values[k] = 0.0
+                for s in range(first, last):
+                    values[s] = 0.0
+                u += (last - first) * (last - first + 1) // 2
+                continue
+            smallest = min(smallest, -pivot / sizes[k])
+        elif not pivot > 0.0:
+            return NOT_DEFINITE
+        inverse = 1.0 / pivot
+        values[k] = inverse
+        for s in range(first, last):
+            share = values[s] * inverse
+            if not of_row:
+                sizes[row_of[s - n]] += share * values[s]
+            for r in range(s, last):
+                values[targets[u]] -= share * values[r]
+                u += 1
+            values[s] = share
+    return smallest
+
+
+@compiled
+def solve(program, values, stiffness, x, y):
+    """The solution for x = [r, c] in its place, by the factors; y is scratch."""
+    n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
+    # of M + s g g^T: the right-hand side is r + s g c, and the multiplier less by s c, so that r serves
+    begin, row_of = columns_of(program)
+    for k in range(n):
+        y[k] = x[order[k]]
+    for k in range(n):
+        share = y[k]
+        for s in range(begin[k], begin[k + 1]):
+            y[row_of[s]] -= values[n + s] * share
+    for k in range(n - 1, -1, -1):
+        total = y[k] * values[k]
+        for s in range(begin[k], begin[k + 1]):
+            total -= values[n + s] * y[row_of[s]]
+        y[k] = total
+    for k in range(n):
+        i = order[k]
+        x[i] = y[k] + stiffness[i - n_q] * x[i] if i >= n_q else y[k]
+
+
+@compiled
+def subtract_product(program, mass, jacobian, counts, x, b):
+    """b - [M x_q + G^T x_c, G x_q] in the place of b; rows that do not count stay zero."""
+    n_q = program[N_COORDINATES]
+    rows, columns, _ = mass_of(program)
+    for k in range(rows.size):
+        b[rows[k]] -= mass[k] * x[columns[k]]
+    rows, columns, _ = jacobian_of(program)
+    for k in range(rows.size):
+        i, j = rows[k], columns[k]
+        b[j] -= jacobian[k] * x[n_q + i]
+        b[n_q + i] -= jacobian[k] * x[j]
+    for i in range(counts.size):
+        if counts[i] == 0.0:
+            b[n_q + i] = 0.0
+
+
+@compiled
+def refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
+    """Solve for x = [r, c] in its place, and refine the solution so many times; the rest is scratch.
+
+    Returns the largest of the last correction over the largest of the solution; 0 without any.
+    """
+    n_q, change = program[N_COORDINATES], 0.0
+    for k in range(x.size):
+        right[k] = x[k]
+    for i in range(counts.size):
+        if counts[i] == 0.0:
+            x[n_q + i] = right[n_q + i] = 0.0
+    solve(program, values, stiffness, x, y)
+    for _ in range(times):
+        for k in range(x.size):
+            residual[k] = right[k]
+        subtract_product(program, mass, jacobian, counts, x, residual)
+        solve(program, values, stiffness, residual, y)
+        largest = change = 0.0
+        for k in range(n_q):
+            x[k] += residual[k]
+            largest, change = max(largest, abs(x[k])), max(change, abs(residual[k]))
+        for k in range(n_q, x.size):
+            x[k] += residual[k]
+        change = change / largest if largest > 0.0 else 0.0
+    return change

@@ -1,0 +1,82 @@
+"""What a system is given: which callbacks, entries and parameters, and what stands for those that are left out."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_real, shown
+from twoloop.kernels.compile.callbacks import KINDS, stand_in
+from twoloop.kernels.compile.private import Dispatcher
+from twoloop.problem.adapters import through_python
+from twoloop.problem.entries import VALUES_OF, Entries, check_entries
+from twoloop.problem.jacobian import differenced_jacobian
+
+Array = NDArray[np.float64]
+
+
+def checked_parameters(parameters: Any) -> Array:
+    """The parameters as a new vector, or what is wrong with them."""
+    p = check_real("parameters", parameters)
+    if p.ndim != 1 or not np.isfinite(p).all():
+        raise ValueError(f"parameters must be a vector of finite numbers; given {shown(parameters)}")
+    return p
+
+
+def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
+    """The callbacks that are given, in the order of KINDS, or what is wrong with their choice."""
+    unknown = [kind for kind in callbacks if kind not in KINDS]
+    if unknown:
+        raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
+    sizes = {"n_c": n_c, "n_a": n_a}
+    needed = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
+    missing = [kind for kind in needed if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
+    if callbacks.get("mass_values") is not None:
+        missing = [kind for kind in missing if kind != "mass"]
+    if missing:
+        rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
+        raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
+    given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
+    if given.get("mass", "") is None:
+        del given["mass"]  # mass_values are there
+    given = {
+        kind: each
+        for kind, each in given.items()
+        if not (
+            KINDS[kind].optional and (each is None or (KINDS[kind].absent != "differences" and each is stand_in(kind)))
+        )
+    }
+    for kind, entry in KINDS.items():
+        if kind in given and sizes.get(entry.shape[0], 1) == 0:
+            of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
+            raise ValueError(f"{kind} goes with {of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
+    known = {*given, *(("jacobian",) if "jacobian_values" in given else ())}
+    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in known]
+    if missing:
+        raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
+    if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
+        raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
+    return given
+
+
+def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
+    """Where the entries of M and C_q are whose values callbacks give, or what is wrong with them."""
+    made: dict[str, Entries] = {}
+    for kind, entries, shape in (("mass", mass, (n_q, n_q)), ("jacobian", jacobian, (n_c, n_q))):
+        values, name = VALUES_OF[kind], f"{kind}_entries"
+        if (callbacks.get(values) is None) != (entries is None):
+            given, other = (name, values) if entries is not None else (values, name)
+            raise ValueError(f"{values} and {name} go together: {given} is given, and {other} is not")
+        if entries is not None:
+            made[kind] = check_entries(name, entries, shape, symmetric=kind == "mass")
+    return made
+
+
+def in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
+    """The callback that stands in the place of one that is not given."""
+    if KINDS[kind].absent != "differences" or "constraint" not in given:
+        return stand_in(kind)
+    constraint = given["constraint"]
+    # what is called in Python cannot be watched, and need not be: it is looked up at every call
+    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
+    return differenced_jacobian(constraint, watched)

@@ -1,0 +1,109 @@
+"""A guess for a large system put on its constraints by sparse factors: consistent_state without its matrices.
+
+What is not plain sailing is left to it: rows that depend on one another beside the constraints only nearly, places near
+a dead centre, other guesses that may lead elsewhere.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import is_at_rounding
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
+from twoloop.kernels.evaluation import tasks
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.static_form import static_form
+from twoloop.run.workspace import kit_of, workspace
+
+Array = NDArray[np.float64]
+
+CLEAR = 1e-5  # sine of a row to others, below which a position may be near a dead centre
+STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
+
+
+class _Metric:
+    """The static form with the unit matrix in the place of M: its corrections are the least of all coordinates."""
+
+    def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
+        self.system, self.t, self.rank = system, t, rank
+        self.form = form._replace(static=form.static._replace(dense_mass=False), mass_pattern=np.zeros((0, 0)))
+        self.kit = kit_of(system, t, q, None, self.form)
+        self.kit.flags[common.CONSTANT_MASS], self.kit.flags[common.MASS_VALUES_GIVEN] = 1, 0
+        self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, (rank, rank), self.form)
+        rows, columns = form.mass
+        diagonal = np.where(rows == columns, 1.0, 0.0)
+        self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
+
+    def ask(self, task: int, q: Array, v: Array, a: Array | None = None) -> int:
+        """What the inner loop says to a task; q and v are changed."""
+        a = self.work.x if a is None else a
+        code = direct(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, self.work.lam)
+        return int(code)
+
+    def nearest(self, way: Array) -> Array:
+        """What the constraints, by the factors there are, leave of a displacement."""
+        rows = self.system.sparse_rows(self.t, self.at)
+        change = np.zeros(len(way))
+        zero, residual = np.zeros(len(way)), np.ascontiguousarray(rows @ way)
+        self.ask(tasks.SOLVE, zero, residual, change)
+        return way - change
+
+    def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
+        """q and v on the constraints."""
+        q, on_the_way = q.copy(), v.copy()
+        if self.ask(tasks.RENEW, q, v) != common.DONE or self.ask(tasks.RESTORE, q, on_the_way) != common.DONE:
+            return None
+        v = v.copy()  # the least change of the velocities is that where positions end
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.TANGENTS):  # twice, to rounding
+            if self.ask(task, q, v) != common.DONE:
+                return None
+        self.at = q
+        return q, v
+
+
+def project_sparsely(
+    system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
+) -> tuple[Array, Array] | None:
+    """(q, v) moved to the constraints by the least change; None where that is not to be left to sparse factors."""
+    form = static_form(system, t, q)
+    if form is None:
+        return None
+    with np.errstate(all="ignore"):
+        metric = _Metric(system, t, q, form)
+    code = metric.ask(tasks.RENEW, q.copy(), v.copy())
+    if code == common.RANK_DIFFERS:
+        metric = _Metric(system, t, q, form, int(metric.work.notes[common.RANK]))
+    elif code != common.DONE:
+        return None
+    found = metric.project(q, v)
+    if found is None or metric.work.notes[common.PIVOT] < CLEAR:
+        return None
+    there = _Metric(system, t, found[0], form, metric.rank)
+    if there.ask(tasks.RENEW, found[0].copy(), v.copy()) != common.DONE:  # other rows count on the constraints
+        return None
+    rows, rate = system.sparse_rows(t, found[0]), system.rates(t, found[0])
+    if not is_at_rounding(system.constraint(t, found[0]), rows, found[0]):
+        return None
+    if not is_at_rounding(rows @ found[1] + rate, rows, found[1], rate):
+        return None
+    moved = found[0] - q
+    if check_assembly and np.abs(moved).max() > 0.0 and not _same_from_elsewhere(metric, found[0], moved):
+        return None
+    return found
+
+
+def _same_from_elsewhere(metric: _Metric, found: Array, moved: Array) -> bool:
+    """Whether other guesses, as far off, end where C_q sends them."""
+    far = float(np.abs(moved).max())
+    generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(found)))
+    rest = np.zeros(len(found))
+    for way in (-2.0 * moved, far * generic[0], far * generic[1]):
+        if metric.project(found, rest) is None:
+            return False
+        expected = found + metric.nearest(way)
+        again = metric.project(found + way, rest)
+        if again is None or np.abs(again[0] - expected).max() > STRAIGHT * np.abs(way).max():
+            return False
+    return True

@@ -1,0 +1,131 @@
+"""Whether a run may use the static form, for large systems: where the entries of M and C_q are, and the program."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import NEARBY, pattern_of
+from twoloop.kernels.algebra.static_order import bodies_of
+from twoloop.kernels.algebra.static_program import (
+    N_OFF,
+    N_PIVOTS,
+    N_UPDATES,
+    Entries,
+    static_program,
+)
+from twoloop.kernels.layout import Static
+from twoloop.methods.plan import Plan
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+LARGE = 100  # coordinates from which on it is faster than the forms of saddle_point.py: measured on chains
+SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
+SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
+
+
+class StaticForm(NamedTuple):
+    """The program of a system, and what a workspace for it needs."""
+
+    program: NDArray[np.int32]
+    static: Static
+    mass: Entries
+    pattern: Array  # of a dense Jacobian, (n_c, n_q), 1 where it has entries; of no size beside jacobian_values
+    mass_pattern: Array  # of a dense M that is not constant, likewise
+
+
+def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
+    """The static form of a system for runs by these plans; None where it does not serve, or would not pay."""
+    if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
+        return None
+    known = "gamma" in system.given or system.functions.gamma_program.size > 0
+    if not known or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
+        return None
+    return system.remembered("static form", lambda: _made(system, t0, q0))  # type: ignore[no-any-return]
+
+
+def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
+    pattern, mass_pattern = np.zeros((0, system.n_q)), np.zeros((0, 0))
+    dense_mass = False
+    if "jacobian" in system.entries:
+        jacobian = system.entries["jacobian"]
+    else:
+        pattern = pattern_of(system, t0, q0)
+        jacobian = _places(pattern)
+    if "mass" in system.entries:
+        mass = system.entries["mass"]
+    else:
+        found = _mass_pattern(system, t0, q0)
+        mass, dense_mass = _places(found), not system.constant_mass
+        mass_pattern = found if dense_mass else mass_pattern
+    if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
+        return None
+    together = [joint.translation + joint.rotation for joint in system.joints]
+    stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
+    program = static_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
+    if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
+        return None
+    n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
+    static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
+    return StaticForm(program, static, mass, pattern, mass_pattern)
+
+
+def _stiff_rows(
+    system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
+) -> list[int]:
+    """Rows of single bodies whose M is singular, with no entry but where M has some: see static_factors.py."""
+    values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
+    body_of = np.array(bodies_of(system.n_q, mass, together))
+    coordinates: dict[int, list[int]] = {}
+    for j, body in enumerate(body_of.tolist()):
+        coordinates.setdefault(body, []).append(j)
+    blocks: dict[int, Array] = {body: np.zeros((len(own), len(own))) for body, own in coordinates.items()}
+    place = {j: k for own in coordinates.values() for k, j in enumerate(own)}
+    there = set()
+    for i, j, value in zip(*(each.tolist() for each in (*mass, values)), strict=True):
+        blocks[int(body_of[i])][place[i], place[j]] += value
+        there.add((i, j))
+    singular = {body for body, block in blocks.items() if not _is_definite(block)}
+    columns: dict[int, list[int]] = {}
+    for i, j in zip(*(each.tolist() for each in jacobian), strict=True) if singular else ():
+        columns.setdefault(i, []).append(j)
+    return [
+        i
+        for i, own in columns.items()
+        if body_of[own[0]] in singular and all((j, k) in there for j in own for k in own)
+    ]
+
+
+def _is_definite(block: Array) -> bool:
+    values = np.linalg.eigvalsh(block) if np.isfinite(block).all() else np.zeros(1)
+    return bool(values[0] > SINGULAR * values[-1])
+
+
+def _is_sparse(n_q: int, n_entries: int) -> bool:
+    """Whether there are so few entries that it is worth while to look for an order."""
+    return n_entries <= SPARSE * n_q * n_q + 24 * n_q
+
+
+def _dense_work(n_q: int, n_c: int) -> float:
+    """Multiplications of one evaluation by Schur's complement, about."""
+    return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
+
+
+def _places(pattern: Array) -> Entries:
+    rows, columns = np.nonzero(pattern)
+    return rows.astype(np.int64), columns.astype(np.int64)
+
+
+def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+    """1 where M has an entry at a position or, if it is not constant, near it."""
+    found = np.zeros((system.n_q, system.n_q))
+    size = np.maximum(np.abs(q0), np.abs(q0).max())
+    ways = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
+    for share, way in zip(NEARBY[:1] if system.constant_mass else NEARBY, ways, strict=False):
+        try:
+            mass = system.mass(t0, q0 + share * size * way)
+        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
+            continue
+        found[(mass != 0.0) | (mass.T != 0.0)] = 1.0
+    return found
