@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twoloop.exported import *  # noqa: F403
+# ruff: noqa: F405, a test compares the names below with those of `exported`
 
 __version__ = "0.1.0"
 

@@ -1,4 +1,4 @@
-"""The generalised-alpha method on the equations at index 3 (Arnold & Brüls, Multibody Syst. Dyn. 18, 2007): 60 lines."""
+"""The generalised-alpha method on the equations at index 3 (Arnold & Brüls, Multibody Syst. Dyn. 18, 2007)."""
 
 import numpy as np
 
@@ -14,7 +14,10 @@ def solved(M, J, right, rows):
     heavy, length = np.abs(M).max(), np.linalg.norm(J, axis=1)  # in any units the matrix has entries of size 1
     unit = J / length[:, None]
     matrix = np.block([[M / heavy, unit.T], [unit, np.zeros((m, m))]])
-    both = np.linalg.lstsq(matrix, np.concatenate([right / heavy, rows / length]), rcond=1e-11)[0]
+    whole = np.concatenate([right / heavy, rows / length])
+    if not np.isfinite(whole).all():
+        raise RuntimeError("forces or constraints are not finite")
+    both = np.linalg.lstsq(matrix, whole, rcond=1e-11)[0]
     return both[:n], both[n:] * heavy / length
 
 

@@ -1,4 +1,4 @@
-"""RATTLE (Andersen, J. Comput. Phys. 52, 1983), for constant masses and forces without velocities: 50 lines."""
+"""RATTLE (Andersen, J. Comput. Phys. 52, 1983), for constant masses and forces without velocities."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The classical Runge-Kutta method on the equations at index 1, put on the constraints after each step: 40 lines."""
+"""The classical Runge-Kutta method on the equations at index 1, put on the constraints after each step."""
 
 import numpy as np
 
@@ -11,6 +11,8 @@ def acceleration(problem, t, q, v):
     rows = J / length[:, None]
     matrix = np.block([[M / heavy, rows.T], [rows, np.zeros((m, m))]])
     right = np.concatenate([problem.force(t, q, v) / heavy, problem.gamma(t, q, v) / length])
+    if not np.isfinite(right).all():
+        raise RuntimeError(f"forces are not finite at t = {t:.6g}")
     both = np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
     return both[:n], both[n:] * heavy / length
 

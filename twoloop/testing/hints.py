@@ -6,11 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from twoloop.testing.accelerations import mistaken_acceleration
 from twoloop.testing.changes import in_a_frame
 from twoloop.testing.findings import Finding
 from twoloop.testing.known_problem import Array
 from twoloop.testing.measuring import Observed, Settings, allowed, forces_of_constraints, violations
+from twoloop.testing.mistakes import mistaken_acceleration
 from twoloop.testing.simulated import Simulate, seen_back, simulated
 
 CLEAR = 0.1  # of an error, to which the right explanation reduces it
@@ -116,9 +116,9 @@ def _velocities(e: Evidence) -> str:
             "The velocities are those of one step later.": motion.v + h * a,
         }
     start = max(1, motion.t.size // 20)
-    error = np.abs(run.v - motion.v)[start:].max()
+    error = np.linalg.norm((run.v - motion.v)[start:])
     for text, other in others.items():
-        if np.abs(run.v - other)[start:].max() < 2.0 * CLEAR * error:
+        if np.linalg.norm((run.v - other)[start:]) < 2.0 * CLEAR * error:
             return f"Positions are right and velocities are not. {text}"
     held = "" if "velocity constraints" not in e.failed else " They do not obey C_q v + C_t = 0 either: project them."
     return (
@@ -130,12 +130,18 @@ def _velocities(e: Evidence) -> str:
 def _drift(e: Evidence) -> str:
     if "constraints" not in e.failed:
         return ""
-    off, _ = violations(e.observed.problem, e.observed.runs[-1], e.observed.motion.scales)
+    found = [violations(e.observed.problem, run, e.observed.motion.scales)[0] for run in e.observed.runs[-2:]]
+    off = found[-1]
     early, late = off[1:11].max(), off[-30:].max()
     if late > 4.0 * early:
         return (
             "The violation of C grows along the run: only accelerations (or velocities) obey the constraints. Project "
             "positions and velocities after each step, or stabilise (GGL; Baumgarte leaves a rest)."
+        )
+    if e.settings.steps is not None and len(found) > 1 and found[0].max() > 1.5 * off.max():
+        return (
+            "The violation of C falls with the steps and does not grow along the run: C = 0 is asked for at another "
+            "instant than that of the state (t instead of t + h?), or of a state that is changed afterwards."
         )
     return (
         "The violation of C is there from the first steps and does not grow: an iteration for the positions stops too "
@@ -150,7 +156,7 @@ def _floor(e: Evidence) -> str:
         return ""
     return (
         f"The error stays at {max(each.max() for each in errors[-1:]):.1g} however fine the steps: not the method "
-        "but the model is wrong (a mass, a force, a sign), or an iteration, a difference quotient or a regularisation ends it."
+        "but the model is wrong (a mass, a force, a sign), or an iteration, a difference quotient or a penalty ends it."
     )
 
 
@@ -161,7 +167,9 @@ def _orders(e: Evidence) -> str:
     seen, said = float(lost[0].measured), e.settings.order
     where = lost[0].property.removeprefix("order of ")
     if said is not None and seen > 0.6 and abs(said - 1.0 - seen) < 0.4:
-        start = f"One order of {where} is lost, {seen:.1f} instead of {said:g}: a coefficient, or a term at another time"
+        start = (
+            f"One order of {where} is lost, {seen:.1f} instead of {said:g}: a coefficient, or a term at another time"
+        )
     elif said is not None:
         start = f"The order of {where} is {seen:.1f} instead of {said:g}"
     else:
@@ -209,13 +217,16 @@ def _multipliers(e: Evidence) -> str:
 
 
 def _frame(e: Evidence) -> str:
-    middle = e.observed.settings[len(e.observed.settings) // 2]
+    n, motion = len(e.observed.settings) // 2, e.observed.motion
+    middle, least = e.observed.settings[n], 10.0 * e.observed.errors("q")[n].max() + 1e-6
+    if e.settings.tolerances:
+        least = max(least, float(allowed(motion, middle).max()))
     wrong = []
     for name, turn, move in (("turned", 0.7, 0.0), ("moved", 0.0, 1.0)):
         seen = in_a_frame(e.observed.problem, turn, move)
-        run = seen_back(simulated(e.simulate, seen.problem, e.observed.motion.t, middle), seen)
-        error = np.abs(run.q - e.observed.motion.q).max() / e.observed.motion.scales[0] if run.complete else np.inf
-        if error > float(e.failed["frame"].allowed if not isinstance(e.failed["frame"].allowed, str) else 0.0):
+        run = seen_back(simulated(e.simulate, seen.problem, motion.t, middle), seen)
+        error = np.abs(run.q - motion.q).max() / motion.scales[0] if run.complete else np.inf
+        if error > least:
             wrong.append(name)
     if wrong == ["turned"]:
         return (
@@ -237,16 +248,29 @@ def _units(e: Evidence) -> str:
     )
 
 
+def _where(e: Evidence) -> str:
+    """Nothing else fits: from when on the motion is another one."""
+    motion = e.observed.motion
+    off = np.flatnonzero(e.position > 0.01)
+    if not off.size:
+        return ""
+    return (
+        f"Off by 1 % from t = {motion.t[off[0]]:.3g} s on, of {motion.t[-1]:.3g} s. Compare accelerations there with "
+        "problem.acceleration(t, q, v)."
+    )
+
+
 MOTION: tuple[Callable[[Evidence], str], ...] = (
     _output,
     _singular,
     _acceleration,
     _rates_of_time,
     _velocities,
-    _orders,
-    _floor,
     _drift,
+    _floor,
+    _orders,
     _slack,
+    _where,
 )
 OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
 

@@ -13,6 +13,7 @@ HELD = 10.0  # tolerances by which positions may be off the constraints, at any 
 HELD_RATES = 100.0  # and velocities
 HELD_BY_STEPS = 1e-8  # what positions may be off the constraints in runs of fixed steps, whatever their length
 ROUNDING = 1e-9  # of such runs, times the growth: errors below are not compared
+UNRESOLVED = 1e-2  # what steps longer than a stiff vibration may leave, however long they are
 LAM_DIGITS = 6.0  # of the known multipliers, below which these are not compared
 
 
@@ -46,6 +47,12 @@ class Observed:
         scale = dict(zip("qv", self.motion.scales, strict=True))[kind]
         known = getattr(self.motion, kind)
         return [np.abs(getattr(run, kind) - known).max(axis=1) / scale for run in self.runs]
+
+    @property
+    def rounding(self) -> Array:
+        """What is not compared in runs of fixed steps (n_t,)."""
+        stiff = UNRESOLVED if "stiff" in self.problem.tags else 0.0
+        return ROUNDING * self.motion.growth + stiff
 
     def floor(self, kind: str) -> Array:
         """What is not told from rounding (n_t,): the digits of the reference, and rounding that has grown."""

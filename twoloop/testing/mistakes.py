@@ -1,6 +1,7 @@
 """What a simulator takes for the acceleration, told from its velocities, and which mistake would make it so."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,8 +11,8 @@ from twoloop.testing.simulated import Simulate, simulated
 
 PLACES = range(0, 86, 5)  # of the known motion, from which the simulator is started
 LATER = 10  # output times after which it is looked at
-TELLS = 0.02  # relative difference from the true acceleration that is one
-EXPLAINS = 0.05  # of that difference, which may remain
+SURE = 3.0  # times the change by a finer difference quotient, from which on a difference of accelerations is one
+EXPLAINS = 0.15  # of the difference from the true acceleration, which may remain
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
 
@@ -73,24 +74,40 @@ MISTAKES: dict[str, Mistake] = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """An acceleration as a simulator has it at a state of its own, how far it is known, and the true one."""
+
+    problem: KnownProblem
+    t: float
+    q: Array
+    v: Array
+    a: Array
+    doubt: float
+    true: Array
+    free: Array  # directions (n_free, n_q) that the constraints allow
+
+
 def mistaken_acceleration(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> str:
     """Which mistake explains the accelerations of a simulator, or ""; each is started on the known motion."""
-    found: list[set[str]] = []
-    for k in _telling(problem):
-        later = begun_later(problem, k, LATER + 1)
-        seen = _own_acceleration(simulate, later, setting, by_steps)
-        if seen is None:
-            continue
-        t, q, v, a = seen
-        true = later.acceleration(t, q, v)[0]
-        if np.abs(a - true).max() < TELLS * np.abs(true).max():
-            continue
-        free = np.linalg.svd(later.jacobian(t, q))[2][np.linalg.matrix_rank(later.jacobian(t, q), rtol=1e-9) :]
-        found.append(
-            {name for name, mistake in MISTAKES.items() if _explains(a, true, _tried(mistake, later, t, q, v), free)}
-        )
-    common = set.intersection(*found) if len(found) > 1 else set()  # once may be chance
-    return next((name for name in MISTAKES if name in common), "")
+    tries = (_seen(simulate, begun_later(problem, k, LATER + 1), setting, by_steps) for k in _telling(problem))
+    places = [seen for seen in tries if seen is not None]
+    if len(places) < 2:  # once may be chance
+        return ""
+    best, least = "", EXPLAINS
+    for name, mistake in MISTAKES.items():
+        others = [_tried(mistake, each.problem, each.t, each.q, each.v) for each in places]
+        for free_only in (False, True):
+            rest, gap = 0.0, 0.0
+            for each, other in zip(places, others, strict=True):
+                project = each.free if free_only else np.eye(each.a.size)
+                off = np.linalg.norm(project @ (each.a - each.true))
+                if off > SURE * each.doubt and np.linalg.norm(project @ (other - each.true)) > SURE * each.doubt:
+                    gap += float(off**2)
+                rest += float(np.linalg.norm(project @ (each.a - other)) ** 2)
+            if gap > 0.0 and np.sqrt(rest / gap) < least:
+                best, least = name, float(np.sqrt(rest / gap))
+    return best
 
 
 def _tried(mistake: Mistake, problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
@@ -116,27 +133,24 @@ def _telling(problem: KnownProblem) -> list[int]:
     return sorted(shows, key=lambda k: -shows[k])[:3]
 
 
-def _own_acceleration(
-    simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool
-) -> tuple[float, Array, Array, Array] | None:
+def _seen(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> Seen | None:
     """A state of a run near its end, and the acceleration there by differences; None where it does not run."""
     first, last = problem.t_span
     interval = (last - first) / (LATER + 1)
     step = 0.125 * interval
-    times = first + interval * LATER + np.array([-step, 0.0, step])
+    times = first + interval * LATER + step * np.arange(-2.0, 3.0)
     run = simulated(simulate, problem, np.concatenate([[first], times]), step if by_steps else setting)
     if not run.complete:
         return None
-    q = run.q[2]
+    t, q, x = float(times[2]), run.q[3], run.q[1:]
+    by_q = (8.0 * (x[3] - x[1]) - (x[4] - x[0])) / (12.0 * step)
     if run.v is not None:
-        return float(times[1]), q, run.v[2], (run.v[3] - run.v[1]) / (2.0 * step)
-    return float(times[1]), q, (run.q[3] - run.q[1]) / (2.0 * step), (run.q[3] - 2.0 * q + run.q[1]) / step**2
-
-
-def _explains(a: Array, true: Array, other: Array, free: Array) -> bool:
-    """Whether a is the mistaken acceleration rather than the true one, as a whole or along what is free."""
-    for project in (np.eye(a.size), free):
-        gap, rest = np.linalg.norm(project @ (other - true)), np.linalg.norm(project @ (a - other))
-        if gap > TELLS * np.linalg.norm(true) and rest < EXPLAINS * gap:
-            return True
-    return False
+        v, u = run.v[3], run.v[1:]
+        rough, a = (u[3] - u[1]) / (2.0 * step), (8.0 * (u[3] - u[1]) - (u[4] - u[0])) / (12.0 * step)
+    else:
+        v, rough = by_q, (x[3] - 2.0 * x[2] + x[1]) / step**2
+        a = (16.0 * (x[3] + x[1]) - 30.0 * x[2] - (x[4] + x[0])) / (12.0 * step**2)
+    true, J = problem.acceleration(t, q, v)[0], problem.jacobian(t, q)
+    values, directions = np.linalg.svd(J)[1:]
+    free = directions[int((values > 1e-9 * values[0]).sum()) :]
+    return Seen(problem, t, q, v, a, float(np.linalg.norm(a - rough)), true, free)

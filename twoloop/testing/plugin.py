@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of the command line, and the list of known failures in pyproject.toml."""
     group = parser.getgroup("twoloop", "check of a simulator of mechanisms")
-    group.addoption("--simulator", metavar="MODULE:FUNCTION", help="simulate(problem, times, tolerance or step) to check")
+    group.addoption(
+        "--simulator", metavar="MODULE:FUNCTION", help="simulate(problem, times, tolerance or step) to check"
+    )
     group.addoption("--simulator-problems", metavar="NAMES", default="smoke", help="smoke, all, or names with commas")
     group.addoption("--simulator-steps", metavar="N,N,...", help="for fixed steps: numbers of steps over the span")
     group.addoption("--simulator-order", type=float, metavar="P", help="for fixed steps: the order of the method")

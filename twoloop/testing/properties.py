@@ -63,7 +63,7 @@ def errors_at_tolerances(observed: Observed, settings: Settings, kind: str) -> I
 def errors_by_steps(observed: Observed, settings: Settings, kind: str) -> Iterator[Finding]:
     """Error with the finest steps, what is left of it for steps that go to zero, and the order."""
     name, errors = observed.problem.name, observed.errors(kind)
-    worst, floor = float(errors[-1].max()), ROUNDING * observed.motion.growth + observed.floor(kind)
+    worst, floor = float(errors[-1].max()), observed.rounding + observed.floor(kind)
     yield Finding(name, f"error of {kind}", worst, MOST, worst <= MOST)
     if len(errors) < 2 or worst > MOST:
         return
@@ -85,7 +85,7 @@ def changes_of(observed: Observed, kind: str) -> list[Array]:
 
 def observed_order(observed: Observed, kind: str) -> float | None:
     """The order of the errors over the last refinement; where the limit is wrong, that of the changes."""
-    floor = ROUNDING * observed.motion.growth + observed.floor(kind)
+    floor = observed.rounding + observed.floor(kind)
     errors, changes, steps = observed.errors(kind), changes_of(observed, kind), observed.settings
     value, rest = still_there(errors, changes, floor)
     if value <= rest:
@@ -111,7 +111,7 @@ def constraints(observed: Observed, settings: Settings) -> Iterator[Finding]:
         yield _worst("velocity constraints", observed, rates, limits)
     elif rates:
         vanish = len(rates) > 1 and rates[-2].max() > 2.0**LEAST_ORDER * rates[-1].max()
-        limit = np.full(floor.shape, MOST if vanish else HELD_BY_STEPS)
+        limit = np.full(floor.shape, MOST) if vanish else HELD_BY_STEPS + observed.rounding
         yield _worst("velocity constraints", observed, [rates[-1]], [limit])
 
 
@@ -123,7 +123,7 @@ def invariant(observed: Observed, settings: Settings, name: str, quantity: Quant
     if settings.tolerances:
         limits = [3.0 * allowed(motion, setting) + floor for setting in observed.settings]
         return _worst(name, observed, found, limits)
-    return _vanishing(observed, name, found, floor + ROUNDING * motion.growth)
+    return _vanishing(observed, name, found, floor + observed.rounding)
 
 
 def multipliers(observed: Observed, settings: Settings) -> Finding:
@@ -136,7 +136,9 @@ def multipliers(observed: Observed, settings: Settings) -> Finding:
             for setting in observed.settings
         ]
         return _worst("multipliers", observed, found, limits)
-    return _vanishing(observed, "multipliers", found, np.minimum(MOST, floor + 1e3 * ROUNDING * motion.growth))
+    return _vanishing(
+        observed, "multipliers", found, np.minimum(MOST, floor + 1e3 * ROUNDING * motion.growth + observed.rounding)
+    )
 
 
 def _vanishing(observed: Observed, name: str, found: list[Array], floor: Array) -> Finding:
@@ -162,5 +164,5 @@ def seen_otherwise(
     if settings.tolerances:
         limit = np.maximum(allowed(motion, setting), 10.0 * base.max()) + observed.floor("q")
     else:
-        limit = 1.5 * np.maximum.accumulate(base) + 1e-7 + ROUNDING * motion.growth
+        limit = 10.0 * np.maximum.accumulate(base) + 1e-6 + observed.rounding
     return _worst(name, there, there.errors("q"), [limit])
