@@ -17,7 +17,7 @@ def solved(M, J, right, rows):
     whole = np.concatenate([right / heavy, rows / length])
     if not np.isfinite(whole).all():
         raise RuntimeError("forces or constraints are not finite")
-    both = np.linalg.lstsq(matrix, whole, rcond=1e-11)[0]
+    both = np.linalg.lstsq(matrix, whole, rcond=1e-7)[0]
     return both[:n], both[n:] * heavy / length
 
 

@@ -137,7 +137,7 @@ FAULTS = [
         RATTLE,
         MARCH,
         MARCH.replace("q, v =", "before, (q, v) = q,").replace("((q, v))", "((q, (q - before) / h))"),
-        "four_bar",
+        "pendulum",
         "middle of the step",
     ),
     Planted("velocities are not projected", RATTLE, "return q, free + change", "return q, free", "four_bar", "velocit"),

@@ -11,7 +11,8 @@ from twoloop.testing import check_simulator
 from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
 from twoloop.testing.known_problems import MAKERS
 
-STEPS = (100, 200, 400)
+STEPS = (100, 200)
+LONG = ("andrews",)  # where an evaluation takes longest
 
 
 def known(edit=lambda problem, q, v, lam: (q, v, lam)):
@@ -33,12 +34,15 @@ def properties_that_fail(report):
 # --- what is right passes
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(fault, id=fault.name, marks=[pytest.mark.slow] if fault.problem in LONG else []) for fault in FAULTS],
+)
 def test_a_planted_fault_is_found_and_named(fault):
     module = module_of(fault.example, fault.old, fault.new)
     report = check_simulator(module.simulate, fault.problem, steps=STEPS, order=ORDERS[fault.example])
     assert not report.passed
-    assert any(fault.words in failure.hint for failure in report.failures), report
+    assert any(fault.words in failure.hint for failure in report.failures), str(report)
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -51,7 +55,7 @@ def test_sound_integrators_pass_on_every_problem(name):
     for example in (RK, ALPHA, RATTLE):
         if name not in beyond.get(example, ()):
             report = check_simulator(module_of(example).simulate, name, steps=(200, 400, 800), order=ORDERS[example])
-            assert report.passed, report
+            assert report.passed, str(report)
 
 
 def by_twoloop(problem, times, tolerance):
@@ -63,8 +67,16 @@ def by_twoloop(problem, times, tolerance):
 
 
 def test_twoloop_passes_its_own_check():
-    report = check_simulator(by_twoloop, ["pendulum", "driven_crank", "heavy_top", "out_of_reach", "force_ends"])
-    assert report.passed, report
+    report = check_simulator(by_twoloop, ["driven_crank", "out_of_reach"], tolerances=[1e-5, 1e-8])
+    assert report.passed, str(report)
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.slow
+def test_twoloop_passes_on_every_problem(name):
+    report = check_simulator(by_twoloop, name)
+    assert report.passed, str(report)
 
 
 def by_scipy(problem, times, tolerance):
@@ -112,7 +124,7 @@ WRONG = [
 def test_what_is_returned_wrongly_is_named(name, edit, words):
     report = check_simulator(known(edit), name)
     hints = [failure.hint for failure in report.failures if failure.property not in ("frame", "units")]
-    assert any(words in hint for hint in hints), report
+    assert any(words in hint for hint in hints), str(report)
 
 
 @pytest.mark.parametrize("name", [name for name, maker in MAKERS.items() if maker().reference is not None])
@@ -189,7 +201,7 @@ def test_a_coarse_step_may_say_no_and_the_finest_may_not():
 
         return simulate
 
-    assert check_simulator(from_step(0.006), "pendulum", steps=STEPS, order=4).passed
+    assert check_simulator(from_step(0.008), "pendulum", steps=STEPS, order=4).passed
     assert properties_that_fail(check_simulator(from_step(1e-3), "pendulum", steps=STEPS)) == {"runs"}
 
 

@@ -10,9 +10,10 @@ import pytest
 
 from tests.processes import run_python
 from tests.testing.planted import EXAMPLES
+from twoloop.testing import plugin
 
 ROOT = Path(__file__).parents[2]
-QUICK = ["--simulator-steps", "100,200", "--simulator-order", "4"]
+QUICK = ["--simulator-steps", "200,400", "--simulator-order", "4"]
 FAULTY = """
 import numpy as np
 def simulate(problem, times, step):
@@ -54,29 +55,36 @@ def test_a_sound_integrator_a_fixture_and_a_report(tmp_path):
 
 def test_a_faulty_one_and_known_failures(tmp_path):
     (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
-    known = "[pytest]\nsimulator_known_failures =\n    pendulum: error of q\n    out_of_reach: says that it ends\n"
+    known = "[pytest]\nsimulator_known_failures = out_of_reach: says that it ends\n"
     (tmp_path / "pytest.ini").write_text(known, encoding="utf-8")
     simulator = ["--simulator", "still:simulate", "--simulator-problems", "pendulum,out_of_reach"]
     done = run_pytest(tmp_path, *simulator, *QUICK, "-rfs")
     assert done.returncode == 1
+    assert "pendulum: error of q: " in done.stdout and "Off by 1 % from t = " in done.stdout
     assert "pendulum: limit of q" not in done.stdout  # the motion is wrong: its limit is not asked for
-    assert "2 xfailed" in done.stdout and " failed" in done.stdout
+    assert "1 failed" in done.stdout and "1 xfailed" in done.stdout
     sound = ["--simulator", f"{EXAMPLES / 'runge_kutta.py'}:simulate", "--simulator-problems", "out_of_reach"]
     done = run_pytest(tmp_path, *sound, *QUICK)
     assert done.returncode == 1 and "XPASS(strict)" in done.stdout  # what was known to fail does not
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("where", "words"),
     [
-        (["--simulator", "nowhere:simulate"], "--simulator nowhere:simulate: ModuleNotFoundError"),
-        (["--simulator", "still.py:run"], "has no attribute 'run'"),
-        (["--simulator", "simulate"], "expected MODULE:FUNCTION or FILE.py:FUNCTION"),
-        (["--simulator", "still.py:simulate", "--simulator-problems", "five_bar"], "given 'five_bar'"),
-        (["--simulator", "still.py:simulate", "--simulator-steps", "30"], "steps must be two or more"),
+        ("nowhere_at_all:simulate", "--simulator nowhere_at_all:simulate: ModuleNotFoundError"),
+        ("missing.py:simulate", "FileNotFoundError"),
+        ("still.py:run", "has no attribute 'run'"),
+        ("still.py:np", "not a function but module"),
+        ("simulate", "expected MODULE:FUNCTION or FILE.py:FUNCTION"),
     ],
 )
-def test_wrong_options(tmp_path, arguments, words):
+def test_what_is_no_simulator(tmp_path, where, words):
     (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
-    done = run_pytest(tmp_path, *arguments)
-    assert done.returncode == 4 and words in done.stdout + done.stderr
+    with pytest.raises(pytest.UsageError, match=words):
+        plugin._loaded(where, tmp_path)
+
+
+def test_wrong_options(tmp_path):
+    (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
+    done = run_pytest(tmp_path, "--simulator", "still.py:simulate", "--simulator-problems", "five_bar")
+    assert done.returncode == 4 and "--simulator: problems must be" in done.stderr and "'five_bar'" in done.stderr

@@ -11,6 +11,7 @@ from twoloop.testing.findings import Finding
 from twoloop.testing.known_problem import Array
 from twoloop.testing.measuring import Observed, Settings, allowed, forces_of_constraints, violations
 from twoloop.testing.mistakes import mistaken_acceleration
+from twoloop.testing.properties import observed_order
 from twoloop.testing.simulated import Simulate, seen_back, simulated
 
 CLEAR = 0.1  # of an error, to which the right explanation reduces it
@@ -99,10 +100,15 @@ def _rates_of_time(e: Evidence) -> str:
     return ""
 
 
+def _one_order_less(e: Evidence) -> bool:
+    """Whether velocities converge an order more slowly than positions."""
+    orders = [observed_order(e.observed, kind) for kind in "qv"] if "order of v" in e.failed else []
+    return len(orders) == 2 and None not in orders and float(orders[1] or 0.0) < float(orders[0] or 0.0) - 0.5
+
+
 def _velocities(e: Evidence) -> str:
     run, motion, problem = e.observed.runs[-1], e.observed.motion, e.observed.problem
-    failed = {"error of v", "limit of v", "order of v"} & set(e.failed)
-    if not failed or {"error of q", "limit of q", "order of q"} & set(e.failed) or run.v is None:
+    if run.v is None or e.wrong("q") or "order of q" in e.failed or not (e.wrong("v") or _one_order_less(e)):
         return ""
     a = np.array([problem.acceleration(*state)[0] for state in zip(motion.t, motion.q, motion.v, strict=True)])
     others = {"The velocities have the other sign.": -motion.v}

@@ -123,11 +123,15 @@ class KnownProblem:
 
 def solved(M: Array, Q: Array, J: Array, right: Array) -> tuple[Array, Array]:
     """Solution a, lam of M a + J^T lam = Q, J a = right, of least norm in lam."""
-    n, m = M.shape[0], J.shape[0]
+    n, m = J.shape[1], J.shape[0]
     matrix = np.block([[M, J.T], [J, np.zeros((m, m))]])
-    # masses and lengths differ by orders: rows and columns alike are brought to size 1 before ranks are told
-    size = np.abs(matrix).max(axis=0)
-    scale = np.where(size > 0.0, 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0)), 1.0)
-    scale[n:] = scale[n:].max(initial=0.0)  # one for all rows, or least norm would mean another
-    whole = np.linalg.lstsq(scale[:, None] * matrix * scale, scale * np.concatenate([Q, right]), rcond=1e-12)[0] * scale
-    return whole[:n], whole[n:]
+    scale = np.ones(n + m)
+    for _ in range(5):  # in any units all rows get a largest entry of 1 (Ruiz 2001), before ranks are told
+        size = np.abs(scale[:, None] * matrix * scale).max(axis=1)
+        scale /= np.sqrt(np.where(size > 0.0, size, 1.0))
+    right = scale * np.concatenate([Q, right])
+    whole, _, rank, _ = np.linalg.lstsq(scale[:, None] * matrix * scale, right, rcond=1e-12)
+    a, lam = np.split(scale * whole, [n])
+    if rank < n + m:  # of least norm in units of the rows, not in those just chosen
+        lam = np.linalg.lstsq(J.T, J.T @ lam, rcond=1e-11)[0]
+    return a, lam

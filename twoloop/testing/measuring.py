@@ -119,7 +119,10 @@ def order(coarse: Array, fine: Array, ratio: float, floor: Array) -> float | Non
 
 
 def still_there(errors: list[Array], changes: list[Array], floor: Array) -> tuple[float, float]:
-    """The largest error of the finest run, and what may be left: three times its change by the last refinement."""
+    """An error of the finest run, and what may be left there: three times its change by the last refinement.
+
+    Of the errors that are not small beside the largest; small ones may be zeros on the way.
+    """
     rest = np.maximum(3.0 * np.maximum.accumulate(changes[-1]), floor)
-    worst = int(np.argmax(errors[-1] / rest))
+    worst = int(np.argmax(np.where(errors[-1] > 0.1 * errors[-1].max(), errors[-1] / rest, 0.0)))
     return float(errors[-1][worst]), float(rest[worst])

@@ -26,7 +26,7 @@ from twoloop.testing.measuring import (
 from twoloop.testing.simulated import Simulated, seen_back
 
 LEAST_ORDER = 0.7  # of a method of whose order nothing is said
-SHORT = 0.35  # by which an observed order may fall short of the one that was said
+SHORT = 0.6  # by which an observed order may fall short of the one that was said
 
 
 def measured(observed: Observed, settings: Settings) -> Iterator[Finding]:
