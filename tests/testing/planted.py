@@ -97,7 +97,7 @@ FAULTS = [
         "driven_crank",
         "unit",
     ),
-    Planted("rows one time late", RK, "np.array(each) for", "np.array((each[0], *each[:-1])) for", "four_bar", "late"),
+    Planted("rows one time late", RK, "np.array(each) for", "np.array((each[0], *each[:-1])) for", "pendulum", "late"),
     Planted(
         "angles jump back",
         RK,
@@ -140,7 +140,7 @@ FAULTS = [
         "pendulum",
         "middle of the step",
     ),
-    Planted("velocities are not projected", RATTLE, "return q, free + change", "return q, free", "four_bar", "velocit"),
+    Planted("velocities are not projected", RATTLE, "return q, free + change", "return q, free", "pendulum", "velocit"),
     Planted(
         "the drive of the start of the step",
         RATTLE,

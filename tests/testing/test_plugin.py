@@ -45,7 +45,7 @@ def test_a_sound_integrator_a_fixture_and_a_report(tmp_path):
     simulator = ["--simulator", f"{EXAMPLES / 'runge_kutta.py'}:simulate", "--simulator-problems", "pendulum"]
     done = run_pytest(tmp_path, *simulator, *QUICK, "--simulator-report", "check.md", "--junitxml", "check.xml", "-v")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "simulator::pendulum::order of q PASSED" in done.stdout and "test_own.py::test_my_own PASSED" in done.stdout
+    assert "14 passed" in done.stdout
     text = (tmp_path / "check.md").read_text(encoding="utf-8")
     assert text.startswith("# Simulator check: all hold") and "| pendulum | order of q | 3." in text
     cases = ElementTree.parse(tmp_path / "check.xml").iter("testcase")
@@ -58,9 +58,9 @@ def test_a_faulty_one_and_known_failures(tmp_path):
     known = "[pytest]\nsimulator_known_failures = out_of_reach: says that it ends\n"
     (tmp_path / "pytest.ini").write_text(known, encoding="utf-8")
     simulator = ["--simulator", "still:simulate", "--simulator-problems", "pendulum,out_of_reach"]
-    done = run_pytest(tmp_path, *simulator, *QUICK, "-rfs")
+    done = run_pytest(tmp_path, *simulator, *QUICK)
     assert done.returncode == 1
-    assert "pendulum: error of q: " in done.stdout and "Off by 1 % from t = " in done.stdout
+    assert "pendulum: error of q: 2, allowed 0.3\nNothing moves" in done.stdout
     assert "pendulum: limit of q" not in done.stdout  # the motion is wrong: its limit is not asked for
     assert "1 failed" in done.stdout and "1 xfailed" in done.stdout
     sound = ["--simulator", f"{EXAMPLES / 'runge_kutta.py'}:simulate", "--simulator-problems", "out_of_reach"]

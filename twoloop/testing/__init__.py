@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twoloop.testing.conformance import check_simulator
-    from twoloop.testing.findings import Failure, Report
+    from twoloop.testing.findings import Failure, Finding, Report
     from twoloop.testing.known_problem import KnownProblem, Motion
     from twoloop.testing.known_problems import problems
 
 _MODULES = {
     "Failure": "findings",
+    "Finding": "findings",
     "KnownProblem": "known_problem",
     "Motion": "known_problem",
     "Report": "findings",
@@ -18,7 +19,7 @@ _MODULES = {
     "problems": "known_problems",
 }
 
-__all__ = ["Failure", "KnownProblem", "Motion", "Report", "check_simulator", "problems"]
+__all__ = ["Failure", "Finding", "KnownProblem", "Motion", "Report", "check_simulator", "problems"]
 
 
 def __getattr__(name: str) -> Any:  # pytest imports `plugin` in every run, which is not to cost an import of numpy

@@ -47,6 +47,8 @@ def _output(e: Evidence) -> str:
     if not e.wrong("q"):
         return ""
     q, motion, kinds = e.observed.runs[-1].q, e.observed.motion, e.observed.problem.coordinates
+    if np.ptp(q, axis=0).max() == 0.0:
+        return "Nothing moves: every row is the same."
     for shift, word in ((1, "late"), (-1, "early")):
         moved = np.roll(q, -shift, axis=0)
         moved[[0, -1]] = motion.q[[0, -1]]
@@ -84,7 +86,7 @@ def _acceleration(e: Evidence) -> str:
         return ""
     by_steps = e.settings.steps is not None
     mistake = mistaken_acceleration(e.simulate, e.observed.problem, e.observed.settings[-1], by_steps)
-    return f"The first steps go by a wrong acceleration: {mistake}." if mistake else ""
+    return f"The accelerations are wrong: {mistake}." if mistake else ""
 
 
 def _rates_of_time(e: Evidence) -> str:
@@ -136,15 +138,14 @@ def _velocities(e: Evidence) -> str:
 def _drift(e: Evidence) -> str:
     if "constraints" not in e.failed:
         return ""
-    found = [violations(e.observed.problem, run, e.observed.motion.scales)[0] for run in e.observed.runs[-2:]]
+    found = [violations(e.observed.problem, run, e.observed.motion.scales)[0] for run in e.observed.runs]
     off = found[-1]
-    early, late = off[1:11].max(), off[-30:].max()
-    if late > 4.0 * early:
+    if any(each[-30:].max() > 4.0 * each[1:11].max() for each in found):
         return (
             "The violation of C grows along the run: only accelerations (or velocities) obey the constraints. Project "
             "positions and velocities after each step, or stabilise (GGL; Baumgarte leaves a rest)."
         )
-    if e.settings.steps is not None and len(found) > 1 and found[0].max() > 1.5 * off.max():
+    if e.settings.steps is not None and found[-2].max() > 1.5 * off.max():
         return (
             "The violation of C falls with the steps and does not grow along the run: C = 0 is asked for at another "
             "instant than that of the state (t instead of t + h?), or of a state that is changed afterwards."

@@ -65,7 +65,7 @@ def errors_by_steps(observed: Observed, settings: Settings, kind: str) -> Iterat
     name, errors = observed.problem.name, observed.errors(kind)
     worst, floor = float(errors[-1].max()), observed.rounding + observed.floor(kind)
     yield Finding(name, f"error of {kind}", worst, MOST, worst <= MOST)
-    if len(errors) < 2 or worst > MOST:
+    if worst > MOST:
         return
     changes = changes_of(observed, kind)
     value, rest = still_there(errors, changes, floor)
@@ -110,7 +110,7 @@ def constraints(observed: Observed, settings: Settings) -> Iterator[Finding]:
         limits = [HELD_RATES * setting + 10.0 * floor for setting in observed.settings]
         yield _worst("velocity constraints", observed, rates, limits)
     elif rates:
-        vanish = len(rates) > 1 and rates[-2].max() > 2.0**LEAST_ORDER * rates[-1].max()
+        vanish = rates[-2].max() > 2.0**LEAST_ORDER * rates[-1].max()
         limit = np.full(floor.shape, MOST) if vanish else HELD_BY_STEPS + observed.rounding
         yield _worst("velocity constraints", observed, [rates[-1]], [limit])
 
@@ -144,10 +144,7 @@ def multipliers(observed: Observed, settings: Settings) -> Finding:
 def _vanishing(observed: Observed, name: str, found: list[Array], floor: Array) -> Finding:
     """Passes where the finest run's error is at most three times its change by the last refinement."""
     worst = float(found[-1].max())
-    limit = float(np.max(floor))
-    if len(found) > 1:
-        limit = max(limit, 3.0 * float(np.abs(found[-1] - found[-2]).max()))
-    limit = min(limit, MOST)
+    limit = min(MOST, max(float(np.max(floor)), 3.0 * float(np.abs(found[-1] - found[-2]).max())))
     return Finding(observed.problem.name, name, worst, limit, worst <= limit)
 
 
