@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
@@ -84,7 +85,18 @@ def test_what_is_no_simulator(tmp_path, where, words):
         plugin._loaded(where, tmp_path)
 
 
-def test_wrong_options(tmp_path):
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("simulator_problems", "five_bar", "problems must be 'smoke'.*given 'five_bar'"),
+        ("simulator_steps", "30", "steps must be two or more"),
+        ("simulator_steps", "many", "invalid literal"),
+        ("simulator_order", 2.0, "order is for simulators of fixed steps"),
+    ],
+)
+def test_wrong_options(tmp_path, option, value, words):
     (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
-    done = run_pytest(tmp_path, "--simulator", "still.py:simulate", "--simulator-problems", "five_bar")
-    assert done.returncode == 4 and "--simulator: problems must be" in done.stderr and "'five_bar'" in done.stderr
+    options = {"simulator": "still.py:simulate", "simulator_problems": "smoke", option: value}
+    config = SimpleNamespace(getoption=options.get, invocation_params=SimpleNamespace(dir=tmp_path))
+    with pytest.raises(pytest.UsageError, match=f"--simulator: {words}"):
+        plugin.pytest_collection_modifyitems(None, config, [])

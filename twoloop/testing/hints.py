@@ -9,9 +9,9 @@ import numpy as np
 from twoloop.testing.changes import in_a_frame
 from twoloop.testing.findings import Finding
 from twoloop.testing.known_problem import Array
-from twoloop.testing.measuring import Observed, Settings, allowed, forces_of_constraints, violations
+from twoloop.testing.measuring import Observed, Settings, allowed, forces_of_constraints, still_there, violations
 from twoloop.testing.mistakes import mistaken_acceleration
-from twoloop.testing.properties import observed_order
+from twoloop.testing.properties import changes_of, observed_order
 from twoloop.testing.simulated import Simulate, seen_back, simulated
 
 CLEAR = 0.1  # of an error, to which the right explanation reduces it
@@ -148,11 +148,26 @@ def _drift(e: Evidence) -> str:
     if e.settings.steps is not None and found[-2].max() > 1.5 * off.max():
         return (
             "The violation of C falls with the steps and does not grow along the run: C = 0 is asked for at another "
-            "instant than that of the state (t instead of t + h?), or of a state that is changed afterwards."
+            "instant than that of the state (t instead of t + h?), of a state that is changed afterwards, or only for "
+            "its derivatives (Baumgarte)."
         )
     return (
         "The violation of C is there from the first steps and does not grow: an iteration for the positions stops too "
-        "early, with a tolerance of its own, or a penalty or regularisation stands in for the constraint."
+        "early, with a tolerance of its own or in single precision, or a penalty or regularisation stands in for C = 0."
+    )
+
+
+def _coarse(e: Evidence) -> str:
+    """An error that is too large, and falls as it should."""
+    if e.settings.steps is None or not {"error of q", "error of v"} & set(e.failed):
+        return ""
+    errors, changes = e.observed.errors("q"), changes_of(e.observed, "q")
+    value, rest = still_there(errors, changes, e.observed.floor("q"))
+    if value > rest or errors[-1].max() > 0.8 * errors[-2].max():
+        return ""
+    return (
+        f"The error falls, from {errors[-2].max():.1g} to {errors[-1].max():.1g} by the last refinement, and is "
+        "still too large: take more steps."
     )
 
 
@@ -162,8 +177,25 @@ def _floor(e: Evidence) -> str:
     if not limits and not (e.wrong("q") and len(errors) > 1 and errors[-1].max() > 0.3 * errors[0].max()):
         return ""
     return (
-        f"The error stays at {max(each.max() for each in errors[-1:]):.1g} however fine the steps: not the method "
-        "but the model is wrong (a mass, a force, a sign), or an iteration, a difference quotient or a penalty ends it."
+        f"The error stays at {errors[-1].max():.1g} however fine the steps: not the method but the model is wrong "
+        "(a mass, a force, a sign), or an iteration, a difference quotient or a penalty ends it."
+    )
+
+
+def _clock(e: Evidence) -> str:
+    """Constraints that hold at the time since the start."""
+    problem, run = e.observed.problem, e.observed.runs[-1]
+    begin = problem.t_span[0]
+    if begin == 0.0 or "constraints" not in e.failed:
+        return ""
+    since, there = (
+        max(np.abs(problem.constraint(t - shift, q)).max() for t, q in zip(run.t[1:], run.q[1:], strict=True))
+        for shift in (begin, 0.0)
+    )
+    return (
+        f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
+        if since < CLEAR * there
+        else ""
     )
 
 
@@ -225,7 +257,7 @@ def _multipliers(e: Evidence) -> str:
 
 def _frame(e: Evidence) -> str:
     n, motion = len(e.observed.settings) // 2, e.observed.motion
-    middle, least = e.observed.settings[n], 10.0 * e.observed.errors("q")[n].max() + 1e-6
+    middle, least = e.observed.settings[n], 30.0 * e.observed.errors("q")[n].max() + 1e-6
     if e.settings.tolerances:
         least = max(least, float(allowed(motion, middle).max()))
     wrong = []
@@ -273,7 +305,9 @@ MOTION: tuple[Callable[[Evidence], str], ...] = (
     _acceleration,
     _rates_of_time,
     _velocities,
+    _clock,
     _drift,
+    _coarse,
     _floor,
     _orders,
     _slack,

@@ -26,7 +26,15 @@ def known_motion(name: str) -> Motion | None:
 
 
 def posed(
-    name: str, equations: Any, start: tuple[Array, Array], end: float, tags: str, kinds: str, powers: Any, **more: Any
+    name: str,
+    equations: Any,
+    start: tuple[Array, Array],
+    end: float,
+    tags: str,
+    kinds: str,
+    powers: Any,
+    begin: float = 0.0,
+    **more: Any,
 ) -> KnownProblem:
     """A problem with its known motion; `tags` are divided by commas, `kinds`, of the coordinates, by blanks."""
     q0, v0 = (np.asarray(each, dtype=float) for each in start)
@@ -37,7 +45,7 @@ def posed(
         **{each: getattr(equations, each) for each in names},
         q0=q0,
         v0=v0,
-        t_span=(0.0, end),
+        t_span=(begin, end),
         tags=tuple(tags.split(", ")),
         coordinates=tuple(kinds.split()),
         row_powers=np.asarray(powers, dtype=float),

@@ -61,7 +61,7 @@ class KnownProblem:
     energy : callable or None
         energy(t, q, v) -> J, where the motion keeps it.
     q0, v0 : ndarray (n_q,)
-        Consistent start.
+        Consistent start, read-only.
     t_span : (float, float)
         Start and end of the motion, s.
     tags : tuple of str
@@ -102,6 +102,12 @@ class KnownProblem:
     singular_times: tuple[float, ...] = ()
     ends: float | None = None
     note: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("q0", "v0"):  # a simulator that steps in place is not to change the start of its next run
+            start = np.array(getattr(self, name), dtype=float)
+            start.flags.writeable = False
+            object.__setattr__(self, name, start)
 
     @property
     def n_q(self) -> int:

@@ -119,17 +119,18 @@ def _turning(start: float, rate: float, amplitude: float, frequency: float) -> A
 
 
 def driven_slider_crank() -> KnownProblem:
-    """The slider-crank, its crank at the angle 0.5 + 4 t + 0.3 sin(3 t): no freedom is left."""
-    equations = _slider_rows()
-    equations.drive(2, _turning(0.5, 4.0, 0.3, 3.0))
-    note = "as many rows as coordinates: everything is C_t and gamma; the last multiplier is the torque of the drive"
+    """The slider-crank, its crank at the angle 0.5 + 4 t + 0.3 sin(3 t), from t = 0.5 s on: no freedom is left."""
+    equations, drive = _slider_rows(), _turning(0.5, 4.0, 0.3, 3.0)
+    equations.drive(2, drive)
+    note = "as many rows as coordinates: everything is C_t and gamma; and the motion does not begin at t = 0"
     powers = [*SLIDER_POWERS, 0.0]
     return _planar(
         "driven_slider_crank",
         equations,
-        _slider_start(0.5, 4.9),
+        _slider_start(drive[0](0.5), drive[1](0.5)),
         2.0,
         "driven, closed chain, planar",
+        begin=0.5,
         energy=None,
         note=note,
         powers=powers,

@@ -139,7 +139,10 @@ def _seen(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: b
     interval = (last - first) / (LATER + 1)
     step = 0.125 * interval
     times = first + interval * LATER + step * np.arange(-2.0, 3.0)
-    run = simulated(simulate, problem, np.concatenate([[first], times]), step if by_steps else setting)
+    try:
+        run = simulated(simulate, problem, np.concatenate([[first], times]), step if by_steps else setting)
+    except (TypeError, ValueError):  # of another shape: it takes no times but those of the motion
+        return None
     if not run.complete:
         return None
     t, q, x = float(times[2]), run.q[3], run.q[1:]

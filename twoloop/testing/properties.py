@@ -161,5 +161,5 @@ def seen_otherwise(
     if settings.tolerances:
         limit = np.maximum(allowed(motion, setting), 10.0 * base.max()) + observed.floor("q")
     else:
-        limit = 10.0 * np.maximum.accumulate(base) + 1e-6 + observed.rounding
+        limit = 30.0 * np.maximum.accumulate(base) + 1e-6 + observed.rounding
     return _worst(name, there, there.errors("q"), [limit])

@@ -62,6 +62,8 @@ def _checked(problem: KnownProblem, name: str, part: Any, shape: tuple[int, int]
     if part is None:
         return None
     try:
+        if np.iscomplexobj(part):
+            raise TypeError("complex numbers")
         array = np.asarray(part, dtype=float)
     except (TypeError, ValueError) as error:
         raise TypeError(
