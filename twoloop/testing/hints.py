@@ -157,28 +157,37 @@ def _drift(e: Evidence) -> str:
     )
 
 
-def _coarse(e: Evidence) -> str:
-    """An error that is too large, and falls as it should."""
-    if e.settings.steps is None or not {"error of q", "error of v"} & set(e.failed):
-        return ""
-    errors, changes = e.observed.errors("q"), changes_of(e.observed, "q")
-    value, rest = still_there(errors, changes, e.observed.floor("q"))
-    if value > rest or errors[-1].max() > 0.8 * errors[-2].max():
-        return ""
-    return (
-        f"The error falls, from {errors[-2].max():.1g} to {errors[-1].max():.1g} by the last refinement, and is "
-        "still too large: take more steps."
-    )
+def _unused(e: Evidence) -> str:
+    runs = e.observed.runs
+    same = len(runs) > 1 and np.array_equal(runs[0].q, runs[-1].q)
+    return "The same numbers whatever the tolerance, or the step: it is not used." if same else ""
+
+
+def _falls(e: Evidence) -> bool:
+    """Whether the error of q goes on falling."""
+    errors = e.observed.errors("q")
+    if e.settings.tolerances is not None:
+        return len(errors) < 2 or errors[-1].max() <= 0.3 * errors[0].max()
+    value, rest = still_there(errors, changes_of(e.observed, "q"), e.observed.floor("q"))
+    return value <= rest and errors[-1].max() < 0.8 * errors[-2].max()
 
 
 def _floor(e: Evidence) -> str:
-    limits = {"limit of q", "limit of v"} & set(e.failed)
-    errors = e.observed.errors("q")
-    if not limits and not (e.wrong("q") and len(errors) > 1 and errors[-1].max() > 0.3 * errors[0].max()):
+    if not {"limit of q", "limit of v"} & set(e.failed) and (not e.wrong("q") or _falls(e)):
         return ""
     return (
-        f"The error stays at {errors[-1].max():.1g} however fine the steps: not the method but the model is wrong "
+        f"The error stays at {e.position.max():.1g}, however fine: not the method but the model is wrong "
         "(a mass, a force, a sign), or an iteration, a difference quotient or a penalty ends it."
+    )
+
+
+def _coarse(e: Evidence) -> str:
+    if e.settings.steps is None or not {"error of q", "error of v"} & set(e.failed):
+        return ""
+    errors = e.observed.errors("q")
+    return (
+        f"The error falls, from {errors[-2].max():.1g} to {errors[-1].max():.1g} by the last refinement, and is "
+        "still too large: take more steps."
     )
 
 
@@ -306,10 +315,11 @@ MOTION: tuple[Callable[[Evidence], str], ...] = (
     _rates_of_time,
     _velocities,
     _clock,
+    _unused,
     _drift,
-    _coarse,
     _floor,
     _orders,
+    _coarse,
     _slack,
     _where,
 )
