@@ -7,6 +7,7 @@ from tests.bad_input.mechanisms import MECHANISMS
 from tests.bad_input.methods import METHODS
 from tests.bad_input.projection import PROJECTION
 from tests.bad_input.results import RESULTS
+from tests.bad_input.simulators import SIMULATORS
 from tests.bad_input.solving import SOLVE
 from tests.bad_input.start import START
 from tests.bad_input.symbolic import SYMBOLIC
@@ -16,5 +17,6 @@ from tests.general.wrong_rows import ROWS
 CASES = [
     *(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS),
     *ENSEMBLES,
+    *SIMULATORS,
     *SYMBOLIC,
 ]

@@ -234,25 +234,7 @@ def test_errors_are_over_the_largest_coordinate():
     assert largest > 2.0 and report.failures[0].measured == pytest.approx(0.1 / largest)
 
 
-# --- wrong arguments and wrong answers
-
-
-@pytest.mark.parametrize(
-    ("returned", "error", "words"),
-    [
-        (lambda n, m: np.zeros((2, n)), ValueError, r"of shape \(101, 2\).*returned shape \(2, 101\) \(transpose it\)"),
-        (lambda n, m: np.zeros((n, 3)), ValueError, r"it returned shape \(101, 3\)"),
-        (lambda n, m: (np.zeros((n, 2)), np.zeros(n)), ValueError, r"return v with a row for each time"),
-        (lambda n, m: (np.zeros((n, 2)), None, np.zeros((n, 2))), ValueError, r"return lam .*\(101, 1\)"),
-        (lambda n, m: None, TypeError, "it returned None"),
-        (lambda n, m: "done", TypeError, "arrays of numbers.*'pendulum' q is str"),
-        (lambda n, m: (1, 2, 3, 4), TypeError, "a tuple of 4"),
-        (lambda n, m: np.full((n, 2), 1j), TypeError, "arrays of numbers.*complex"),
-    ],
-)
-def test_answers_of_another_shape(returned, error, words):
-    with pytest.raises(error, match=words):
-        check_simulator(lambda problem, times, tolerance: returned(times.size, problem.n_c), "pendulum")
+# --- wrong answers; wrong arguments are in tests/bad_input/simulators.py
 
 
 def test_answers_that_differ_from_run_to_run():
@@ -262,35 +244,3 @@ def test_answers_that_differ_from_run_to_run():
 
     with pytest.raises(TypeError, match="the same of q, v and lam in every run; on 'pendulum'"):
         check_simulator(simulate, "pendulum")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "words"),
-    [
-        (("solver.py",), TypeError, "simulate must be a function of .*given str"),
-        ((known(), "five_bar"), ValueError, "problems must be 'smoke', 'all' or of pendulum.*given 'five_bar'"),
-        ((known(), ["pendulum", 3]), ValueError, "given 3"),
-    ],
-)
-def test_wrong_arguments(arguments, error, words):
-    with pytest.raises(error, match=words):
-        check_simulator(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"tolerances": []}, "tolerances must be falling"),
-        ({"tolerances": [1e-6, 1e-4]}, "tolerances must be falling"),
-        ({"tolerances": [0.0]}, "between 0 and 1"),
-        ({"steps": [100]}, "steps must be two or more"),
-        ({"steps": [100, 250]}, "multiple of 100"),
-        ({"steps": [200, 100]}, "growing"),
-        ({"steps": [100, 200.0]}, "steps must be"),
-        ({"order": 4}, "order is for simulators of fixed steps"),
-        ({"steps": [100, 200], "order": 0.0}, "order must be positive"),
-    ],
-)
-def test_wrong_options(options, words):
-    with pytest.raises(ValueError, match=words):
-        check_simulator(known(), "pendulum", **options)

@@ -1,6 +1,7 @@
 """Checks any simulator of mechanisms against known motions."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from twoloop.testing.findings import Finding, Report
 from twoloop.testing.hints import Evidence, with_hints
 from twoloop.testing.known_motions import N_TIMES
 from twoloop.testing.known_problem import KnownProblem
-from twoloop.testing.known_problems import named
+from twoloop.testing.known_problems import listed, named
 from twoloop.testing.measuring import Observed, Settings
 from twoloop.testing.properties import measured, seen_otherwise
 from twoloop.testing.simulated import Simulate, Simulated, simulated
@@ -25,7 +26,7 @@ SEEN = {"frame": in_a_frame, "units": in_millimetres_and_grams}
 
 def check_simulator(
     simulate: Simulate,
-    problems: str | Iterable[str | KnownProblem] = "smoke",
+    problems: str | KnownProblem | Iterable[str | KnownProblem] = "smoke",
     *,
     tolerances: Sequence[float] = (1e-4, 1e-6, 1e-8),
     steps: Sequence[int] | None = None,
@@ -98,26 +99,28 @@ def check_simulator(
 
 def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order: float | None) -> Settings:
     """The settings of a check, their values looked at."""
+    if order is not None and not (_number(order) and order > 0.0):
+        raise ValueError(f"order must be a positive number; given {order!r}")
     if steps is not None:
-        given = tuple(steps)
+        given = listed("steps", steps)
         whole = all(isinstance(n, int | np.integer) and n > 0 and n % (N_TIMES - 1) == 0 for n in given)
-        if len(given) < 2 or not whole or list(given) != sorted(set(given)):
+        if not whole or len(given) < 2 or given != sorted(set(given)):
             raise ValueError(
                 f"steps must be two or more growing numbers of steps, each a multiple of {N_TIMES - 1}; given {steps!r}"
             )
-        if order is not None and not order > 0.0:
-            raise ValueError(f"order must be positive; given {order!r}")
-        return Settings(None, given, order)
+        return Settings(None, tuple(given), order)
     if order is not None:
         raise ValueError(f"order is for simulators of fixed steps, with steps=; given {order!r} without")
-    values = tuple(float(value) for value in tolerances)
-    if (
-        not values
-        or not all(0.0 < value < 1.0 for value in values)
-        or list(values) != sorted(set(values), reverse=True)
-    ):
-        raise ValueError(f"tolerances must be falling numbers between 0 and 1; given {tolerances!r}")
-    return Settings(values, None, None)
+    values = listed("tolerances", tolerances)
+    if not values or not all(_number(value) and 0.0 < value < 1.0 for value in values):
+        raise ValueError(f"tolerances must be numbers between 0 and 1; given {tolerances!r}")
+    if values != sorted(set(values), reverse=True):
+        raise ValueError(f"tolerances must fall from the first to the last; given {tolerances!r}")
+    return Settings(tuple(float(value) for value in values), None, None)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings) -> tuple[list[Finding], list[Skipped]]:

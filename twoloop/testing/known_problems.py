@@ -1,6 +1,7 @@
 """The problems whose motions are known, by name and by tag."""
 
 from collections.abc import Iterable
+from typing import Any
 
 from twoloop.testing import linkages, pendulums, spatial_mechanisms
 from twoloop.testing.known_problem import KnownProblem
@@ -74,7 +75,7 @@ def problems(tags: str | Iterable[str] | None = None) -> list[KnownProblem]:
     >>> [problem.name for problem in problems("driven")]
     ['driven_crank', 'out_of_reach', 'driven_slider_crank']
     """
-    wanted = [tags] if isinstance(tags, str) else list(tags or ())
+    wanted = listed("tags", () if tags is None else tags)
     for tag in wanted:
         if tag not in TAGS:
             raise ValueError(f"tags must be of {', '.join(TAGS)}; given {tag!r}")
@@ -82,16 +83,25 @@ def problems(tags: str | Iterable[str] | None = None) -> list[KnownProblem]:
     return [problem for problem in everything if set(wanted) <= set(problem.tags)]
 
 
-def named(choice: str | Iterable[str | KnownProblem]) -> list[KnownProblem]:
+def named(choice: str | KnownProblem | Iterable[str | KnownProblem]) -> list[KnownProblem]:
     """The problems of a choice: "smoke", "all", a name, or names and problems."""
     if isinstance(choice, str) and choice in ("smoke", "all"):
         return problems("smoke" if choice == "smoke" else None)
-    chosen = []
-    for each in [choice] if isinstance(choice, str) else choice:
+    chosen: list[KnownProblem] = []
+    for each in [choice] if isinstance(choice, KnownProblem) else listed("problems", choice):
         if isinstance(each, KnownProblem):
             chosen.append(each)
-        elif each in MAKERS:
+        elif isinstance(each, str) and each in MAKERS:
             chosen.append(MAKERS[each]())
         else:
             raise ValueError(f"problems must be 'smoke', 'all' or of {', '.join(MAKERS)}; given {each!r}")
+    if not chosen:
+        raise ValueError("problems must name at least one; given an empty list, on which everything would pass")
     return chosen
+
+
+def listed(name: str, given: Any) -> list[Any]:
+    """The members of a list that was given, or the one text."""
+    if not isinstance(given, Iterable):
+        raise TypeError(f"{name} must be a list; given {given!r}")
+    return [given] if isinstance(given, str) else list(given)
