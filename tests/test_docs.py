@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.test_rooms import documentation
+from tests.testing.planted import FAULTS
 from twoloop import Result, Status, mechanisms, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
@@ -129,6 +130,7 @@ def test_the_red_example_is_as_printed(names):
     page, text = names("check_simulator"), (DOCS / "check_simulator.md").read_text(encoding="utf-8")
     assert not page["report"].passed and page["repaired"].passed
     assert all(failure.hint in text for failure in page["report"].failures)
+    assert f"Of {len(FAULTS)} faults planted" in text
     assert all(f"    {failure.property}: " in text for failure in page["report"].failures)
 
 

@@ -54,9 +54,10 @@ def test_sound_integrators_pass_on_every_problem(name):
         RK: {"redundant_slider_crank"},
         RATTLE: {"redundant_slider_crank", "heavy_top", "andrews", "spatial_four_bar"},
     }
+    steps = (800, 1600) if "stiff" in name else (200, 400, 800)  # longer ones do not converge, and say so
     for example in (RK, ALPHA, RATTLE):
         if name not in beyond.get(example, ()):
-            report = check_simulator(module_of(example).simulate, name, steps=(200, 400, 800), order=ORDERS[example])
+            report = check_simulator(module_of(example).simulate, name, steps=steps, order=ORDERS[example])
             assert report.passed, str(report)
 
 
@@ -116,6 +117,7 @@ def singular_branch(problem, q, v, lam):
 
 WRONG = [
     ("pendulum", lambda problem, q, v, lam: (q, -v, lam), "velocities have the other sign"),
+    ("pendulum", lambda problem, q, v, lam: (q, np.vstack([v[:1], v[:-1]]), lam), "the output time before"),
     ("pendulum", lambda problem, q, v, lam: (q, v, -lam), "multipliers have the other sign"),
     ("pendulum", lambda problem, q, v, lam: (q, v, 0.5 * lam), "0.5 times"),
     ("pendulum", lambda problem, q, v, lam: (np.roll(q, 1, axis=0), None, None), "late"),

@@ -113,7 +113,10 @@ def _velocities(e: Evidence) -> str:
     if run.v is None or e.wrong("q") or "order of q" in e.failed or not (e.wrong("v") or _one_order_less(e)):
         return ""
     a = np.array([problem.acceleration(*state)[0] for state in zip(motion.t, motion.q, motion.v, strict=True)])
-    others = {"The velocities have the other sign.": -motion.v}
+    others = {
+        "The velocities have the other sign.": -motion.v,
+        "The velocities are those of the output time before.": np.vstack([motion.v[:1], motion.v[:-1]]),
+    }
     if e.settings.steps is not None:
         h = e.observed.settings[-1]
         middle = "The velocities are those of the middle of the step {}: bring them to its end with half a step of a."
